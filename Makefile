@@ -1,0 +1,33 @@
+# Two commands do everything on a fresh machine with Python and make:
+#   make run     the environment, then `tmlattice tune-fit` on the built-in ring
+#   make test    the environment, then the tests
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+
+.PHONY: run test test-all check bench clean
+
+run: $(VENV)/installed
+	$(BIN)/tmlattice tune-fit
+
+test: $(VENV)/installed
+	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term
+
+test-all: $(VENV)/installed
+	$(BIN)/python -m pytest --cov --cov-report=term
+
+check: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(VENV)/installed
+	$(BIN)/python benchmarks/speed.py
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

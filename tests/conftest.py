@@ -1,0 +1,44 @@
+"""Rings that many tests share, loaded once."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
+
+
+@pytest.fixture(scope="session")
+def small_ring():
+    from tmlattice import load_ring
+
+    return load_ring(SMALL)
+
+
+@pytest.fixture(scope="session")
+def small_network(small_ring):
+    from tmlattice import TaylorNetwork
+
+    return TaylorNetwork.from_ring(small_ring)
+
+
+@pytest.fixture(scope="session")
+def petra3():
+    from tmlattice import load_ring
+
+    return load_ring("petra3")
+
+
+@pytest.fixture(scope="session")
+def petra3_network(petra3):
+    from tmlattice import TaylorNetwork
+
+    return TaylorNetwork.from_ring(petra3)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20260)

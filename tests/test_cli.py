@@ -1,0 +1,220 @@
+"""The command as a user runs it: what it prints and writes, and how it ends on wrong input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
+QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
+
+
+def tmlattice(*arguments, cwd, check=None):
+    done = subprocess.run(
+        [sys.executable, "-m", "tmlattice", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    if check is not None:
+        assert done.returncode == check, done.stdout + done.stderr
+    return done
+
+
+def schema(name):
+    return json.loads((files("tmlattice") / "schemas" / f"{name}.schema.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    done = tmlattice(
+        "tune-fit",
+        "--epochs",
+        200,
+        "--json",
+        "result.json",
+        "--out",
+        "figures",
+        cwd=folder,
+        check=0,
+    )
+    return folder, done
+
+
+def test_tune_fit_on_the_built_in_ring(outcome):
+    folder, _ = outcome
+    result = json.loads((folder / "result.json").read_text())
+    jsonschema.validate(result, schema("tune-fit"))
+    assert result["layers"] == 1519
+    assert result["monitors"] == 246
+    assert result["change"] == -0.2
+    assert len(result["loss"]) == 200
+    assert result["orbit_rms"]["after"] < 0.5 * result["orbit_rms"]["before"]
+    for plane in range(2):
+        network, true = (result["tunes"][key][plane] for key in ("network", "true"))
+        assert result["error"]["absolute"][plane] == pytest.approx(abs(network - true))
+        assert result["error"]["relative"][plane] == pytest.approx(abs(network - true) / true)
+    assert set(result["seconds"]) == {"maps", "compile", "fit", "tunes", "total"}
+    assert json.loads((folder / "figures" / "tune-fit.json").read_text()) == result
+
+
+def test_tune_fit_prints_the_table_and_writes_three_figures(outcome):
+    folder, done = outcome
+    for words in ("1519 layers", "246 monitors", "true, perturbed (OCELOT)", "relative to the frac",
+                  "rms [µm]", "noise", "seconds"):  # fmt: skip
+        assert words in done.stdout
+    assert sorted(p.name for p in (folder / "figures").iterdir()) == [
+        "loss.png", "orbit.png", "spectrum.png", "tune-fit.json"
+    ]  # fmt: skip
+    for name in ("loss", "orbit", "spectrum"):
+        assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(p.name for p in folder.iterdir()) == ["figures", "result.json"]
+    assert "\x1b" not in done.stdout  # no colours and no bar where there is no terminal
+    assert done.stderr == ""
+
+
+def test_quiet_prints_nothing(tmp_path):
+    done = tmlattice("tune-fit", SMALL, *QUICK, "--quiet", cwd=tmp_path, check=0)
+    assert done.stdout == done.stderr == ""
+    assert (tmp_path / "tune-fit" / "orbit.png").exists()
+
+
+def test_info(tmp_path):
+    done = tmlattice("info", SMALL, "--json", "info.json", cwd=tmp_path, check=0)
+    assert "quadrupole" in done.stdout
+    facts = json.loads((tmp_path / "info.json").read_text())
+    jsonschema.validate(facts, schema("info"))
+    assert facts["counts"]["quadrupole"] == 32
+    assert facts["layers"] == 114
+
+
+def test_info_on_an_unstable_ring_still_counts(tmp_path):
+    (tmp_path / "wild.py").write_text(
+        "from ocelot import *\nenergy = 1.0\nring = [Quadrupole(l=1, k1=9.0, eid='q')]"
+    )
+    done = tmlattice("info", "wild.py", cwd=tmp_path, check=0)
+    assert "unstable" in done.stdout
+
+
+def test_help_imports_nothing_heavy(tmp_path):
+    code = (
+        "import sys\nfrom click.testing import CliRunner\n"
+        "from tmlattice.cli.command import tmlattice\n"
+        "for words in (['--help'], ['tune-fit', '--help'], ['--version']):\n"
+        "    assert CliRunner().invoke(tmlattice, words).exit_code == 0\n"
+        "heavy = {'torch', 'ocelot', 'numpy', 'matplotlib', 'numba'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+
+
+def test_version_has_one_source(tmp_path):
+    from importlib.metadata import version
+
+    import tmlattice as package
+
+    done = tmlattice("--version", cwd=tmp_path, check=0)
+    assert package.__version__ in done.stdout
+    assert version("tmlattice") == package.__version__
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["tune-fit", "petra4"], "no lattice 'petra4'; did you mean 'petra3'"),
+        (["tune-fit", "nowhere/ring.py"], "no lattice file"),
+        (["tune-fit", SMALL, "--magnet", "QD:8"], "no element 'QD:8'; did you mean"),
+        (["tune-fit", SMALL, "--magnet", "bend::1"], "name a quadrupole or a sextupole"),
+        (["tune-fit", SMALL, "--change", "-3"], "unstable"),
+        (["tune-fit", SMALL, "--launch", "0.5,0.5,0,0"], "is lost in layer"),
+        (["tune-fit", SMALL, "--launch", "1,2"], "four numbers"),
+        (["tune-fit", SMALL, "--launch", "nan,0,0,0"], "four numbers"),
+        (["tune-fit", SMALL, "--noise", "-1e-5"], "--noise"),
+        (["tune-fit", SMALL, "--turns", "3"], "--turns"),
+        (["tune-fit", SMALL, "--epochs", "0"], "--epochs"),
+        (["tune-fit", SMALL, "--learning-rate", "100", *QUICK[:4]], "lower the learning rate"),
+        (["tune-fit", SMALL, "--sequence", "loop"], "no sequence"),
+        (["tune-fit", SMALL, "--regularization", "l3"], "--regularization"),
+        (["tune-fit", SMALL, "--out", "/dev/null/folder"], "cannot write"),
+        (["tune-fit", SMALL, "--json", "no/such/folder/a.json"], "cannot write"),
+        (["tune-fit", SMALL, "--wrong"], "--wrong"),
+        (["tunefit"], "tunefit"),
+        (["info", "petra4"], "no lattice"),
+    ],
+)
+def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(tmp_path, arguments, words):
+    done = tmlattice(*arguments, cwd=tmp_path, check=2)
+    assert words in done.stderr
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_leaves_nothing(tmp_path):
+    from tmlattice.files import OutputError, output_folder
+
+    def write_on_a_full_disk():
+        with output_folder(tmp_path / "out") as folder:
+            (folder / "a").write_text("x")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="No space left"):
+        write_on_a_full_disk()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_results_are_replaced_whole(tmp_path):
+    from tmlattice.files import output_file
+
+    path = tmp_path / "a.json"
+    path.write_text("old")
+
+    def stop_half_way():
+        with output_file(path) as temporary:
+            temporary.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stop_half_way()
+    assert path.read_text() == "old"
+    with output_file(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_ctrl_c_ends_soon_with_nothing_half_written(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tmlattice", "tune-fit", SMALL, *QUICK[:4], "--epochs", "1000000",
+         "--json", "a.json"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    time.sleep(12)  # imports and kernels are over: it fits
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    sent = time.monotonic()
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert time.monotonic() - sent < 10  # a second in life; a loaded test machine has its own pace
+    assert "stopped" in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_study_prints_median_and_worst(tmp_path):
+    done = tmlattice(
+        "study", "tune-fit", SMALL, "--magnets", 2, *QUICK, "--regularization", "none",
+        "--regularization", "l2", "--json", "study.json", "--workers", 1, cwd=tmp_path, check=0,
+    )  # fmt: skip
+    result = json.loads((tmp_path / "study.json").read_text())
+    jsonschema.validate(result, schema("study-tune-fit"))
+    assert set(result["methods"]) == {"none", "l2"}
+    assert result["cases"] == 2
+    assert "worst" in done.stdout

@@ -1,0 +1,187 @@
+"""Fine-tuning: it learns what it is shown, leaves the rest alone, and repeats itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from tmlattice import Measurement, TaylorNetwork, fine_tune
+from tmlattice.errors import BeamLostError, MeasurementError, TmlatticeError, UnknownNameError
+from tmlattice.fitting import tune_fit
+from tmlattice.fitting.experiment import perturbed_ring
+from tmlattice.network import symplectic_penalty
+
+LAUNCH = np.array([[1e-4, 0, 1e-4, 0], [-1e-4, 1e-5, 5e-5, 0]])
+
+
+@pytest.fixture(scope="module")
+def weakened(small_ring):
+    network = TaylorNetwork.from_ring(perturbed_ring(small_ring, "QD::5", -0.02))
+    readings = network(LAUNCH).detach().numpy()
+    return Measurement(LAUNCH, readings[:, None], network.monitors)
+
+
+def fit(network, measurement, **options):
+    return fine_tune(
+        network, measurement, progress=False, **{"epochs": 150, "learning_rate": 1e-4, **options}
+    )
+
+
+def rms(network, measurement):
+    left = network(measurement.launches).detach().numpy() - measurement.readings[:, 0]
+    return np.sqrt(np.nanmean(left**2))
+
+
+def test_residual_shrinks_and_the_given_network_stays(small_network, weakened):
+    before = [p.detach().clone() for p in small_network.parameters()]
+    result = fit(small_network, weakened)
+    assert rms(result.network, weakened) < 0.1 * rms(small_network, weakened)
+    for old, now in zip(before, small_network.parameters(), strict=True):
+        assert torch.equal(old, now)
+        assert now.grad is None
+
+
+def test_loss_is_the_sum_of_squares_over_monitors_per_shot(small_network, weakened):
+    result = fit(small_network, weakened, epochs=1)
+    left = small_network(LAUNCH).detach().numpy() - weakened.readings[:, 0]
+    np.testing.assert_allclose(result.loss[0], (left**2).sum() / 2, rtol=1e-12)
+    expected = symplectic_penalty(small_network.W1, small_network.W2).sum().item()
+    np.testing.assert_allclose(result.penalty[0], expected, rtol=1e-12)
+
+
+def test_same_input_gives_the_same_weights(small_network, weakened):
+    one, other = (fit(small_network, weakened, epochs=30) for _ in range(2))
+    assert one.loss == other.loss
+    assert torch.equal(one.network.W1, other.network.W1)
+
+
+def test_weights_kept_are_those_of_least_loss(small_network, weakened):
+    result = fit(small_network, weakened, learning_rate=3e-3)  # it overshoots and oscillates
+    assert result.best_epoch == int(np.argmin(result.loss))
+    best = rms(result.network, weakened) ** 2 * weakened.readings[0].size
+    np.testing.assert_allclose(best, min(result.loss), rtol=1e-9)
+
+
+def test_early_stop_ends_a_fit_that_has_settled(small_network):
+    settled = Measurement(
+        LAUNCH, small_network(LAUNCH).detach().numpy()[:, None], small_network.monitors
+    )
+    result = fit(small_network, settled, epochs=500, patience=20)
+    assert result.stopped_early
+    assert len(result.loss) <= 40
+    assert not fit(small_network, settled, epochs=50, patience=None).stopped_early
+
+
+def test_missing_readings_are_left_out(small_network, weakened):
+    readings = weakened.readings.copy()
+    readings[0, 0, 3:9, 0] = np.nan
+    readings[1, 0, 20] = np.nan
+    holes = Measurement(LAUNCH, readings, weakened.monitors)
+    left = small_network(LAUNCH).detach().numpy() - readings[:, 0]
+    result = fit(small_network, holes)
+    np.testing.assert_allclose(result.loss[0], np.nansum(left**2) / 2, rtol=1e-12)
+    assert all(torch.isfinite(p).all() for p in result.network.parameters())
+    assert rms(result.network, holes) < 0.1 * rms(small_network, holes)
+
+
+def test_monitors_are_matched_by_name_not_by_place(small_network, weakened):
+    order = np.random.default_rng(1).permutation(len(weakened.monitors))
+    shuffled = Measurement(
+        LAUNCH, weakened.readings[:, :, order], tuple(weakened.monitors[i].upper() for i in order)
+    )
+    assert (
+        fit(small_network, shuffled, epochs=5).loss == fit(small_network, weakened, epochs=5).loss
+    )
+
+
+def test_strong_symplectic_penalty_keeps_layers_symplectic(small_network, weakened):
+    free = fit(small_network, weakened, regularization="none")
+    held = fit(small_network, weakened, regularization_rate=1.0)
+
+    def departure(network):
+        W1 = network.W1.detach()
+        return symplectic_penalty(W1, torch.zeros_like(network.W2)).sum().item()
+
+    assert departure(held.network) < 0.1 * departure(free.network)
+    assert free.penalty == [0.0] * len(free.penalty)
+
+
+@pytest.mark.parametrize("kind", ["l1", "l2"])
+def test_norm_penalties_pull_towards_the_design(small_network, weakened, kind):
+    def moved(result):
+        pairs = zip(result.network.parameters(), small_network.parameters(), strict=True)
+        return sum((a - b).abs().sum().item() for a, b in pairs)
+
+    weak = fit(small_network, weakened, regularization=kind, regularization_rate=1e-12)
+    strong = fit(small_network, weakened, regularization=kind, regularization_rate=1e3)
+    assert moved(strong) < 0.5 * moved(weak)
+    assert weak.penalty[0] == 0.0
+    assert weak.penalty[-1] > 0.0
+
+
+def test_penalty_relative_to_the_design_starts_at_zero(small_network, weakened):
+    result = fit(small_network, weakened, relative_to_design=True, epochs=5)
+    assert result.penalty[0] == pytest.approx(0.0, abs=1e-25)
+    assert result.penalty[-1] > 0
+
+
+def test_diverging_fit_says_what_to_change(small_network, weakened):
+    with pytest.raises(BeamLostError, match=r"diverged in epoch .*lower the learning rate"):
+        fit(small_network, weakened, learning_rate=10.0)
+
+
+def test_measurements_that_do_not_fit_are_refused(small_network, weakened):
+    readings = weakened.readings
+    with pytest.raises(MeasurementError, match=r"need \["):
+        Measurement(LAUNCH[:1], readings, weakened.monitors)
+    with pytest.raises(MeasurementError, match="every reading is missing"):
+        Measurement(LAUNCH, np.full_like(readings, np.nan), weakened.monitors)
+    with pytest.raises(MeasurementError, match="launch is not finite"):
+        Measurement(LAUNCH * np.nan, readings, weakened.monitors)
+    strange = Measurement(LAUNCH, readings, ("bpm_x", *weakened.monitors[1:]))
+    with pytest.raises(UnknownNameError, match="no monitor 'bpm_x'"):
+        fit(small_network, strange)
+    with pytest.raises(ValueError, match="l3"):
+        fit(small_network, weakened, regularization="l3")
+
+
+def test_any_torch_optimiser_works(small_network, weakened):
+    network = small_network.copy()
+    target = torch.from_numpy(weakened.readings[:, 0])
+    optimiser = torch.optim.LBFGS([network.W1], max_iter=20, line_search_fn="strong_wolfe")
+    before = rms(network, weakened)
+
+    def closure():
+        optimiser.zero_grad()
+        loss = 1e6 * (network(LAUNCH) - target).square().sum()
+        loss.backward()
+        return loss
+
+    optimiser.step(closure)
+    assert rms(network, weakened) < 0.5 * before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"magnet": "bend::3"}, "is a bend; name a quadrupole or a sextupole"),
+        ({"magnet": "QD:3"}, "did you mean"),
+        ({"noise": -1e-6}, "zero or more"),
+        ({"noise": float("nan")}, "zero or more"),
+        ({"launch": (1, 2, 3)}, "four finite numbers"),
+        ({"turns": 3}, "too few"),
+        ({"change": -3.0}, "unstable"),
+        ({"launch": (0.5, 0.5, 0, 0)}, "is lost"),
+    ],
+)
+def test_experiment_refuses_what_it_cannot_do(small_ring, arguments, message):
+    with pytest.raises(TmlatticeError, match=message):
+        tune_fit(small_ring, progress=False, epochs=3, **arguments)
+
+
+def test_experiment_is_repeated_by_its_seed(small_ring):
+    options = {"progress": False, "epochs": 20, "launch": (1e-4, 0, 1e-4, 0), "change": -0.02}
+    one, same, other = (tune_fit(small_ring, seed=s, **options) for s in (1, 1, 2))
+    assert one.fit.loss == same.fit.loss
+    np.testing.assert_array_equal(one.network_tunes, same.network_tunes)
+    assert one.fit.loss != other.fit.loss
+    assert 1e-5 < (one.measured - other.measured).std() < 4e-5  # two draws of 20 micrometres

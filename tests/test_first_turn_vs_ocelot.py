@@ -1,0 +1,108 @@
+"""The network's first turn against OCELOT's own second-order maps, applied part by part."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from ocelot.cpbd.tm_utils import SecondOrderMult, transfer_maps_mult_full_py
+
+from tmlattice import TaylorNetwork
+from tmlattice.lattice.ocelot import SecondTM
+from tmlattice.maps import element_map, ring_maps
+
+
+def parts(element, energy):
+    """OCELOT's second-order parts of an element: three for a bend."""
+    source = copy.deepcopy(element.source)
+    source.set_tm(SecondTM)
+    return [part.get_params(energy) for part in source.tms]
+
+
+def ocelot_first_turn(ring, launch, whole_elements):
+    """Readings [batch, monitor, 2] and the last state [batch, 4], by OCELOT's own functions.
+
+    A bend is applied as one second-order map, composed by OCELOT (`whole_elements`), or as its
+    three parts one after the other.
+    """
+    states = np.zeros((6, len(launch)))
+    states[:4] = launch.T
+    apply = SecondOrderMult().tmat_multip
+    readings = []
+    for element in ring.elements:
+        if element.kind == "monitor":
+            readings.append(states[[0, 2]].T.copy())
+        maps = [
+            (p.B.reshape(6, 1), p.get_rotated_R(), p.get_rotated_T())
+            for p in parts(element, ring.energy)
+        ]
+        if whole_elements:
+            total = maps[0]
+            for part in maps[1:]:
+                total = transfer_maps_mult_full_py(*total, *part)
+            maps = [total]
+        for B, R, T in maps:
+            apply(states, R, T)
+            states += np.reshape(B, (6, 1))
+    return np.stack(readings, axis=1), states[:4].T
+
+
+@pytest.mark.parametrize("name", ["petra3", "small_ring"])
+@pytest.mark.parametrize("amplitude", [1e-3, 1e-4])
+def test_readings_match_ocelot_maps_one_by_one(name, amplitude, request, rng):
+    ring = request.getfixturevalue(name)
+    network = TaylorNetwork.from_ring(ring)
+    launch = amplitude * rng.standard_normal((3, 4)) * [1, 0.05, 1, 0.05]
+    readings, last = ocelot_first_turn(ring, launch, whole_elements=True)
+    # 1e-12 m: rounding over the turn
+    np.testing.assert_allclose(network(launch).detach().numpy(), readings, rtol=0, atol=1e-12)
+    turn = network.track(launch, 1)[:, 1]
+    np.testing.assert_allclose(turn, last, rtol=0, atol=1e-12)
+    assert np.abs(readings).max() > amplitude / 2  # the beam really went round
+
+
+def test_composing_the_edges_of_a_bend_leaves_out_the_third_order_alone(petra3, rng):
+    network = TaylorNetwork.from_ring(petra3)
+    shape = rng.standard_normal((3, 4)) * [1, 0.05, 1, 0.05]
+    errors = []
+    for amplitude in (1e-3, 5e-4):
+        readings, _ = ocelot_first_turn(petra3, amplitude * shape, whole_elements=False)
+        mine = network(amplitude * shape).detach().numpy()
+        errors.append(np.abs(mine - readings).max())
+    assert errors[0] < 1e-9  # a nanometre, where the orbit has several millimetres
+    assert 6 < errors[0] / errors[1] < 10  # third order: a factor of eight
+
+
+def test_a_kick_in_a_corrector_reaches_the_monitors_behind_it(small_ring):
+    kicked = small_ring.with_changed("v5", angle=1e-5)
+    launch = np.zeros((1, 4))
+    readings, _ = ocelot_first_turn(kicked, launch, whole_elements=True)
+    maps = ring_maps(kicked)
+    network = TaylorNetwork(maps)(launch).detach().numpy()
+    np.testing.assert_allclose(network, readings, rtol=0, atol=1e-13)
+    behind = maps.at > maps.layers.index("v5")
+    assert (network[0, ~behind] == 0).all()
+    assert np.abs(network[0, behind, 1]).max() > 1e-5
+    assert np.abs(network[0, :, 0]).max() < 1e-8  # a vertical kick is no horizontal one
+
+
+@pytest.mark.parametrize("name", ["QF::3", "bend::7", "sf::2", "wig_1", "generated_a"])
+@pytest.mark.parametrize("dimension", [4, 6])
+def test_element_map_matches_ocelot_to_second_order(small_ring, name, dimension, rng):
+    element = small_ring[name]
+    x = np.zeros((6, 20))
+    x[:dimension] = 1e-5 * rng.standard_normal((dimension, 20))
+    image = element_map(element, small_ring.energy, dimension)(x[:dimension].T)
+    for part in parts(element, small_ring.energy):
+        SecondOrderMult().tmat_multip(x, part.get_rotated_R(), part.get_rotated_T())
+        x += part.B.reshape(6, 1)
+    np.testing.assert_allclose(image, x[:dimension].T, rtol=0, atol=1e-15)
+
+
+def test_layers_hold_one_magnet_each(petra3, petra3_network):
+    assert petra3_network.layers == tuple(e.name for e in petra3.elements if e.is_magnet)
+    assert petra3_network.W0.shape == (1519, 4)
+    assert petra3_network.W1.shape == (1519, 4, 4)
+    assert petra3_network.W2.shape == (1519, 4, 10)
+    assert petra3_network.W0.dtype == torch.float64
+    assert petra3_network(np.zeros((2, 4))).shape == (2, 246, 2)

@@ -1,0 +1,201 @@
+"""Reading OCELOT lattice files: names, kinds, places, and the traps of real files."""
+
+import numpy as np
+import pytest
+
+from tmlattice import TaylorNetwork, load_ring, one_turn_optics
+from tmlattice.errors import LatticeError, UnknownNameError
+from tmlattice.lattice import middle_of_first_arc
+
+
+def write(folder, text, name="machine.py"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_names_follow_the_rule(small_ring):
+    names = [e.name for e in small_ring.elements]
+    assert len(set(names)) == len(names)
+    assert "bpm_start" in names  # stands once: no number
+    assert [n for n in names if n.startswith("QF")] == [f"QF::{i}" for i in range(16)]
+    assert "generated_a" in names  # OCELOT made up the id: the lowest-sorting variable
+    assert "generated_b" not in names
+    assert not any("ID_" in n for n in names)
+    assert small_ring["qf::3"] is small_ring["QF::3"]  # case does not matter
+    assert small_ring["bpm_start::0"] is small_ring["bpm_start"]
+
+
+def test_element_without_a_variable_is_named_by_its_kind(tmp_path):
+    path = write(
+        tmp_path,
+        "from ocelot import *\nenergy = 1.0\n"
+        "ring = [Quadrupole(l=0.1, k1=1.0), Drift(l=1), Drift(l=1)]",
+    )
+    assert [e.name for e in load_ring(path).elements] == ["quadrupole", "drift::0", "drift::1"]
+
+
+def test_names_that_differ_in_case_are_numbered_together(tmp_path):
+    path = write(
+        tmp_path,
+        "from ocelot import *\nenergy = 1.0\n"
+        "ring = [Quadrupole(l=0.1, eid='QA'), Drift(l=1, eid='d'), Quadrupole(l=0.2, eid='qa')]",
+    )
+    ring = load_ring(path)
+    assert [e.name for e in ring.elements] == ["QA::0", "d", "qa::1"]
+    assert ring["QA::1"].length == 0.2
+
+
+def test_places_and_strengths(small_ring):
+    quadrupole = small_ring["QF::0"]
+    assert (quadrupole.kind, quadrupole.length, quadrupole.k1, quadrupole.s) == (
+        "quadrupole", 0.4, 0.9, 0.2
+    )  # fmt: skip
+    cell = 4 * 0.5 + 2 * 0.4 + 2 * 1.2 + 2 * 0.2 + 2 * 0.5
+    np.testing.assert_allclose(small_ring["QF::7"].s, 7 * cell + 0.2)
+    assert small_ring["sd::0"].k2 == -9.0
+    np.testing.assert_allclose(small_ring["bend::0"].angle, np.pi / 16)
+    assert small_ring.energy == 3.0
+    assert small_ring["wig_1"].kind == "wiggler"
+    assert small_ring.counts()["monitor"] == 35
+
+
+def test_changing_one_place_leaves_the_others_and_the_given_ring(small_ring):
+    changed = small_ring.with_changed("QF::3", k1=0.7)
+    assert changed["QF::3"].k1 == 0.7
+    assert changed["QF::3"].source.k1 == 0.7
+    assert changed["QF::2"].source.k1 == changed["QF::4"].source.k1 == 0.9
+    assert small_ring["QF::3"].source.k1 == 0.9
+    before = TaylorNetwork.from_ring(small_ring).W1
+    after = TaylorNetwork.from_ring(changed).W1
+    moved = (before != after).any(dim=2).any(dim=1).nonzero().ravel().tolist()
+    assert [TaylorNetwork.from_ring(changed).layers[i] for i in moved] == ["QF::3"]
+
+
+def test_matrix_without_a_longitudinal_block_gets_one(small_ring):
+    matrix = small_ring["wig_1"].source.R(3.0)[0]
+    assert matrix[4, 4] == matrix[5, 5] == 1.0
+
+
+def test_monitors_with_no_magnet_between_hang_on_one_layer(small_ring):
+    maps = TaylorNetwork.from_ring(small_ring).maps
+    at = dict(zip(maps.monitors, maps.at, strict=True))
+    assert at["last_a"] == at["last_b"] == len(maps.layers)
+    assert at["bpm_start"] == at["bpm::0"] == 0
+    network = TaylorNetwork(maps)
+    readings = network([[1e-4, 1e-5, 0, 0]])[0].detach().numpy()
+    slope = network.states([[1e-4, 1e-5, 0, 0]])[0, -1, 1]
+    a, b = (readings[maps.monitors.index(name), 0] for name in ("last_a", "last_b"))
+    np.testing.assert_allclose(b - a, 0.5 * slope, rtol=1e-9)  # a drift of 0.5 m between them
+
+
+def test_octupole_is_warned_of(tmp_path):
+    path = write(
+        tmp_path,
+        "from ocelot import *\nenergy = 1.0\n"
+        "cell = [Quadrupole(l=0.1, k1=1.0, eid='q'), Octupole(l=0.1, k3=50.0, eid='oct')]",
+    )
+    with pytest.warns(UserWarning, match="octupole 'oct' is a drift"):
+        ring = load_ring(path)
+    assert ring["oct"].kind == "octupole"
+
+
+def test_energy_is_read_given_or_warned_of(tmp_path):
+    body = "from ocelot import *\nlattice = [Quadrupole(l=0.1, k1=1.0, eid='q')]\n"
+    with pytest.warns(UserWarning, match="no beam energy"):
+        assert load_ring(write(tmp_path, body)).energy == 6.0
+    assert load_ring(write(tmp_path, body), energy=2.5).energy == 2.5
+    twiss = write(tmp_path, body + "tws0 = Twiss()\ntws0.E = 14.0\n", "b.py")
+    assert load_ring(twiss).energy == 14.0
+
+
+@pytest.mark.parametrize("variable", ["ring", "cell", "lattice", "mine"])
+def test_sequence_may_be_nested_or_a_magnetic_lattice(tmp_path, variable):
+    path = write(
+        tmp_path,
+        "from ocelot import *\nenergy = 1.0\nq = Quadrupole(l=0.1, k1=1.0, eid='q')\n"
+        f"{variable} = MagneticLattice((q, (q, [q])))\n",
+    )
+    ring = load_ring(path, sequence="mine" if variable == "mine" else None)
+    assert [e.name for e in ring.magnets] == ["q::0", "q::1", "q::2"]
+
+
+def test_file_is_run_as_a_module_with_its_neighbours(tmp_path):
+    write(tmp_path, "from ocelot import *\nq = Quadrupole(l=0.1, k1=1.0, eid='q')\n", "parts.py")
+    path = write(
+        tmp_path,
+        "from ocelot import *\nfrom parts import q\nenergy = 1.0\nn = 3\n"
+        "ring = [q for i in range(n) if i < n]\n",  # fails under exec(code, globals, locals)
+    )
+    assert len(load_ring(path).magnets) == 3
+
+
+def test_negative_drift_of_rounding_does_not_add_half_a_turn(small_ring):
+    from tmlattice.optics import twiss
+
+    total = twiss(TaylorNetwork.from_ring(small_ring)).total_tunes
+    without = small_ring.elements[: small_ring.index("back")]
+    assert small_ring["back"].length < 0
+    assert len(without) < len(small_ring.elements)
+    assert np.floor(total).tolist() == [3, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "no sequence called ring, cell or lattice"),
+        ("ring = []", "is empty"),
+        ("ring = [1, 2]", "holds 1, which is no element"),
+        ("import no_such_module", "fails to run.*ModuleNotFoundError"),
+        ("ring = [", "fails to run.*SyntaxError"),
+        ("raise SystemExit(3)", "fails to run.*SystemExit"),
+    ],
+)
+def test_damaged_files_end_in_one_sentence(tmp_path, text, message):
+    with pytest.raises(LatticeError, match=message):
+        load_ring(write(tmp_path, text))
+
+
+def test_unknown_names_offer_the_nearest(small_ring, tmp_path):
+    with pytest.raises(UnknownNameError, match=r"no element 'qd:12'; did you mean .*QD::12"):
+        small_ring["qd:12"]
+    with pytest.raises(UnknownNameError, match="no lattice 'petra'; did you mean 'petra3'"):
+        load_ring("petra")
+    with pytest.raises(LatticeError, match="no lattice file"):
+        load_ring(tmp_path / "none.py")
+    with pytest.raises(LatticeError, match="not a Python file"):
+        load_ring(write(tmp_path, "x", "ring.txt"))
+
+
+def test_only_attributes_that_exist_can_change(small_ring):
+    with pytest.raises(LatticeError, match="cannot be changed"):
+        small_ring.with_changed("QF::3", colour_of_paint=1.0)
+    with pytest.raises(LatticeError, match="cannot be changed"):
+        small_ring.with_changed("QF::3", l=1.0)
+
+
+def test_default_magnet_is_in_the_middle_of_the_first_arc(petra3):
+    magnet = middle_of_first_arc(petra3)
+    assert magnet.kind == "quadrupole"
+    assert magnet.k1 < 0
+    bends = [e.s for e in petra3.elements if e.kind == "bend"]
+    assert bends[0] < magnet.s < petra3.length / 8
+    assert abs(magnet.s - (bends[0] + petra3.length / 8 - bends[0]) / 2) < 60
+
+
+def test_tilted_magnet_keeps_its_tilt(tmp_path):
+    path = write(
+        tmp_path,
+        "from ocelot import *\nfrom math import pi\nenergy = 1.0\n"
+        "q = Quadrupole(l=0.1, k1=1.0, tilt=pi/4, eid='skew')\n"
+        "ring = [q, Drift(l=1.0, eid='d'), Monitor(eid='m')]",
+    )
+    ring = load_ring(path)
+    assert ring["skew"].tilt == pytest.approx(np.pi / 4)
+    reading = TaylorNetwork.from_ring(ring)([[1e-3, 0, 0, 0]])[0, 0]
+    assert abs(reading[1].item()) > 1e-5  # x is turned into y
+
+
+def test_design_optics_of_the_small_ring_are_stable(small_network):
+    optics = one_turn_optics(small_network)
+    assert optics.growth == pytest.approx(1.0, abs=1e-12)

@@ -1,0 +1,150 @@
+"""The compiled sweeps against a plain torch loop, and against finite differences."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tmlattice import TaylorNetwork
+from tmlattice.errors import BeamLostError
+from tmlattice.network import sweeps
+from tmlattice.network.reference import plain_readings
+
+
+def dense(network, rng, size=1e-3):
+    """A copy whose weights are all different from zero, as after fine-tuning."""
+    copy = network.copy()
+    with torch.no_grad():
+        for weight in copy.parameters():
+            weight.add_(size * torch.from_numpy(rng.standard_normal(tuple(weight.shape))))
+    return copy
+
+
+@pytest.mark.parametrize("batch", [1, 2, 16, 17, 70, 130])  # every width of block, full and not
+@pytest.mark.parametrize("dimension", [4, 6])
+def test_values_and_gradients_match_the_plain_loop(small_ring, batch, dimension, rng):
+    network = dense(TaylorNetwork.from_ring(small_ring, dimension), rng)
+    launch = torch.from_numpy(1e-4 * rng.standard_normal((batch, dimension)))
+    launch.requires_grad_()
+    mine, plain = network(launch), plain_readings(network, launch)
+    scale = plain.abs().max()
+    assert (mine - plain).abs().max() <= 1e-13 * scale
+    pull = torch.from_numpy(rng.standard_normal(tuple(mine.shape)))
+    wanted = [launch, *network.parameters()]
+    got = torch.autograd.grad((mine * pull).sum(), wanted)
+    expected = torch.autograd.grad((plain * pull).sum(), wanted)
+    for one, other in zip(got, expected, strict=True):
+        assert (one - other).abs().max() <= 1e-10 * other.abs().max()
+
+
+def test_values_and_gradients_match_on_the_whole_ring(petra3_network, rng):
+    launch = torch.from_numpy(1e-3 * rng.standard_normal((2, 4)) * [1, 0.05, 1, 0.05])
+    mine, plain = petra3_network(launch), plain_readings(petra3_network, launch)
+    assert (mine - plain).abs().max() <= 1e-13
+    weights = list(petra3_network.parameters())
+    got = torch.autograd.grad(mine.square().sum(), weights)
+    expected = torch.autograd.grad(plain.square().sum(), weights)
+    for one, other in zip(got, expected, strict=True):
+        assert (one - other).abs().max() <= 1e-10 * other.abs().max()
+
+
+def test_gradcheck_on_a_short_ring(tmp_path, rng):
+    (tmp_path / "short.py").write_text(
+        "from ocelot import *\nenergy = 1.0\n"
+        "q = Quadrupole(l=0.3, k1=1.2, eid='q')\ns = Sextupole(l=0.1, k2=20.0, eid='s')\n"
+        "cell = [Monitor(eid='a'), q, Drift(l=0.5, eid='d'), s, Monitor(eid='b'), Monitor(eid='c')]"
+    )
+    from tmlattice import load_ring
+
+    network = dense(TaylorNetwork.from_ring(load_ring(tmp_path / "short.py")), rng, 0.1)
+    launch = torch.from_numpy(0.1 * rng.standard_normal((2, 4))).requires_grad_()
+    names = [name for name, _ in network.named_parameters()]
+
+    def readings(launch, *weights):
+        return torch.func.functional_call(network, dict(zip(names, weights, strict=True)), launch)
+
+    weights = [w.detach().clone().requires_grad_() for w in network.parameters()]
+    assert torch.autograd.gradcheck(readings, (launch, *weights), eps=1e-6, atol=1e-8)
+
+
+def test_a_layer_that_bends_only_slightly_is_not_skipped(small_network, rng):
+    network = small_network.copy()
+    with torch.no_grad():
+        network.W2[40, 1, 0] += 5.0
+    launch = torch.from_numpy(1e-3 * rng.standard_normal((1, 4)))
+    plain = plain_readings(network, launch)
+    assert (network(launch) - plain).abs().max() <= 1e-13 * plain.abs().max()
+    assert (network(launch) - small_network(launch)).abs().max() > 1e-8
+
+
+def test_tracking_repeats_the_one_turn_chain(small_network, rng):
+    launch = 1e-4 * rng.standard_normal((40, 4)) * [1, 0.1, 1, 0.1]
+    turns = small_network.track(launch, 3)
+    assert turns.shape == (40, 4, 4)
+    np.testing.assert_array_equal(turns[:, 0], launch)
+    closing = small_network.maps.closing
+    state = launch
+    for turn in range(1, 4):
+        state = closing(small_network.states(state)[:, -1])
+        np.testing.assert_allclose(turns[:, turn], state, rtol=1e-12, atol=1e-18)
+
+
+def test_jacobian_of_a_turn_matches_differences(small_network):
+    x = np.array([2e-4, 1e-5, -1e-4, 2e-5])
+    _, jacobian = small_network.one_turn_map(x)
+    h = 1e-7
+    shifted = small_network.track(np.concatenate([x + h * np.eye(4), x - h * np.eye(4)]), 1)[:, 1]
+    np.testing.assert_allclose(
+        jacobian, (shifted[:4] - shifted[4:]).T / (2 * h), rtol=1e-6, atol=1e-6
+    )
+
+
+def test_lost_beam_is_named_by_its_layer(small_network):
+    network = small_network.copy()
+    with torch.no_grad():
+        network.W1[17] *= 1e9
+    with pytest.raises(BeamLostError, match=rf"layer 17 \('{network.layers[17]}'\)"):
+        network([[1e-4, 0, 0, 0]])
+    with pytest.raises(BeamLostError, match=r"trajectory 1 .*turn 1.*layer 17"):
+        network.track([[0, 0, 0, 0], [1e-4, 0, 0, 0]], 5)
+    with pytest.raises(BeamLostError, match="at the launch"):
+        small_network([[np.nan, 0, 0, 0]])
+
+
+@pytest.mark.parametrize("launch", [[0, 0, 0, 0], [[0, 0, 0]], np.zeros((2, 6))])
+def test_launch_of_another_shape_is_refused(small_network, launch):
+    with pytest.raises(ValueError, match="should be"):
+        small_network(launch)
+
+
+def test_packing_is_undone(rng):
+    rows = rng.standard_normal((37, 5, 2))
+    np.testing.assert_array_equal(sweeps.unpack(sweeps.pack(rows, 16), 37), rows)
+
+
+def test_result_does_not_depend_on_the_number_of_threads():
+    code = (
+        "import sys, numpy as np, torch\n"
+        "from tmlattice import TaylorNetwork, load_ring\n"
+        "network = TaylorNetwork.from_ring(load_ring(sys.argv[1]))\n"
+        "launch = 1e-4 * np.random.default_rng(0).standard_normal((300, 4))\n"
+        "readings = network(launch)\n"
+        "readings.square().sum().backward()\n"
+        "import hashlib\n"
+        "digest = hashlib.sha256(readings.detach().numpy().tobytes())\n"
+        "for p in network.parameters(): digest.update(p.grad.numpy().tobytes())\n"
+        "print(digest.hexdigest())\n"
+    )
+    lattice = str(Path(__file__).parent / "lattices" / "small_ring.py")
+    results = set()
+    for threads in ("1", "2", "3"):
+        done = subprocess.run(
+            [sys.executable, "-c", code, lattice], capture_output=True, text=True, check=True,
+            env={**os.environ, "NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+        results.add(done.stdout)
+    assert len(results) == 1

@@ -1,0 +1,5 @@
+"""`python -m tmlattice`."""
+
+from tmlattice.cli.command import main
+
+main()

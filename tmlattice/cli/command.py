@@ -1,0 +1,70 @@
+"""The group of commands, and how any of them ends: a result, or one sentence and a code."""
+
+import os
+import sys
+import warnings
+from typing import NoReturn, TextIO
+
+import click
+
+from tmlattice import __version__
+from tmlattice.cli.info import info
+from tmlattice.cli.study import study
+from tmlattice.cli.tune_fit import tune_fit
+from tmlattice.errors import TmlatticeError
+
+BAD_INPUT = 2
+STOPPED = 130  # as the shell has it for Ctrl-C
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="tmlattice")
+def tmlattice() -> None:
+    """The gap between the model of a storage ring and the ring itself.
+
+    A LATTICE is a built-in name (petra3) or a path to an OCELOT lattice file. Such a file is
+    Python code and is run: load only files that you trust.
+    """
+
+
+tmlattice.add_command(tune_fit)
+tmlattice.add_command(info)
+tmlattice.add_command(study)
+
+
+def main() -> NoReturn:
+    """Run the command line. Exit code 0: done; 2: input that cannot be used; 130: Ctrl-C."""
+    warnings.showwarning = _show_warning
+    try:
+        tmlattice(standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        sys.exit(BAD_INPUT)
+    except click.ClickException as error:
+        _fail(error.format_message(), BAD_INPUT)
+    except TmlatticeError as error:
+        _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
+    except (KeyboardInterrupt, click.exceptions.Abort):
+        click.echo("tmlattice: stopped; nothing was written", err=True)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(STOPPED)  # temporary files are gone; torch and its threads need a second to end
+    sys.exit(0)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    click.echo(f"tmlattice: {message}", err=True)
+    sys.exit(code)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    click.echo(f"tmlattice: warning: {message}", err=True)

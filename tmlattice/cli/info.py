@@ -1,0 +1,94 @@
+"""`tmlattice info`: what a lattice holds and how it focuses."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tmlattice.cli.options import console, json_option, lattice_argument, quiet_option, table
+
+
+@click.command("info")
+@lattice_argument
+@json_option
+@quiet_option
+def info(
+    lattice: str, sequence: str | None, energy: float | None, json_file: Path | None, quiet: bool
+) -> None:
+    """Print counts, length, tunes, chromaticity and betas of LATTICE."""
+    from contextlib import nullcontext
+
+    from tmlattice.files import output_file, write_json
+
+    with output_file(json_file) if json_file else nullcontext() as path:
+        facts = _facts(lattice, sequence, energy)
+        if path:
+            write_json(path, facts)
+    if not quiet:
+        _print(facts)
+
+
+def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str, Any]:
+    from tmlattice import __version__
+    from tmlattice.errors import UnstableRingError
+    from tmlattice.lattice import load_ring
+    from tmlattice.network import TaylorNetwork
+    from tmlattice.optics import off_momentum, twiss
+
+    ring = load_ring(lattice, sequence, energy)
+    facts: dict[str, Any] = {
+        "format": "tmlattice-info",
+        "version": 1,
+        "package": __version__,
+        "lattice": ring.name,
+        "energy_gev": ring.energy,
+        "length": ring.length,
+        "counts": dict(sorted(ring.counts().items())),
+        "layers": len(ring.magnets),
+        "bend_angle": sum(e.angle for e in ring.elements if e.kind == "bend"),
+        "tunes": None,
+        "chromaticity": None,
+        "beta_max": None,
+        "dispersion_max": None,
+        "momentum_compaction": None,
+        "problem": None,
+    }
+    try:
+        functions = twiss(TaylorNetwork.from_ring(ring))
+        facts["tunes"] = functions.total_tunes.tolist()
+        facts["beta_max"] = functions.beta.max(axis=0).tolist()
+        energy_effects = off_momentum(TaylorNetwork.from_ring(ring, 6), ring.length)
+        facts["chromaticity"] = energy_effects.chromaticity.tolist()
+        facts["dispersion_max"] = abs(energy_effects.dispersion).max(axis=0).tolist()
+        facts["momentum_compaction"] = energy_effects.momentum_compaction
+    except UnstableRingError as error:
+        facts["problem"] = str(error)
+    return facts
+
+
+def _print(facts: dict[str, Any]) -> None:
+    screen = console()
+    screen.print(
+        f"{facts['lattice']}: {facts['length']:.4f} m, {facts['energy_gev']:g} GeV, "
+        f"{facts['layers']} magnets, bends sum to {facts['bend_angle']:.9f} rad"
+    )
+    counts = table("elements", "count")
+    for kind, count in facts["counts"].items():
+        counts.add_row(kind, str(count))
+    screen.print(counts)
+    if facts["tunes"] is not None:
+        optics = table("optics", "x", "y")
+        rows = [
+            ("tune", "tunes", "{:.6f}"),
+            ("chromaticity dQ / d delta", "chromaticity", "{:+.3f}"),
+            ("largest beta at a magnet's exit [m]", "beta_max", "{:.2f}"),
+            ("largest dispersion there [m]", "dispersion_max", "{:.4f}"),
+        ]
+        for name, key, form in rows:
+            value = facts[key]
+            optics.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
+        screen.print(optics)
+        if facts["momentum_compaction"] is not None:
+            screen.print(f"momentum compaction {facts['momentum_compaction']:.4e}")
+    if facts["problem"]:
+        screen.print(f"{facts['problem']}")

@@ -1,0 +1,82 @@
+"""Options that several commands share."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+FILE = click.Path(path_type=Path)
+
+
+class Launch(click.ParamType):  # type: ignore[type-arg]
+    """x,px,y,py as one word."""
+
+    name = "x,px,y,py"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """Four finite numbers."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 4 or not all(abs(n) < float("inf") for n in numbers):
+            self.fail(
+                f"'{value}' is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0",
+                param,
+                ctx,
+            )
+        return numbers
+
+
+def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
+    """LATTICE, and which sequence of it, at which energy."""
+    for decorate in (
+        click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
+                     help="Beam energy; else what the lattice states."),
+        click.option("--sequence", metavar="NAME",
+                     help="The lattice file's variable that holds the ring."),
+        click.argument("lattice", default="petra3"),
+    ):  # fmt: skip
+        function = decorate(function)
+    return function
+
+
+def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """--json FILE."""
+    return click.option("--json", "json_file", type=FILE, metavar="FILE",
+                        help="Write the result as JSON.")(function)  # fmt: skip
+
+
+def quiet_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """--quiet."""
+    return click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors.")(function)
+
+
+def console() -> "Console":
+    """Where results are printed: as wide as the terminal, else 100 columns."""
+    from rich.console import Console
+
+    wide = Console(highlight=False, markup=False)
+    return wide if wide.is_terminal else Console(highlight=False, markup=False, width=100)
+
+
+def table(*columns: str) -> "Table":
+    """A table with its first column left, the others right."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    made = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for i, column in enumerate(columns):
+        made.add_column(column, justify="right" if i else "left")
+    return made

@@ -1,0 +1,119 @@
+"""`tmlattice study`: an experiment over many magnets."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tmlattice.cli.options import (
+    Launch,
+    console,
+    json_option,
+    lattice_argument,
+    quiet_option,
+    table,
+)
+
+METHODS = ["symplectic", "none", "l1", "l2"]
+
+
+@click.group("study")
+def study() -> None:
+    """Run an experiment over many magnets."""
+
+
+@study.command("tune-fit")
+@lattice_argument
+@click.option(
+    "--magnets",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Powered quadrupoles, evenly spread over the ring.",
+)
+@click.option("--change", type=float, default=-0.2, show_default=True)
+@click.option("--launch", type=Launch(), default="1e-3,0,1e-3,0", show_default=True)
+@click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True)
+@click.option("--epochs", type=click.IntRange(1), default=1000, show_default=True)
+@click.option("--turns", type=click.IntRange(16), default=500, show_default=True)
+@click.option(
+    "--regularization",
+    "methods",
+    type=click.Choice(METHODS),
+    multiple=True,
+    help="Repeat for several; all where none is named.",
+)
+@click.option("--regularization-rate", type=click.FloatRange(0), default=1e-10, show_default=True)
+@click.option(
+    "--learning-rate", type=click.FloatRange(0, min_open=True), default=1e-6, show_default=True
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--workers", type=click.IntRange(1), help="Processes; else one a core.")
+@json_option
+@quiet_option
+def tune_fit(
+    lattice: str,
+    methods: tuple[str, ...],
+    json_file: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Median, 95th percentile and worst tune error of the paper's recipe, by regularization."""
+    from tmlattice import __version__
+    from tmlattice.files import output_file, write_json
+    from tmlattice.fitting.study import study_tune_fit, summarise
+
+    chosen = methods or tuple(METHODS)
+    with output_file(json_file) if json_file else nullcontext() as path:
+        cases = list(study_tune_fit(lattice, chosen, progress=not quiet, **options))
+        summary = {
+            "format": "tmlattice-study-tune-fit",
+            "version": 1,
+            "package": __version__,
+            "lattice": lattice,
+            "options": {**options, "launch": list(options["launch"])},
+            **summarise(cases),
+            "results": [
+                {
+                    "magnet": case.magnet,
+                    "s": case.s,
+                    "method": case.method,
+                    "abs_dq": None if case.absolute_error is None else [*case.absolute_error],
+                    "rel_dq": None if case.relative_error is None else [*case.relative_error],
+                    "orbit_rms": case.orbit_rms,
+                    "problem": case.problem,
+                }
+                for case in sorted(cases, key=lambda c: (c.s, c.method))
+            ],
+        }
+        if path:
+            write_json(path, summary)
+    if not quiet:
+        _print(summary)
+
+
+def _print(summary: dict[str, Any]) -> None:
+    screen = console()
+    screen.print(
+        f"{summary['cases']} magnets, {summary['unstable']} of them with an unstable ring "
+        "(no tune exists; left out)"
+    )
+    for key, title, form in (
+        ("abs_dq", "|dQ|", "{:.5f}"),
+        ("rel_dq", "|dQ| relative to the fraction", "{:.2%}"),
+    ):
+        errors = table(title, "x median", "p95", "worst", "y median", "p95", "worst",
+                       "predicted", "no tune")  # fmt: skip
+        for name, entry in summary["methods"].items():
+            values = [entry[key][plane][which] for plane in "xy" for which in entry[key][plane]]
+            errors.add_row(
+                name,
+                *("-" if value is None else form.format(value) for value in values),
+                str(entry["predicted"]),
+                str(entry["failed"]),
+            )
+        screen.print(errors)
+    for name, entry in summary["methods"].items():
+        if entry["orbit_rms"] is not None:
+            screen.print(f"{name}: median residual {1e6 * entry['orbit_rms']:.2f} µm rms")

@@ -1,0 +1,174 @@
+"""`tmlattice tune-fit`: from one perturbed first-turn orbit to the tunes."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tmlattice.cli.options import (
+    FILE,
+    Launch,
+    console,
+    json_option,
+    lattice_argument,
+    quiet_option,
+    table,
+)
+
+if TYPE_CHECKING:
+    from tmlattice.fitting import TuneFit
+
+
+@click.command("tune-fit")
+@lattice_argument
+@click.option(
+    "--magnet",
+    metavar="NAME",
+    help="Quadrupole or sextupole to change; else the defocusing quadrupole in the "
+    "middle of the first arc.",
+)
+@click.option(
+    "--change", type=float, default=-0.2, show_default=True, help="Relative change of its strength."
+)
+@click.option(
+    "--launch",
+    type=Launch(),
+    default="1e-3,0,1e-3,0",
+    show_default=True,
+    help="State at the start of the ring, m and rad.",
+)
+@click.option(
+    "--noise",
+    type=click.FloatRange(0),
+    default=2e-5,
+    show_default=True,
+    help="Rms of one reading, m.",
+)
+@click.option("--epochs", type=click.IntRange(1), default=1000, show_default=True)
+@click.option(
+    "--turns",
+    type=click.IntRange(16),
+    default=500,
+    show_default=True,
+    help="Tracked for the tunes.",
+)
+@click.option(
+    "--regularization",
+    type=click.Choice(["symplectic", "none", "l1", "l2"]),
+    default="symplectic",
+    show_default=True,
+)
+@click.option("--regularization-rate", type=click.FloatRange(0), default=1e-10, show_default=True)
+@click.option(
+    "--learning-rate", type=click.FloatRange(0, min_open=True), default=1e-6, show_default=True
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the readings' noise."
+)
+@click.option(
+    "--out",
+    type=FILE,
+    default="tune-fit",
+    show_default=True,
+    metavar="DIR",
+    help="Folder for the three figures and tune-fit.json.",
+)
+@json_option
+@quiet_option
+def tune_fit(
+    lattice: str,
+    sequence: str | None,
+    energy: float | None,
+    out: Path,
+    json_file: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Predict the tunes of a perturbed ring from one first-turn orbit.
+
+    One magnet of LATTICE is weakened, the monitors read one noisy first turn, the network of the
+    unperturbed design is fine-tuned on it, and its tunes are held against OCELOT's true ones.
+    """  # fmt: skip
+    from tmlattice.files import output_file, output_folder, write_json
+
+    with ExitStack() as files:
+        folder = files.enter_context(output_folder(out))
+        extra = files.enter_context(output_file(json_file)) if json_file else None
+        from tmlattice.fitting import tune_fit as run
+        from tmlattice.lattice import load_ring
+
+        ring = load_ring(lattice, sequence, energy)
+        outcome = run(ring, progress=not quiet, **options)
+        _draw(outcome, folder)
+        result = outcome.as_json()
+        for path in (folder / "tune-fit.json", extra):
+            if path:
+                write_json(path, result)
+    if not quiet:
+        _print(outcome, out, json_file)
+
+
+def _draw(outcome: "TuneFit", folder: Path) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum
+
+    orbit = plot_orbit_fit(outcome)
+    spectrum, axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True, layout="constrained")
+    plot_tune_fit_spectrum(outcome, tuple(axes))
+    axes[0].set_xlabel("")
+    axes[0].set_title(f"{outcome.turns} turns through the fine-tuned network")
+    loss, ax = plt.subplots(figsize=(8, 5), layout="constrained")
+    monitors = len(outcome.fit.network.monitors)
+    plot_loss(outcome.fit, ax, floor=2 * monitors * outcome.noise**2)
+    ax.set_title(f"Fine-tuning on one orbit of {monitors} monitors")
+    for figure, name in ((orbit, "orbit"), (spectrum, "spectrum"), (loss, "loss")):
+        figure.savefig(folder / f"{name}.png", dpi=150)
+        plt.close(figure)
+
+
+def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
+    screen = console()
+    magnet = outcome.ring[outcome.magnet]
+    network = outcome.fit.network
+    screen.print(
+        f"{outcome.ring.name}: {outcome.ring.length:.3f} m, "
+        f"{outcome.ring.energy:g} GeV, {len(network.layers)} layers, "
+        f"{len(network.monitors)} monitors\n"
+        f"{magnet.kind} {magnet.name} at s = {magnet.s:.2f} m "
+        f"changed by {100 * outcome.change:+g} %, noise {1e6 * outcome.noise:g} µm"
+    )
+    tunes = table("fractional tunes", "Qx", "Qy")
+    rows = [
+        ("design (OCELOT)", outcome.design_tunes, "{:.6f}"),
+        ("true, perturbed (OCELOT)", outcome.true_tunes, "{:.6f}"),
+        ("fine-tuned network", outcome.network_tunes, "{:.6f}"),
+        ("absolute error", outcome.absolute_error, "{:.6f}"),
+        ("error relative to the fraction", outcome.relative_error, "{:.2%}"),
+    ]
+    for name, value, form in rows:
+        tunes.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
+    screen.print(tunes)
+    if outcome.problem:
+        screen.print(f"{outcome.problem}")
+    before, after = outcome.orbit_rms
+    fit = outcome.fit
+    how = "patience ran out" if fit.stopped_early else "all epochs"
+    orbit = table("readings less network", "rms [µm]")
+    for name, rms in (("before", before), ("after", after), ("noise", outcome.noise)):
+        orbit.add_row(name, f"{1e6 * rms:.2f}")
+    screen.print(orbit)
+    stages = table("stage", *outcome.seconds)
+    stages.add_row("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))
+    screen.print(stages)
+    screen.print(
+        f"{len(fit.loss)} epochs ({how}), regularization {fit.options['regularization']} x "
+        f"{fit.options['regularization_rate']:g}, learning rate {fit.options['learning_rate']:g}, "
+        f"seed {outcome.seed}"
+    )
+    written = f"{out}/: orbit.png, spectrum.png, loss.png, tune-fit.json"
+    screen.print(f"written: {written}" + (f"; {json_file}" if json_file else ""))

@@ -1,0 +1,43 @@
+"""The package's own errors. Each message is one sentence: what is wrong, where, what mends it."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class TmlatticeError(Exception):
+    """Input that cannot be used, or a result that does not exist; the message says the mend."""
+
+
+class LatticeError(TmlatticeError):
+    """A lattice that cannot be found, read or modelled."""
+
+
+class UnknownNameError(LatticeError):
+    """A name that the lattice does not have; the message offers the nearest ones."""
+
+
+class UnstableRingError(TmlatticeError):
+    """A one-turn matrix with growing motion: the ring has no tune."""
+
+
+class BeamLostError(TmlatticeError):
+    """A trajectory that leaves the range in which the maps mean anything."""
+
+
+class TooFewTurnsError(TmlatticeError):
+    """A signal too short for a frequency."""
+
+
+class MeasurementError(TmlatticeError):
+    """A measurement that does not fit the ring, or is not a measurement."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """The error for a `name` that is not among the `known` ones, with the nearest of them."""
+    known = list(known)
+    near = difflib.get_close_matches(name.casefold(), [k.casefold() for k in known], 3, 0.5)
+    original = {k.casefold(): k for k in known}
+    shown = [original[k] for k in near] or known[:3]
+    offer = " or ".join(f"'{k}'" for k in shown)
+    question = f"did you mean {offer}?" if near else f"known are {offer}, ..."
+    return UnknownNameError(f"no {kind} '{name}'; {question}" if shown else f"no {kind} '{name}'")

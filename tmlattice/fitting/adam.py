@@ -1,0 +1,203 @@
+"""Fine-tuning by the paper's recipe: every weight free, Adam, and a symplectic penalty."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from tmlattice.errors import BeamLostError, MeasurementError
+from tmlattice.measurement import Measurement
+from tmlattice.network import TaylorNetwork, symplectic_penalty
+from tmlattice.network.symplectic import symplectic_coefficients
+
+
+class Regularization(StrEnum):
+    """What is added to the loss, times its rate."""
+
+    SYMPLECTIC = "symplectic"
+    NONE = "none"
+    L1 = "l1"
+    L2 = "l2"
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fine-tuned network and how it came about.
+
+    Attributes:
+        network: with the weights of the epoch of least loss.
+        loss: of every epoch, m^2: squared residuals summed over monitors and planes, mean over
+            shots; without the regularization.
+        penalty: of every epoch, the regularization's value before its rate; zeros for "none".
+        best_epoch: the epoch whose weights the network has.
+        stopped_early: True where the patience ran out before the epochs did.
+        seconds: of wall clock.
+        options: everything that the fit was asked for.
+    """
+
+    network: TaylorNetwork
+    loss: list[float]
+    penalty: list[float]
+    best_epoch: int
+    stopped_early: bool
+    seconds: float
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def fine_tune(
+    network: TaylorNetwork,
+    measurement: Measurement,
+    *,
+    epochs: int = 1000,
+    learning_rate: float = 1e-6,
+    regularization: Regularization | str = "symplectic",
+    regularization_rate: float = 1e-10,
+    relative_to_design: bool = False,
+    free: Sequence[str] = ("W1", "W2"),
+    clip: float = 1.0,
+    patience: int | None = 200,
+    progress: bool = True,
+) -> FitResult:
+    """Fit all weights of a network to the first turn of a measurement, by Adam.
+
+    The loss is sum over monitors and planes of (model - reading)^2, mean over shots, in m^2 (the
+    norm is squared), plus rate times the regularization summed over layers:
+
+    - "symplectic": the squares of the coefficients of J^T S J - S (`symplectic_penalty`);
+    - "l1", "l2": sum of |w - w_design| or (w - w_design)^2 over all weights (of the departure from
+      the design: pulled towards zero, a layer would lose the magnet that it stands for);
+    - "none".
+
+    W0 stays as it is unless it is named in `free`: a magnet that has no field on the axis keeps
+    none, and free constant kicks, being the cheapest way to move an orbit, would take up all of a
+    gradient error and leave the tunes where they were.
+
+    The given network is left as it is. The same input gives the same result: nothing is drawn.
+
+    Args:
+        network: the design, or any start.
+        measurement: at least one reading of the first turn; NaN are left out.
+        epochs: gradient steps at most.
+        learning_rate: Adam's. A weight moves by at most about this much a step, whatever its
+            unit.
+        regularization: see above.
+        regularization_rate: lambda. The paper's 1e-10 does nothing in metres.
+        relative_to_design: the symplectic penalty counts departures from the design's own defect.
+        free: names of the weights that move, among W0, W1, W2.
+        clip: largest norm of the gradient, before Adam.
+        patience: stop after this many epochs without a loss lower by 0.1 %; None: never.
+        progress: show a bar where there is a terminal.
+
+    Raises:
+        MeasurementError: no reading of the first turn.
+        UnknownNameError: a monitor that the network does not have.
+        BeamLostError: the fit diverged (the learning rate is too high), or the launch is lost.
+        ValueError: an unknown regularization, or an unknown weight.
+
+    Source: A. Ivanov, U. Iben, A. Golovkina, physics-based polynomial neural networks for one-shot
+    learning of dynamical systems.
+    """
+    regularization = Regularization(regularization)
+    launch = torch.from_numpy(np.ascontiguousarray(measurement.launches, dtype=float))
+    first_turn = measurement.in_order_of(network.monitors)[:, 0]
+    present = np.isfinite(first_turn)
+    if not present.any():
+        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
+    weight = torch.from_numpy(present / len(first_turn))
+    target = torch.from_numpy(np.where(present, first_turn, 0.0))
+
+    model = network.copy()
+    unknown = set(free) - {name for name, _ in model.named_parameters()}
+    if unknown or not free:
+        raise ValueError(f"no weights {sorted(unknown)}; free are some of W0, W1, W2")
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name in free)
+    start = [p.detach().clone() for p in model.parameters()]
+    moving = [p for p in model.parameters() if p.requires_grad]
+    design = (
+        symplectic_coefficients(network.W1, network.W2)
+        if relative_to_design and regularization is Regularization.SYMPLECTIC
+        else None
+    )
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the tensors are small: more threads only wait for each other
+    optimiser = torch.optim.Adam(moving, lr=learning_rate, fused=True)
+    losses: list[float] = []
+    penalties: list[float] = []
+    best, best_epoch, best_weights = np.inf, 0, start
+    milestone, milestone_epoch = np.inf, 0
+    stopped = False
+    begun = time.perf_counter()
+    # disable=None: tqdm is silent where there is no terminal
+    bar = tqdm(range(epochs), "fine-tuning", unit="epoch", disable=None if progress else True)
+    try:
+        for epoch in bar:
+            optimiser.zero_grad()
+            try:
+                readings = model(launch)
+            except BeamLostError as error:
+                if epoch == 0:
+                    raise
+                raise BeamLostError(
+                    f"the fit diverged in epoch {epoch}: lower the learning rate "
+                    f"({learning_rate:g}); {error}"
+                ) from error
+            loss = ((readings - target).square() * weight).sum()
+            penalty = _penalty(model, start, regularization, design)
+            (loss + regularization_rate * penalty).backward()
+            losses.append(loss.item())
+            penalties.append(penalty.item())
+            if losses[-1] < best:
+                best, best_epoch = losses[-1], epoch
+                best_weights = [p.detach().clone() for p in model.parameters()]
+            if losses[-1] < 0.999 * milestone:
+                milestone, milestone_epoch = losses[-1], epoch
+            elif patience is not None and epoch - milestone_epoch >= patience:
+                stopped = True
+                break
+            torch.nn.utils.clip_grad_norm_(moving, clip)
+            optimiser.step()
+    finally:
+        bar.close()
+        torch.set_num_threads(threads)
+    with torch.no_grad():
+        for parameter, kept in zip(model.parameters(), best_weights, strict=True):
+            parameter.copy_(kept)
+    model.requires_grad_(True)
+    return FitResult(
+        network=model,
+        loss=losses,
+        penalty=penalties,
+        best_epoch=best_epoch,
+        stopped_early=stopped,
+        seconds=time.perf_counter() - begun,
+        options={
+            "epochs": epochs,
+            "learning_rate": learning_rate,
+            "regularization": regularization.value,
+            "regularization_rate": regularization_rate,
+            "relative_to_design": relative_to_design,
+            "free": list(free),
+            "clip": clip,
+            "patience": patience,
+        },
+    )
+
+
+def _penalty(
+    model: TaylorNetwork, start: list[Tensor], kind: Regularization, design: Any
+) -> Tensor:
+    if kind is Regularization.SYMPLECTIC:
+        return symplectic_penalty(model.W1, model.W2, design).sum()
+    if kind is Regularization.NONE:
+        return torch.zeros((), dtype=torch.float64)
+    moved = [p - s for p, s in zip(model.parameters(), start, strict=True)]
+    if kind is Regularization.L1:
+        return torch.stack([m.abs().sum() for m in moved]).sum()
+    return torch.stack([m.square().sum() for m in moved]).sum()

@@ -1,0 +1,263 @@
+"""The main experiment: one magnet is weakened, one orbit is measured, the tunes are predicted.
+
+The network knows the design ring and one noisy first-turn orbit of the perturbed one; the tunes
+that it then predicts are held against OCELOT's one-turn matrix of the perturbed ring.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import TmlatticeError, TooFewTurnsError
+from tmlattice.fitting.adam import FitResult, fine_tune
+from tmlattice.harmonics import MIN_TURNS, tunes
+from tmlattice.lattice import Ring, middle_of_first_arc
+from tmlattice.maps import element_map, ring_matrix
+from tmlattice.measurement import Measurement
+from tmlattice.network import TaylorNetwork
+from tmlattice.optics import matrix_tunes, one_turn_optics
+
+Array = NDArray[np.float64]
+
+DEFAULT_LAUNCH = (1e-3, 0.0, 1e-3, 0.0)
+"""x, px, y, py: off axis by 1 mm in both planes."""
+
+TUNE_AMPLITUDE = 1e-4
+"""Part of the launch at which the tunes are taken: tunes shift with the square of the amplitude
+(1e-4 at 1 mm), and the truth is the one-turn matrix's, at zero amplitude; a network with free
+weights is not symplectic, and its motion may grow a thousandfold in 500 turns."""
+
+
+@dataclass(frozen=True)
+class TuneFit:
+    """What `tune_fit` found. Tunes are fractions (x, y); None where there is no tune.
+
+    Attributes:
+        ring: the design.
+        magnet: name of the perturbed magnet.
+        change: relative change of its strength.
+        launch: state at the start of the ring, [n].
+        noise: rms of a reading, m.
+        design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2].
+        network_tunes: from tracking the fine-tuned network, [2].
+        tune_signal: states of that tracking, [1, turns + 1, n].
+        s: of the monitors, m, [monitor].
+        measured, before, after: readings, and the network's before and after fine-tuning,
+            [monitor, 2], m.
+        fit: the fine-tuned network and its history.
+        seconds: of wall clock, by stage.
+        seed: of the noise.
+        turns: tracked for the tunes.
+        problem: why there are no network tunes, or None.
+    """
+
+    ring: Ring
+    magnet: str
+    change: float
+    launch: Array
+    noise: float
+    design_tunes: Array
+    true_tunes: Array
+    network_tunes: Array | None
+    tune_signal: Array | None
+    s: Array
+    measured: Array
+    before: Array
+    after: Array
+    fit: FitResult
+    seconds: dict[str, float]
+    seed: int
+    turns: int
+    problem: str | None = None
+
+    @property
+    def absolute_error(self) -> Array | None:
+        """|network tune - true tune|, the short way round the circle, [2]."""
+        if self.network_tunes is None:
+            return None
+        return np.abs((self.network_tunes - self.true_tunes + 0.5) % 1.0 - 0.5)
+
+    @property
+    def relative_error(self) -> Array | None:
+        """The absolute error over the true fraction, [2]."""
+        error = self.absolute_error
+        return None if error is None else error / self.true_tunes
+
+    @property
+    def orbit_rms(self) -> tuple[float, float]:
+        """rms over monitors and planes of the residual before and after, m."""
+        before, after = (
+            float(np.sqrt(np.mean((self.measured - model) ** 2)))
+            for model in (self.before, self.after)
+        )
+        return before, after
+
+    def as_json(self) -> dict[str, Any]:
+        """The result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""
+        from tmlattice import __version__
+
+        def pair(value: Array | None) -> list[float] | None:
+            return None if value is None else [float(v) for v in value]
+
+        before, after = self.orbit_rms
+        return {
+            "format": "tmlattice-tune-fit",
+            "version": 1,
+            "package": __version__,
+            "lattice": self.ring.name,
+            "layers": len(self.fit.network.layers),
+            "monitors": len(self.fit.network.monitors),
+            "magnet": self.magnet,
+            "change": self.change,
+            "launch": [float(v) for v in self.launch],
+            "tunes": {
+                "design": pair(self.design_tunes),
+                "true": pair(self.true_tunes),
+                "network": pair(self.network_tunes),
+            },
+            "error": {
+                "absolute": pair(self.absolute_error),
+                "relative": pair(self.relative_error),
+            },
+            "orbit_rms": {"before": before, "after": after},
+            "noise": self.noise,
+            "loss": self.fit.loss,
+            "penalty": self.fit.penalty,
+            "seconds": self.seconds,
+            "regularization": self.fit.options["regularization"],
+            "seed": self.seed,
+            "turns": self.turns,
+            "options": self.fit.options,
+            "problem": self.problem,
+        }
+
+
+class _Stopwatch(dict[str, float]):
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        self[name] = self.get(name, 0.0) + time.perf_counter() - begun
+
+
+def perturbed_ring(ring: Ring, magnet: str, change: float) -> Ring:
+    """The ring with the strength of one quadrupole or sextupole changed by a relative amount.
+
+    Raises:
+        TmlatticeError: a magnet of another kind, or one whose strength is zero.
+        UnknownNameError: no such magnet.
+    """
+    element = ring[magnet]
+    attribute = {"quadrupole": "k1", "sextupole": "k2"}.get(element.kind)
+    if attribute is None:
+        raise TmlatticeError(
+            f"'{element.name}' is a {element.kind}; name a quadrupole or a sextupole, whose "
+            "strength can be changed"
+        )
+    strength = getattr(element, attribute)
+    if strength == 0:
+        raise TmlatticeError(
+            f"{element.kind} '{element.name}' has zero strength, which no relative change "
+            "changes; name a powered one"
+        )
+    return ring.with_changed(element.name, **{attribute: strength * (1 + change)})
+
+
+def tune_fit(
+    ring: Ring,
+    magnet: str | None = None,
+    change: float = -0.2,
+    launch: Sequence[float] = DEFAULT_LAUNCH,
+    noise: float = 2e-5,
+    turns: int = 500,
+    seed: int = 0,
+    *,
+    progress: bool = True,
+    **options: Any,
+) -> TuneFit:
+    """Perturb one magnet, measure one first turn, fine-tune the design's network, predict tunes.
+
+    Args:
+        ring: the design.
+        magnet: a quadrupole or sextupole; else the one that `middle_of_first_arc` names.
+        change: relative change of its strength.
+        launch: x, px, y, py at the start of the ring, m and rad.
+        noise: rms of a reading, m; drawn from the seed.
+        turns: tracked for the tunes, at a ten-thousandth of the launch's amplitude.
+        seed: of the noise.
+        progress: show a bar where there is a terminal.
+        options: passed to `fine_tune`.
+
+    Raises:
+        UnstableRingError: the design or the perturbed ring has no tune.
+        BeamLostError: the launch is lost on the first turn, or the fit diverged.
+        TmlatticeError: a magnet that cannot be weakened, negative noise, too few turns.
+    """
+    if not noise >= 0 or not np.isfinite(noise):
+        raise TmlatticeError(f"the noise is {noise:g} m; it is an rms: zero or more")
+    if turns < MIN_TURNS:
+        raise TooFewTurnsError(f"{turns} turns are too few for a tune; {MIN_TURNS} at least do")
+    start = np.asarray(launch, dtype=float)
+    if start.shape != (4,) or not np.isfinite(start).all():
+        raise TmlatticeError("a launch has four finite numbers: x, px, y, py in m and rad")
+    watch = _Stopwatch()
+    begun = time.perf_counter()
+    name = middle_of_first_arc(ring).name if magnet is None else ring[magnet].name
+    with watch.stage("compile"):
+        for element in {e.kind: e for e in ring.elements}.values():
+            element_map(element, ring.energy)  # OCELOT compiles some of its own code
+    with watch.stage("maps"):
+        machine = perturbed_ring(ring, name, change)
+        network = TaylorNetwork.from_ring(ring)
+        truth = TaylorNetwork.from_ring(machine)
+        design_tunes = matrix_tunes(ring_matrix(ring))
+        true_tunes = matrix_tunes(ring_matrix(machine))
+    with watch.stage("compile"):
+        compile_kernels(network)
+    readings = truth(start[None]).detach().numpy()
+    readings = readings + noise * np.random.default_rng(seed).standard_normal(readings.shape)
+    measurement = Measurement(start[None], readings[:, None], network.monitors, (noise, noise))
+    with watch.stage("fit"):
+        fit = fine_tune(network, measurement, progress=progress, **options)
+    found, signal, problem = None, None, None
+    with watch.stage("tunes"):
+        try:
+            optics = one_turn_optics(fit.network)
+            signal = fit.network.track((optics.closed_orbit + TUNE_AMPLITUDE * start)[None], turns)
+            found = tunes(signal, optics).fraction[0]
+        except TmlatticeError as error:
+            problem = f"the fine-tuned network has no tune: {error}"
+    watch["total"] = time.perf_counter() - begun
+    return TuneFit(
+        ring=ring,
+        magnet=name,
+        change=change,
+        launch=start,
+        noise=noise,
+        design_tunes=design_tunes,
+        true_tunes=true_tunes,
+        network_tunes=found,
+        tune_signal=signal,
+        s=network.maps.s_monitors,
+        measured=readings[0],
+        before=network(start[None]).detach().numpy()[0],
+        after=fit.network(start[None]).detach().numpy()[0],
+        fit=fit,
+        seconds=dict(watch),
+        seed=seed,
+        turns=turns,
+        problem=problem,
+    )
+
+
+def compile_kernels(network: TaylorNetwork) -> None:
+    """Compile, or load from the cache, every kernel that a fit of one shot uses."""
+    launch = np.zeros((1, network.dimension))
+    readings = np.zeros((1, 1, len(network.monitors), 2))
+    fine_tune(network, Measurement(launch, readings, network.monitors), epochs=1, progress=False)
+    network.track(launch, 1)

@@ -1,0 +1,137 @@
+"""Tunes from turn-by-turn positions.
+
+>>> states = network.track(launch, turns=500)          # [batch, turns + 1, 4], m
+>>> tune = tunes(states, optics=one_turn_optics(network))
+>>> tune.fraction                                       # [batch, 2], (x, y), in turns
+
+The normalised complex coordinate z = x_N - i p_N, with x_N = x / sqrt(beta) and
+p_N = (alpha x + beta px) / sqrt(beta), turns by +Q a turn, so Q and 1 - Q differ: a real signal
+cannot tell them apart, and the wrong sign would exchange them.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import TooFewTurnsError
+from tmlattice.optics import Optics
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MIN_TURNS = 16
+
+
+class Method(StrEnum):
+    """How a frequency is found in a signal."""
+
+    NAFF = "naff"
+    FFT = "fft"
+
+
+@dataclass(frozen=True)
+class Tunes:
+    """Frequencies of the strongest line of each plane.
+
+    Attributes:
+        fraction: fractional tunes (x, y) in [0, 1), [batch, 2].
+        error: their error, from the difference between the two halves of the signal, [batch, 2]:
+            how far the line is from one steady frequency.
+        amplitude: of the line, as the modulus of z in sqrt(m), [batch, 2].
+        method: which was used.
+        turns: length of the signal.
+    """
+
+    fraction: Array
+    error: Array
+    amplitude: Array
+    method: Method
+    turns: int
+
+
+def tunes(states: Array, optics: Optics | None = None, method: Method | str = "naff") -> Tunes:
+    """The fractional tunes of a turn-by-turn signal, resolved between 0 and 1.
+
+    Args:
+        states: (x, px, y, py, ...) at the start of each turn, [batch, turns, n >= 4], m.
+        optics: Twiss parameters and closed orbit at the same place; else they are taken from the
+            second moments of the signal itself.
+        method: "naff" (nafflib, 1e-9 on a clean signal) or "fft" (Hann window, interpolated,
+            about 1e-6 in 500 turns).
+
+    Raises:
+        TooFewTurnsError: fewer than 16 turns, or a signal that is lost or not finite (names the
+            turn).
+        ValueError: an array of another shape, or an unknown method.
+
+    Source: J. Laskar, Physica D 67 (1993) 257, for NAFF; R. Bartolini et al., Part. Accel. 52
+    (1996) 147, for interpolated FFT with a window.
+    """
+    method = Method(method)
+    states = np.asarray(states, dtype=float)
+    if states.ndim != 3 or states.shape[2] < 4:
+        raise ValueError(f"states have the shape {states.shape}; it should be [batch, turns, 4]")
+    batch, turns = states.shape[:2]
+    if turns < MIN_TURNS:
+        raise TooFewTurnsError(f"{turns} turns are too few for a tune; {MIN_TURNS} at least do")
+    finite = np.all(np.isfinite(states), axis=2)
+    if not finite.all():
+        trajectory = int(np.any(~finite, axis=1).argmax())
+        turn = int((~finite[trajectory]).argmax())
+        raise TooFewTurnsError(f"trajectory {trajectory} is lost in turn {turn}: it has no tune")
+    fraction, error, amplitude = (np.empty((batch, 2)) for _ in range(3))
+    for plane in range(2):
+        z = normalised(states, plane, optics)
+        for trajectory in range(batch):
+            signal = z[trajectory]
+            fraction[trajectory, plane], amplitude[trajectory, plane] = frequency(signal, method)
+            half = turns // 2
+            first, _ = frequency(signal[:half], method)
+            second, _ = frequency(signal[-half:], method)
+            error[trajectory, plane] = abs((first - second + 0.5) % 1.0 - 0.5) / 2
+    return Tunes(fraction, error, amplitude, method, turns)
+
+
+def normalised(states: Array, plane: int, optics: Optics | None = None) -> ComplexArray:
+    """z = x_N - i p_N of one plane (0: x, 1: y), [batch, turns], in sqrt(m)."""
+    x, p = states[..., 2 * plane], states[..., 2 * plane + 1]
+    if optics is not None:
+        x = x - optics.closed_orbit[2 * plane]
+        p = p - optics.closed_orbit[2 * plane + 1]
+        alpha, beta = optics.alpha[plane], optics.beta[plane]
+    else:
+        x = x - x.mean(axis=-1, keepdims=True)
+        p = p - p.mean(axis=-1, keepdims=True)
+        xx, xp, pp = ((a * b).mean(axis=-1, keepdims=True) for a, b in ((x, x), (x, p), (p, p)))
+        area = np.sqrt(np.maximum(xx * pp - xp**2, 1e-300))
+        alpha, beta = -xp / area, np.maximum(xx / area, 1e-300)
+    return np.asarray((x - 1j * (alpha * x + beta * p)) / np.sqrt(beta))
+
+
+def frequency(signal: ComplexArray, method: Method = Method.NAFF) -> tuple[float, float]:
+    """Frequency in [0, 1) and amplitude of the strongest line of a complex signal [turns]."""
+    if method is Method.NAFF:
+        import nafflib  # pulls in pandas
+
+        line, value = nafflib.fundamental_frequency(signal.copy())
+        return float(np.real(value)) % 1.0, float(abs(line))
+    return _interpolated_fft(signal)
+
+
+def _interpolated_fft(signal: ComplexArray) -> tuple[float, float]:
+    """The peak of the Hann-windowed spectrum, between its bins.
+
+    With the Hann window the two largest neighbours of a single line at k + d have the exact ratio
+    r = (1 + d) / (2 - d) for long signals, so d = (2 r - 1) / (r + 1).
+    """
+    turns = len(signal)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(turns) / turns)
+    spectrum = np.abs(np.fft.fft(signal * window))
+    peak = int(spectrum.argmax())
+    right, left = spectrum[(peak + 1) % turns], spectrum[peak - 1]
+    side, ratio = (1, right / spectrum[peak]) if right >= left else (-1, left / spectrum[peak])
+    shift = side * (2 * ratio - 1) / (ratio + 1)
+    hann = np.sinc(shift) / (1 - shift**2) / 2  # the window's response off the bin
+    return ((peak + shift) / turns) % 1.0, float(spectrum[peak] / turns / hann)

@@ -1,0 +1,172 @@
+"""A ring: named elements in beam order, each with the OCELOT object that it stands for."""
+
+import copy
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+from tmlattice.errors import LatticeError, unknown_name
+
+Kind = Literal[
+    "drift",
+    "quadrupole",
+    "bend",
+    "hcorrector",
+    "vcorrector",
+    "sextupole",
+    "octupole",
+    "multipole",
+    "solenoid",
+    "wiggler",
+    "monitor",
+    "marker",
+    "cavity",
+    "matrix",
+]
+
+PASSIVE: frozenset[str] = frozenset({"drift", "monitor", "marker", "cavity"})
+"""Kinds that are no magnets: they belong to the way between two magnets."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """One place in the ring.
+
+    Attributes:
+        name: unique in the ring; `family::k` where the family stands there more than once.
+        family: the name without its number: the magnets that share it share a power supply.
+        kind: what it is, see `Kind`.
+        s: position of its middle from the start of the sequence, m.
+        length: m.
+        k1, k2: normal quadrupole and sextupole strength, 1/m2 and 1/m3 (0 where it has none).
+        angle: bend angle, or the kick of a corrector, rad.
+        tilt: rotation about the beam axis, rad.
+        source: the OCELOT element; shared by all places of one object, so never change it
+            (`Ring.with_changed` copies).
+    """
+
+    name: str
+    family: str
+    kind: Kind
+    s: float
+    length: float
+    k1: float
+    k2: float
+    angle: float
+    tilt: float
+    source: Any = field(repr=False, compare=False)
+
+    @property
+    def is_magnet(self) -> bool:
+        """True for everything that is not a drift, a monitor, a marker or a cavity."""
+        return self.kind not in PASSIVE
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Elements in beam order, and the beam energy.
+
+    Attributes:
+        name: the name or the path that it was loaded by.
+        elements: in beam order from the start of the sequence.
+        energy: GeV.
+        changes: what was changed since it was loaded, by element name.
+    """
+
+    name: str
+    elements: tuple[Element, ...]
+    energy: float
+    changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @cached_property
+    def length(self) -> float:
+        """Circumference, m."""
+        return sum(element.length for element in self.elements)
+
+    @cached_property
+    def monitors(self) -> tuple[Element, ...]:
+        """The beam position monitors in beam order."""
+        return tuple(e for e in self.elements if e.kind == "monitor")
+
+    @cached_property
+    def magnets(self) -> tuple[Element, ...]:
+        """The magnets in beam order: one layer of the network each."""
+        return tuple(e for e in self.elements if e.is_magnet)
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        index = {element.name.casefold(): i for i, element in enumerate(self.elements)}
+        for i, element in enumerate(self.elements):  # a name that stands once is also name::0
+            index.setdefault(f"{element.name.casefold()}::0", i)
+        return index
+
+    def index(self, name: str) -> int:
+        """Place of the element of this name in `elements`; case does not matter.
+
+        Raises:
+            UnknownNameError: with the nearest names.
+        """
+        try:
+            return self._index[name.strip().casefold()]
+        except KeyError:
+            raise unknown_name("element", name, (e.name for e in self.elements)) from None
+
+    def __getitem__(self, name: str) -> Element:
+        return self.elements[self.index(name)]
+
+    def counts(self) -> dict[str, int]:
+        """Number of elements by kind."""
+        return dict(Counter(element.kind for element in self.elements))
+
+    def with_changed(self, name: str, **attributes: float) -> "Ring":
+        """A new ring in which one element has other attributes; this one stays as it is.
+
+        Args:
+            name: the element.
+            attributes: OCELOT's names and units: k1=, k2=, angle=, tilt=, ...
+
+        Raises:
+            UnknownNameError: no such element.
+            LatticeError: the element has no such attribute, or its length would change.
+        """
+        place = self.index(name)
+        old = self.elements[place]
+        source = copy.deepcopy(old.source)  # the object may stand in many places
+        for attribute, amount in attributes.items():
+            if attribute == "l" or not hasattr(source, attribute):
+                raise LatticeError(
+                    f"'{attribute}' of {old.kind} '{old.name}' cannot be changed; "
+                    "strengths and angles can (k1, k2, angle, tilt)"
+                )
+            setattr(source, attribute, amount)
+        known: dict[str, Any] = {
+            k: v for k, v in attributes.items() if k in ("k1", "k2", "angle", "tilt")
+        }
+        new = replace(old, source=source, **known)
+        changed = {**self.changes, old.name: {**self.changes.get(old.name, {}), **attributes}}
+        return replace(
+            self,
+            elements=(*self.elements[:place], new, *self.elements[place + 1 :]),
+            changes=changed,
+        )
+
+
+def number_names(names: Iterable[str]) -> list[str]:
+    """Names made unique: one that stands more than once becomes name::0, name::1, ... in order.
+
+    Names that differ only in case are the same name.
+    """
+    names = list(names)
+    total = Counter(name.casefold() for name in names)
+    seen: Counter[str] = Counter()
+    numbered = []
+    for name in names:
+        key = name.casefold()
+        numbered.append(f"{name}::{seen[key]}" if total[key] > 1 else name)
+        seen[key] += 1
+    return numbered
+
+
+KINDS: tuple[str, ...] = get_args(Kind)

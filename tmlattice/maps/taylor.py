@@ -1,0 +1,249 @@
+"""The algebra of truncated Taylor maps of any order and dimension.
+
+A map sends x [n] to W0 + W1 x + W2 x^[2] + ..., where x^[k] holds the products of k coordinates in
+the reduced Kronecker order: x1^2, x1 x2, ..., x1 xn, x2^2, ..., xn^2 for k = 2. Each Wk is
+[n, C(n + k - 1, k)].
+
+Inside, a polynomial is one row over all monomials of degree 0 to the order, degree by degree; the
+product of two is a table look-up, made once for each dimension and order.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement, pairwise
+from math import comb
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+def kronecker_exponents(n: int, degree: int) -> list[tuple[int, ...]]:
+    """Exponents of the monomials of one degree in n variables, in the reduced Kronecker order."""
+    return [
+        tuple(variables.count(i) for i in range(n))
+        for variables in combinations_with_replacement(range(n), degree)
+    ]
+
+
+def second_derivatives(W2: Array) -> Array:
+    """d2 (image) / d x_i d x_j [..., n, n, n] of second-order coefficients W2 [..., n, pairs]."""
+    n = W2.shape[-2]
+    i, j = np.triu_indices(n)
+    pair = np.empty((n, n), dtype=np.intp)
+    pair[i, j] = pair[j, i] = np.arange(len(i))
+    return np.asarray(W2[..., pair] * (1.0 + np.eye(n)))
+
+
+def symplectic_form(n: int) -> Array:
+    """S [n, n] of the symplectic condition J^T S J = S, in OCELOT's order of coordinates.
+
+    Two or four coordinates: diag(J, ...), J = [[0, 1], [-1, 0]]. Six: diag(J, J, -J), because
+    OCELOT's (tau, p) has the opposite sign.
+    """
+    signs = [1.0, 1.0, -1.0] if n == 6 else [1.0] * (n // 2)
+    if n % 2 or n > 6:
+        raise ValueError(f"no symplectic form for {n} coordinates: 2, 4 and 6 have one")
+    return np.kron(np.diag(signs), np.array([[0.0, 1.0], [-1.0, 0.0]]))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Monomials of degree 0 to `order`, and how they multiply."""
+
+    exponents: Indices  # [monomial, n]
+    starts: tuple[int, ...]  # of each degree, and the end
+    parents: Indices  # [monomial, 2]: it is monomial parents[., 0] times variable parents[., 1]
+    left: Indices  # products left * right = target that stay within the order
+    right: Indices
+    target: Indices
+
+    def multiply(self, a: Array, b: Array) -> Array:
+        """Product of polynomials [..., monomial], truncated at the order."""
+        products = a[..., self.left] * b[..., self.right]
+        result = np.zeros(np.broadcast_shapes(a.shape, b.shape))
+        np.add.at(result, (..., self.target), products)  # type: ignore[arg-type]
+        return result
+
+    def monomials(self, factors: Array) -> list[Array]:
+        """All monomials of the given n polynomials `factors` [n, monomial], truncated."""
+        one = np.zeros_like(factors[0])
+        one[0] = 1.0
+        values = [one]
+        for parent, variable in self.parents[1:]:
+            values.append(self.multiply(values[parent], factors[variable]))
+        return values
+
+
+@functools.cache
+def _table(n: int, order: int) -> _Table:
+    rows: list[tuple[int, ...]] = []
+    starts = [0]
+    for degree in range(order + 1):
+        rows += kronecker_exponents(n, degree)
+        starts.append(len(rows))
+    index = {row: i for i, row in enumerate(rows)}
+    parents = [(0, 0)]
+    for row in rows[1:]:
+        variable = next(i for i in range(n) if row[i])
+        below = tuple(e - (i == variable) for i, e in enumerate(row))
+        parents.append((index[below], variable))
+    left, right, target = [], [], []
+    for i, a in enumerate(rows):
+        for j, b in enumerate(rows[: starts[order - sum(a) + 1]]):
+            left.append(i)
+            right.append(j)
+            target.append(index[tuple(x + y for x, y in zip(a, b, strict=True))])
+    arrays = (np.array(v, dtype=np.intp) for v in (rows, parents, left, right, target))
+    exponents, parent_array, left_array, right_array, target_array = arrays
+    return _Table(
+        exponents.reshape(len(rows), n),
+        tuple(starts),
+        parent_array,
+        left_array,
+        right_array,
+        target_array,
+    )
+
+
+class TaylorMap:
+    """x -> W0 + W1 x + W2 x^[2] + ... + Wp x^[p], truncated at order p.
+
+    Args:
+        coefficients: W0 [n], W1 [n, n], W2 [n, n (n + 1) / 2], ..., Wp [n, C(n + p - 1, p)] in
+            the reduced Kronecker order; the units are the coordinates' own.
+
+    Attributes:
+        n: number of coordinates.
+        order: p.
+
+    Raises:
+        ValueError: a coefficient array of another shape (the message says which it should be).
+
+    Source: A. Ivanov, S. Golovkina, U. Iben, physics-based polynomial neural networks.
+    """
+
+    def __init__(self, coefficients: Sequence[ArrayLike]) -> None:
+        arrays = [np.array(w, dtype=float) for w in coefficients]
+        if len(arrays) < 2 or arrays[0].ndim != 1:
+            raise ValueError("a map has at least W0 [n] and W1 [n, n]")
+        self.n = len(arrays[0])
+        self.order = len(arrays) - 1
+        for degree, w in enumerate(arrays[1:], start=1):
+            wanted = (self.n, comb(self.n + degree - 1, degree))
+            if w.shape != wanted:
+                raise ValueError(f"W{degree} has the shape {w.shape}; it should be {wanted}")
+        self._rows = np.concatenate([arrays[0][:, None], *arrays[1:]], axis=1)
+
+    @classmethod
+    def _of_rows(cls, rows: Array, order: int) -> "TaylorMap":
+        new = cls.__new__(cls)
+        new.n, new.order, new._rows = len(rows), order, rows
+        return new
+
+    @classmethod
+    def identity(cls, n: int, order: int = 1) -> "TaylorMap":
+        """The map that moves nothing."""
+        return cls.linear(np.eye(n), order)
+
+    @classmethod
+    def linear(cls, matrix: ArrayLike, order: int = 1) -> "TaylorMap":
+        """The map x -> matrix x, with zero coefficients up to `order`."""
+        matrix = np.asarray(matrix, dtype=float)
+        n = len(matrix)
+        higher = [np.zeros((n, comb(n + k - 1, k))) for k in range(2, order + 1)]
+        return cls([np.zeros(n), matrix, *higher])
+
+    @property
+    def _table(self) -> _Table:
+        return _table(self.n, self.order)
+
+    @property
+    def coefficients(self) -> list[Array]:
+        """W0 [n], W1 [n, n], W2 [n, n (n + 1) / 2], ..., copies."""
+        starts = self._table.starts
+        parts = [self._rows[:, a:b].copy() for a, b in pairwise(starts)]
+        return [parts[0][:, 0], *parts[1:]]
+
+    def __repr__(self) -> str:
+        return f"TaylorMap(n={self.n}, order={self.order})"
+
+    def __call__(self, x: ArrayLike) -> Array:
+        """Images of the states x [..., n], the same shape."""
+        x = np.asarray(x, dtype=float)
+        values = np.ones((*x.shape[:-1], len(self._table.exponents)))
+        for i, (parent, variable) in enumerate(self._table.parents[1:], start=1):
+            values[..., i] = values[..., parent] * x[..., variable]
+        return np.asarray(values @ self._rows.T)
+
+    def truncated(self, order: int) -> "TaylorMap":
+        """The same map cut, or filled with zeros, to another order."""
+        rows = np.zeros((self.n, _table(self.n, order).starts[-1]))
+        kept = min(rows.shape[1], self._rows.shape[1])
+        rows[:, :kept] = self._rows[:, :kept]
+        return self._of_rows(rows, order)
+
+    def after(self, first: "TaylorMap", order: int | None = None) -> "TaylorMap":
+        """This map after `first`: x -> self(first(x)), truncated at `order` (else the higher).
+
+        Exact up to the order, constant terms included; see `__matmul__`.
+        """
+        if first.n != self.n:
+            raise ValueError(f"maps of {self.n} and {first.n} coordinates do not compose")
+        order = max(self.order, first.order) if order is None else order
+        table = _table(self.n, order)
+        inner = first.truncated(order)._rows
+        # The outer map enters with all its terms: a constant in `first` feeds them down.
+        outer_table = self._table
+        values = [np.eye(1, inner.shape[1])[0]]
+        for parent, variable in outer_table.parents[1:]:
+            values.append(table.multiply(values[parent], inner[variable]))
+        return self._of_rows(self._rows @ np.array(values), order)
+
+    def __matmul__(self, first: "TaylorMap") -> "TaylorMap":
+        """`second @ first`: first `first`, then `second`, as with matrices."""
+        return self.after(first)
+
+    def jacobian(self, x: ArrayLike) -> Array:
+        """d image / d x at the states x [..., n], [..., n (image), n (x)]."""
+        x = np.asarray(x, dtype=float)
+        columns = [self._derivative(i) for i in range(self.n)]
+        if self.order == 1:
+            constant = np.stack([column[:, 0] for column in columns], axis=-1)
+            return np.broadcast_to(constant, (*x.shape[:-1], self.n, self.n)).copy()
+        maps = [self._of_rows(column, self.order - 1) for column in columns]
+        return np.stack([m(x) for m in maps], axis=-1)
+
+    def _derivative(self, i: int) -> Array:
+        """Rows over monomials up to order - 1 of the derivative by x_i."""
+        lower = _table(self.n, self.order - 1)
+        index = {tuple(row): k for k, row in enumerate(lower.exponents.tolist())}
+        rows = np.zeros((self.n, len(lower.exponents)))
+        for k, exponents in enumerate(self._table.exponents.tolist()):
+            if exponents[i]:
+                below = list(exponents)
+                below[i] -= 1
+                rows[:, index[tuple(below)]] += exponents[i] * self._rows[:, k]
+        return rows
+
+    def symplectic_defect(self) -> list[Array]:
+        """Coefficients of J(x)^T S J(x) - S by degree 0, 1, ..., 2 (order - 1).
+
+        Entry k is [n, n, monomials of degree k]; all are zero for a symplectic map. A truncated
+        map of a magnet has its first non-zero entry at degree `order`.
+        """
+        degree = 2 * (self.order - 1)
+        table = _table(self.n, degree)
+        jacobian = np.zeros((self.n, self.n, table.starts[-1]))
+        for i in range(self.n):
+            column = self._derivative(i)
+            jacobian[:, i, : column.shape[1]] = column
+        form = symplectic_form(self.n)
+        defect = np.zeros_like(jacobian)
+        defect[:, :, 0] -= form
+        for a, b in zip(*np.nonzero(form), strict=True):
+            defect += form[a, b] * table.multiply(jacobian[a][:, None, :], jacobian[b][None, :, :])
+        return [defect[:, :, a:b] for a, b in pairwise(table.starts)]

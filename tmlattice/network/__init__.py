@@ -1,0 +1,12 @@
+"""The ring as a network: one unshared second-order layer per magnet, one read-out per monitor.
+
+>>> network = TaylorNetwork.from_ring(load_ring("petra3"))
+>>> network(launch)                     # readings [batch, monitor, 2], differentiable
+>>> network.track(launch, turns=500)    # states [batch, turns + 1, n]
+>>> symplectic_penalty(network.W1, network.W2).sum()
+"""
+
+from tmlattice.network.network import TaylorNetwork
+from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
+
+__all__ = ["TaylorNetwork", "penalty_parts", "symplectic_penalty"]

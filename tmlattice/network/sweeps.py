@@ -1,0 +1,208 @@
+"""The compiled sweeps: trajectories forward through all layers, sensitivities back.
+
+A layer takes the state x [n] to W0 + W1 x + W2 [x]^2, with the products x_i x_j (i <= j) in the
+reduced Kronecker order. A ring is a chain of some 1500 layers that differ from each other, so the
+chain is the loop, and the weights stream through it once for every block of `lanes` trajectories.
+The dimension and the number of lanes are compile-time constants: the compiler unrolls the small
+loops, runs one trajectory as a short chain of fused products (lanes = 1), and fills the vector
+unit with many (lanes = 64). Blocks are shared among threads; sums over trajectories are taken in
+one fixed order, so the result does not depend on their number.
+
+Axes: `states` [block, layer + 1, n, lane], `W0` [layer, n], `W1` [layer, n, n],
+`W2` [layer, n, n (n + 1) / 2], read-outs `R0` [monitor, 2], `R1` [monitor, 2, n],
+`R2` [monitor, 2, n (n + 1) / 2].
+"""
+
+from collections.abc import Callable
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.network.threads import share
+
+Array = NDArray[np.float64]
+Size = tuple[tuple[None, ...], tuple[None, ...]]
+
+LANES = (1, 16, 64)
+"""Trajectories that a block may hold: one, a few, many. One needs the shortest chain of
+operations; many need long rows for the vector unit."""
+
+
+def run(kernel: Callable[..., None], count: int, size: Size, *arguments: object) -> None:
+    """Call `kernel(first, last, size, *arguments)` over `count` blocks or layers.
+
+    Many trajectories are shared among threads; for one or a few, waking a thread costs more than
+    it saves.
+    """
+    if len(size[1]) < LANES[-1]:
+        kernel(0, count, size, *arguments)
+    else:
+        share(kernel, count, size, *arguments)
+
+
+_PLANES = (None, None)
+
+# Products are fused into sums (`contract`): exact to rounding, and repeatable. Nothing else of fast
+# mathematics touches a state. Sums over lanes (`reassoc`) may follow the vector unit's order.
+_jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+_jit_sums = numba.njit(
+    nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc"}
+)
+
+
+@_jit
+def _polynomial(size, k, W0, W1, W2, curved, x, y):  # type: ignore[no-untyped-def]
+    """y [., lane] = polynomial k of x [n, lane], in Horner's form: few and short chains."""
+    n, lanes = len(size[0]), len(size[1])
+    for a in range(y.shape[0]):
+        if curved[k]:
+            for v in range(lanes):
+                total = W0[k, a]
+                m = 0
+                for i in range(n):
+                    slope = W1[k, a, i]
+                    for j in range(i, n):
+                        slope += W2[k, a, m] * x[j, v]
+                        m += 1
+                    total += slope * x[i, v]
+                y[a, v] = total
+        else:
+            for v in range(lanes):
+                total = W0[k, a]
+                for i in range(n):
+                    total += W1[k, a, i] * x[i, v]
+                y[a, v] = total
+
+
+@_jit
+def _pull(size, rows, k, W1, W2, curved, x, above, below):  # type: ignore[no-untyped-def]
+    """below [n, lane] += J(x)^T above [row, lane]: a sensitivity carried back through
+    polynomial k."""
+    n, lanes, height = len(size[0]), len(size[1]), len(rows)
+    for i in range(n):
+        for v in range(lanes):
+            total = below[i, v]
+            for a in range(height):
+                total += W1[k, a, i] * above[a, v]
+            below[i, v] = total
+    if curved[k]:
+        m = 0
+        for i in range(n):
+            for j in range(i, n):
+                for v in range(lanes):
+                    bend = 0.0
+                    for a in range(height):
+                        bend += W2[k, a, m] * above[a, v]
+                    below[i, v] += bend * x[j, v]
+                    below[j, v] += bend * x[i, v]
+                m += 1
+
+
+@_jit
+def forward(first, last, size, W0, W1, W2, curved, states):  # type: ignore[no-untyped-def]
+    """Fill states [block, 1:, n, lane] from states[block, 0]."""
+    for block in range(first, last):
+        for k in range(W0.shape[0]):
+            _polynomial(size, k, W0, W1, W2, curved, states[block, k], states[block, k + 1])
+
+
+@_jit
+def track(first, last, size, W0, W1, W2, curved, turns):  # type: ignore[no-untyped-def]
+    """Fill turns [block, 1:, n, lane] from turns[block, 0]; states inside a turn are not kept."""
+    n, lanes = len(size[0]), len(size[1])
+    x = np.empty((n, lanes))
+    y = np.empty((n, lanes))
+    for block in range(first, last):
+        x[:] = turns[block, 0]
+        for turn in range(1, turns.shape[1]):
+            for k in range(W0.shape[0]):
+                _polynomial(size, k, W0, W1, W2, curved, x, y)
+                for a in range(n):
+                    for v in range(lanes):
+                        x[a, v] = y[a, v]
+            turns[block, turn] = x
+
+
+@_jit
+def read(first, last, size, R0, R1, R2, bent, at, states, readings):  # type: ignore[no-untyped-def]
+    """Fill readings [block, monitor, 2, lane]; monitor m reads the state at exit `at[m]`."""
+    for block in range(first, last):
+        for m in range(R0.shape[0]):
+            _polynomial(size, m, R0, R1, R2, bent, states[block, at[m]], readings[block, m])
+
+
+@_jit
+def reverse(  # type: ignore[no-untyped-def]
+    first, last, size, W1, W2, curved, R1, R2, bent, start, states, pulls, adjoint
+):
+    """Fill adjoint [block, layer + 1, n, lane] = d loss / d states from
+    pulls [block, monitor, 2, lane] = d loss / d readings.
+
+    The monitors at exit k are start[k] to start[k + 1] - 1: they stand in beam order.
+    """
+    n, lanes = len(size[0]), len(size[1])
+    for block in range(first, last):
+        for k in range(W1.shape[0], -1, -1):
+            below = adjoint[block, k]
+            for b in range(n):
+                for v in range(lanes):
+                    below[b, v] = 0.0
+            if k < W1.shape[0]:
+                _pull(
+                    size, size[0], k, W1, W2, curved, states[block, k], adjoint[block, k + 1], below
+                )
+            for m in range(start[k], start[k + 1]):
+                _pull(size, _PLANES, m, R1, R2, bent, states[block, k], pulls[block, m], below)
+
+
+@_jit_sums
+def weights(first, last, size, states, adjoint, G0, G1, G2):  # type: ignore[no-untyped-def]
+    """Gradients of the weights of the layers first to last - 1, summed over trajectories."""
+    n, lanes = len(size[0]), len(size[1])
+    for k in range(first, last):
+        for block in range(states.shape[0]):
+            x = states[block, k]
+            for a in range(n):
+                up = adjoint[block, k + 1, a]
+                total = 0.0
+                for v in range(lanes):
+                    total += up[v]
+                G0[k, a] += total
+                m = 0
+                for i in range(n):
+                    total = 0.0
+                    for v in range(lanes):
+                        total += up[v] * x[i, v]
+                    G1[k, a, i] += total
+                    for j in range(i, n):
+                        total = 0.0
+                        for v in range(lanes):
+                            total += up[v] * x[i, v] * x[j, v]
+                        G2[k, a, m] += total
+                        m += 1
+
+
+def size_of(n: int, batch: int) -> Size:
+    """The compile-time constants of the kernels: their lengths are the dimension and the lanes."""
+    return (None,) * n, (None,) * lanes_for(batch)
+
+
+def lanes_for(batch: int) -> int:
+    """How many trajectories a block holds for a batch of this size."""
+    return next((lanes for lanes in LANES if batch <= lanes), LANES[-1])
+
+
+def pack(rows: Array, lanes: int) -> Array:
+    """Trajectories [batch, ...] as blocks [block, ..., lane], the last one filled up with zeros."""
+    blocks = -(-len(rows) // lanes)
+    padded = np.zeros((blocks * lanes, *rows.shape[1:]))
+    padded[: len(rows)] = rows
+    folded = padded.reshape(blocks, lanes, *rows.shape[1:])
+    return np.ascontiguousarray(np.moveaxis(folded, 1, -1))
+
+
+def unpack(blocks: Array, batch: int) -> Array:
+    """The inverse of `pack`: [block, ..., lane] as [batch, ...], a copy."""
+    rows = np.moveaxis(blocks, -1, 1)
+    return np.ascontiguousarray(rows.reshape(-1, *rows.shape[2:])[:batch])

@@ -1,0 +1,244 @@
+"""Closed orbit, Twiss parameters, integer tunes and chromaticity of a network.
+
+Everything comes from the layers' own maps: the one-turn matrix is the product of their Jacobians
+along the closed orbit, the betas and phases come from carrying its eigenvectors round the ring.
+
+>>> optics = one_turn_optics(network)
+>>> optics.tunes                                   # fractions of Qx, Qy
+>>> functions = twiss(network)
+>>> functions.total_tunes                          # with their integers
+>>> off_momentum(TaylorNetwork.from_ring(ring, 6)).chromaticity
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import UnstableRingError
+from tmlattice.maps.taylor import symplectic_form
+from tmlattice.network import TaylorNetwork
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Linear motion at the start of the ring.
+
+    Attributes:
+        tunes: fractional tunes (x, y) in [0, 1), [2].
+        alpha, beta: Twiss parameters of each plane (of the mode that lives mostly in it), 1 and m,
+            [2]; exact where the planes are not coupled.
+        closed_orbit: the state that repeats, [n].
+        growth: the modulus of an eigenvalue that is furthest from 1: how much the amplitude grows
+            or shrinks in a turn; 1 for a symplectic map.
+    """
+
+    tunes: Array
+    alpha: Array
+    beta: Array
+    closed_orbit: Array
+    growth: float
+
+
+@dataclass(frozen=True)
+class Twiss:
+    """Optical functions at the start and at the exit of every layer.
+
+    Attributes:
+        s: m, [layer + 1].
+        beta: m, [layer + 1, 2].
+        alpha: [layer + 1, 2].
+        phase: turns since the start, [layer + 1, 2].
+        total_tunes: Qx, Qy with their integers, [2].
+    """
+
+    s: Array
+    beta: Array
+    alpha: Array
+    phase: Array
+    total_tunes: Array
+
+
+@dataclass(frozen=True)
+class OffMomentum:
+    """What depends on the energy, from six-dimensional maps at +-delta.
+
+    Attributes:
+        chromaticity: dQ / d delta of each plane, [2].
+        s: m, [layer + 1].
+        dispersion: d(x, y) / d delta at the start and at the layers' exits, m, [layer + 1, 2].
+        momentum_compaction: relative lengthening of the turn's time per delta: the path's, less
+            1 / gamma^2 (7e-9 at 6 GeV).
+    """
+
+    chromaticity: Array
+    s: Array
+    dispersion: Array
+    momentum_compaction: float
+
+
+def normal_modes(matrix: Array) -> tuple[ComplexArray, ComplexArray]:
+    """Eigenvalues exp(2 pi i Q) [2] and eigenvectors [4, 2] of a 4x4 one-turn matrix, (x, y).
+
+    The eigenvectors turn forward and are scaled to v^H S v = 2 i, so that beta = |v_x|^2 and
+    alpha = -Re(v_x^* v_px).
+
+    A map that is not quite symplectic (a fine-tuned network with free weights) may have
+    eigenvalues off the unit circle; as long as they turn, they have a tune.
+
+    Raises:
+        UnstableRingError: motion that grows without turning, in a plane or on a sum resonance.
+    """
+    values, vectors = np.linalg.eig(matrix.astype(complex))
+    area = np.imag(np.einsum("ak,ab,bk->k", vectors.conj(), symplectic_form(4), vectors)) / 2
+    forward = np.flatnonzero(area > 1e-9)
+    if len(forward) != 2:
+        traces = matrix[0, 0] + matrix[1, 1], matrix[2, 2] + matrix[3, 3]
+        raise UnstableRingError(
+            "the ring is unstable: its one-turn matrix has half traces of "
+            f"{traces[0] / 2:.4f} (x) and {traces[1] / 2:.4f} (y) and an eigenvalue of modulus "
+            f"{np.abs(values).max():.4g}, so no tune exists; change the magnet by less"
+        )
+    vectors = vectors[:, forward] / np.sqrt(area[forward])
+    in_x = np.imag(vectors[0].conj() * vectors[1])  # the share of each mode's area in x
+    order = np.argsort(-in_x)
+    return values[forward][order], vectors[:, order]
+
+
+def matrix_tunes(matrix: Array) -> Array:
+    """Fractional tunes (x, y) in [0, 1) of a 4x4 one-turn matrix, [2].
+
+    Q and 1 - Q are told apart by the direction in which the eigenvectors turn.
+
+    Raises:
+        UnstableRingError: no tune exists.
+    """
+    values, _ = normal_modes(matrix)
+    return np.asarray(np.angle(values) / (2 * np.pi) % 1.0)
+
+
+def closed_orbit(network: TaylorNetwork, delta: float = 0.0, tolerance: float = 1e-14) -> Array:
+    """The state [n] that repeats after a turn, in x, px, y, py, by Newton's method.
+
+    Args:
+        network: four or six coordinates; in six, tau stays 0 and p stays `delta`.
+        delta: relative energy deviation p, six coordinates only.
+        tolerance: m and rad.
+
+    Raises:
+        UnstableRingError: there is none within reach.
+    """
+    x = np.zeros(network.dimension)
+    if network.dimension == 6:
+        x[5] = delta
+    for _ in range(30):
+        image, jacobian = network.one_turn_map(x)
+        miss = image[:4] - x[:4]
+        if not np.isfinite(miss).all():
+            break
+        try:
+            step = np.linalg.solve(np.eye(4) - jacobian[:4, :4], miss)
+        except np.linalg.LinAlgError:
+            break
+        x[:4] += step
+        if np.abs(step).max() < max(tolerance, 1e-12 * np.abs(x[:4]).max()):
+            return x
+    raise UnstableRingError(
+        "no closed orbit: Newton's method does not settle; the ring is at an integer resonance or "
+        "its kicks are too large"
+    )
+
+
+def one_turn_optics(network: TaylorNetwork) -> Optics:
+    """Tunes, alpha and beta at the start of the ring, on the network's own closed orbit.
+
+    Raises:
+        UnstableRingError: no closed orbit, or no tune.
+    """
+    orbit = closed_orbit(network)
+    _, jacobian = network.one_turn_map(orbit)
+    values, vectors = normal_modes(jacobian[:4, :4])
+    alpha, beta = _alpha_beta(vectors)
+    moduli = np.abs(values)
+    return Optics(
+        tunes=np.asarray(np.angle(values) / (2 * np.pi) % 1.0),
+        alpha=alpha,
+        beta=beta,
+        closed_orbit=orbit,
+        growth=float(moduli[np.abs(moduli - 1).argmax()]),
+    )
+
+
+def _alpha_beta(vectors: ComplexArray) -> tuple[Array, Array]:
+    """alpha, beta [..., 2] of eigenvectors [..., 4, 2], each mode in its own plane."""
+    x = np.stack([vectors[..., 0, 0], vectors[..., 2, 1]], axis=-1)
+    p = np.stack([vectors[..., 1, 0], vectors[..., 3, 1]], axis=-1)
+    return -np.real(x.conj() * p), np.abs(x) ** 2
+
+
+def twiss(network: TaylorNetwork) -> Twiss:
+    """Betas, alphas and phases along the ring, and the tunes with their integers.
+
+    The phase of each step is that of the eigenvector, taken between -0.1 and 2 pi - 0.1: every
+    layer advances the phase, except for rounding (drifts of slightly negative length), which
+    must not count as a whole turn.
+
+    Raises:
+        UnstableRingError: no closed orbit, or no tune.
+    """
+    orbit = closed_orbit(network)
+    _, jacobians = network.jacobians(orbit)
+    total = np.eye(network.dimension)
+    for matrix in jacobians:
+        total = matrix @ total
+    values, vector = normal_modes(total[:4, :4])
+    path = [vector]
+    for matrix in jacobians:
+        path.append(matrix[:4, :4] @ path[-1])
+    vectors = np.stack(path)
+    position = np.stack([vectors[:, 0, 0], vectors[:, 2, 1]], axis=-1)
+    steps = np.angle(position[1:] / position[:-1])
+    steps = (steps + 0.1) % (2 * np.pi) - 0.1
+    phase = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) / (2 * np.pi)
+    alpha, beta = _alpha_beta(vectors[:-1])
+    fraction = np.angle(values) / (2 * np.pi) % 1.0
+    whole = np.round(phase[-1] - fraction)
+    s = np.concatenate([[0.0], network.maps.s])
+    return Twiss(s=s, beta=beta, alpha=alpha, phase=phase[:-1], total_tunes=whole + fraction)
+
+
+def off_momentum(network: TaylorNetwork, length: float, delta: float = 1e-4) -> OffMomentum:
+    """Chromaticity, dispersion and momentum compaction by differences between +delta and -delta.
+
+    Args:
+        network: six coordinates, `TaylorNetwork.from_ring(ring, 6)`.
+        length: circumference, m.
+        delta: relative energy deviation of the two closed orbits.
+
+    Raises:
+        UnstableRingError: no closed orbit or no tune at one of the energies.
+        ValueError: a network of four coordinates knows no energy.
+    """
+    if network.dimension != 6:
+        raise ValueError("energy needs six coordinates: TaylorNetwork.from_ring(ring, 6)")
+    tunes, paths = [], []
+    for side in (delta, -delta):
+        orbit = closed_orbit(network, side)
+        path, jacobians = network.jacobians(orbit)
+        total = np.eye(6)
+        for matrix in jacobians:
+            total = matrix @ total
+        tunes.append(matrix_tunes(total[:4, :4]))
+        paths.append(path)
+    shift = (tunes[0] - tunes[1] + 0.5) % 1.0 - 0.5  # a tune may cross an integer in between
+    change = (paths[0] - paths[1]) / (2 * delta)
+    slip = change[-1, 4] - change[0, 4]  # tau is c t: later is positive
+    return OffMomentum(
+        chromaticity=shift / (2 * delta),
+        s=np.concatenate([[0.0], network.maps.s]),
+        dispersion=change[:-1][:, [0, 2]],
+        momentum_compaction=float(slip / length),
+    )

@@ -1,0 +1,55 @@
+"""The lattice strip under anything that is plotted against s."""
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.patches import Rectangle
+
+from tmlattice.lattice import Ring
+
+COLOURS = {
+    "bend": "tab:blue",
+    "quadrupole": "tab:red",
+    "sextupole": "tab:green",
+    "wiggler": "tab:purple",
+    "cavity": "tab:orange",
+}
+
+
+def lattice_strip(ring: Ring, ax: Axes) -> Axes:
+    """Draw the magnets of a ring along s: bends blue, quadrupoles red (up focuses in x),
+    sextupoles green, wigglers purple.
+
+    Args:
+        ring: what to draw.
+        ax: a low, wide axes; it shares s with the figure above it.
+    """
+    widest = ring.length / 600  # so that a short magnet is still seen on a whole ring
+    for kind, colour in COLOURS.items():
+        boxes = []
+        for element in ring.elements:
+            if element.kind != kind or (
+                kind in ("quadrupole", "sextupole") and _sign(element) == 0
+            ):
+                continue
+            width = max(element.length, widest)
+            if kind in ("bend", "wiggler"):
+                bottom, height = -0.3, 0.6
+            else:
+                bottom, height = (0.0, 1.0) if _sign(element) > 0 else (-1.0, 1.0)
+            boxes.append(Rectangle((element.s - width / 2, bottom), width, height))
+        ax.add_collection(PatchCollection(boxes, facecolor=colour, edgecolor="none"))
+    ax.axhline(0, color="0.4", linewidth=0.5, zorder=0)
+    ax.set_xlim(0, ring.length)
+    ax.set_ylim(-1.2, 1.2)
+    ax.set_yticks([])
+    for side in ("left", "right", "top"):
+        ax.spines[side].set_visible(False)
+    ax.set_xlabel("s [m]")
+    return ax
+
+
+def _sign(element: Any) -> float:
+    strength = element.k1 if element.kind == "quadrupole" else element.k2
+    return float(strength)
