@@ -30,7 +30,7 @@ def signal(qx, qy, turns=500, batch=1):
 @pytest.mark.parametrize(("method", "tolerance"), [("naff", 1e-8), ("fft", 1e-6)])
 def test_tune_above_half_is_not_folded(qx, qy, method, tolerance):
     matrix, states = signal(qx, qy)
-    known = Optics(np.array([qx, qy]), np.array([-0.7, 1.3]), np.array([12.0, 4.0]), np.zeros(4), 1)
+    known = Optics(np.array([qx, qy]), normal_modes(matrix)[1], np.zeros(4))
     for optics in (known, None):  # given, or from the signal's own moments
         found = tunes(states, optics, method)
         assert found.fraction.shape == (1, 2)
@@ -41,10 +41,12 @@ def test_tune_above_half_is_not_folded(qx, qy, method, tolerance):
 
 
 def test_amplitude_of_the_line_is_the_action():
-    _, states = signal(0.1236, 0.2747)
+    matrix, states = signal(0.1236, 0.2747)
     x, px = states[0, 0, :2]
     action = np.sqrt((x**2 + (12.0 * px - 0.7 * x) ** 2) / 12.0)
-    optics = Optics(np.zeros(2), np.array([-0.7, 1.3]), np.array([12.0, 4.0]), np.zeros(4), 1)
+    optics = Optics(np.zeros(2), normal_modes(matrix)[1], np.zeros(4))
+    z = optics.normalised(states[0, 0])[0]  # x_N - i p_N
+    np.testing.assert_allclose(z, (x - 1j * (12.0 * px - 0.7 * x)) / np.sqrt(12.0), rtol=1e-12)
     for method, tolerance in (("naff", 1e-3), ("fft", 1e-3)):
         found = tunes(states, optics, method).amplitude[0, 0]
         np.testing.assert_allclose(found, action, rtol=tolerance)
@@ -56,6 +58,24 @@ def test_twiss_of_a_known_matrix():
     np.testing.assert_allclose(np.abs(vectors[0, 0]) ** 2, 12.0)
     np.testing.assert_allclose(np.abs(vectors[2, 1]) ** 2, 4.0)
     np.testing.assert_allclose(-np.real(vectors[0, 0].conj() * vectors[1, 0]), -0.7)
+
+
+@pytest.mark.parametrize("growth", [0.9, 0.99, 1.05])
+def test_growing_or_damped_motion_keeps_its_tune(growth):
+    matrix, _ = signal(0.1236, 0.7253)
+    coupling = np.zeros((4, 4))
+    coupling[0, 3], coupling[3, 0] = 0.3, 0.02  # not symplectic, and the planes talk
+    matrix = matrix + coupling
+    matrix[:2, :2] *= growth
+    exact = matrix_tunes(matrix)
+    states = [np.array([1e-9, 2e-11, -5e-10, 1e-11])]
+    for _ in range(160):
+        states.append(matrix @ states[-1])
+    optics = Optics(exact, normal_modes(matrix)[1], np.zeros(4))
+    found = tunes(np.array(states)[None], optics)
+    np.testing.assert_allclose(found.fraction[0], exact, atol=1e-7)
+    assert abs(exact[0] - 0.1236) < 0.03
+    assert abs(exact[1] - 0.7253) < 0.03
 
 
 def test_error_grows_when_the_tune_drifts():

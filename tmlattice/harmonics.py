@@ -4,9 +4,10 @@
 >>> tune = tunes(states, optics=one_turn_optics(network))
 >>> tune.fraction                                       # [batch, 2], (x, y), in turns
 
-The normalised complex coordinate z = x_N - i p_N, with x_N = x / sqrt(beta) and
-p_N = (alpha x + beta px) / sqrt(beta), turns by +Q a turn, so Q and 1 - Q differ: a real signal
-cannot tell them apart, and the wrong sign would exchange them.
+The normalised complex coordinate z = x_N - i p_N (`Optics.normalised`) turns by +Q a turn, so Q and
+1 - Q differ: a real signal cannot tell them apart, and the wrong sign would exchange them. Motion
+that grows or shrinks (a network that is not symplectic) keeps its phase: the trend of log |z| is
+taken out before the line is sought.
 """
 
 from dataclasses import dataclass
@@ -82,32 +83,49 @@ def tunes(states: Array, optics: Optics | None = None, method: Method | str = "n
         turn = int((~finite[trajectory]).argmax())
         raise TooFewTurnsError(f"trajectory {trajectory} is lost in turn {turn}: it has no tune")
     fraction, error, amplitude = (np.empty((batch, 2)) for _ in range(3))
-    for plane in range(2):
-        z = normalised(states, plane, optics)
-        for trajectory in range(batch):
-            signal = z[trajectory]
+    z = normalised(states, optics)
+    half = turns // 2
+    for trajectory in range(batch):
+        for plane in range(2):
+            signal = _level(z[trajectory, :, plane])
             fraction[trajectory, plane], amplitude[trajectory, plane] = frequency(signal, method)
-            half = turns // 2
             first, _ = frequency(signal[:half], method)
             second, _ = frequency(signal[-half:], method)
             error[trajectory, plane] = abs((first - second + 0.5) % 1.0 - 0.5) / 2
+    if not np.isfinite(fraction).all():
+        raise TooFewTurnsError(
+            f"no steady line in {turns} turns; track more turns, or closer to the closed orbit"
+        )
     return Tunes(fraction, error, amplitude, method, turns)
 
 
-def normalised(states: Array, plane: int, optics: Optics | None = None) -> ComplexArray:
-    """z = x_N - i p_N of one plane (0: x, 1: y), [batch, turns], in sqrt(m)."""
-    x, p = states[..., 2 * plane], states[..., 2 * plane + 1]
+def normalised(states: Array, optics: Optics | None = None) -> ComplexArray:
+    """z = x_N - i p_N of both planes, [..., turns, 2], in sqrt(m), of states [..., turns, n].
+
+    Without optics each plane is normalised by the second moments of its own signal.
+    """
     if optics is not None:
-        x = x - optics.closed_orbit[2 * plane]
-        p = p - optics.closed_orbit[2 * plane + 1]
-        alpha, beta = optics.alpha[plane], optics.beta[plane]
-    else:
-        x = x - x.mean(axis=-1, keepdims=True)
-        p = p - p.mean(axis=-1, keepdims=True)
-        xx, xp, pp = ((a * b).mean(axis=-1, keepdims=True) for a, b in ((x, x), (x, p), (p, p)))
+        return optics.normalised(states)
+    planes = []
+    for x, p in ((states[..., 0], states[..., 1]), (states[..., 2], states[..., 3])):
+        x0, p0 = (v - v.mean(axis=-1, keepdims=True) for v in (x, p))
+        xx, xp, pp = (
+            (a * b).mean(axis=-1, keepdims=True) for a, b in ((x0, x0), (x0, p0), (p0, p0))
+        )
         area = np.sqrt(np.maximum(xx * pp - xp**2, 1e-300))
         alpha, beta = -xp / area, np.maximum(xx / area, 1e-300)
-    return np.asarray((x - 1j * (alpha * x + beta * p)) / np.sqrt(beta))
+        planes.append((x0 - 1j * (alpha * x0 + beta * p0)) / np.sqrt(beta))
+    return np.stack(planes, axis=-1)
+
+
+def _level(signal: ComplexArray) -> ComplexArray:
+    """The signal without exponential growth; its first amplitude stays."""
+    size = np.abs(signal)
+    if not (size > 0).all():  # no motion at all, or motion that passes through zero
+        return signal
+    turn = np.arange(len(signal))
+    rate = np.polyfit(turn, np.log(size), 1)[0]
+    return np.asarray(signal * np.exp(-rate * turn))
 
 
 def frequency(signal: ComplexArray, method: Method = Method.NAFF) -> tuple[float, float]:
@@ -115,8 +133,8 @@ def frequency(signal: ComplexArray, method: Method = Method.NAFF) -> tuple[float
     if method is Method.NAFF:
         import nafflib  # pulls in pandas
 
-        line, value = nafflib.fundamental_frequency(signal.copy())
-        return float(np.real(value)) % 1.0, float(abs(line))
+        lines, values = nafflib.naff(signal.copy(), num_harmonics=1)
+        return float(np.real(values[0])) % 1.0, float(abs(lines[0]))
     return _interpolated_fft(signal)
 
 

@@ -29,18 +29,37 @@ class Optics:
 
     Attributes:
         tunes: fractional tunes (x, y) in [0, 1), [2].
-        alpha, beta: Twiss parameters of each plane (of the mode that lives mostly in it), 1 and m,
-            [2]; exact where the planes are not coupled.
+        modes: eigenvectors of the one-turn matrix, (x, px, y, py) by (x, y), [4, 2]; they turn
+            forward and are scaled to v^H S v = 2 i.
         closed_orbit: the state that repeats, [n].
         growth: the modulus of an eigenvalue that is furthest from 1: how much the amplitude grows
             or shrinks in a turn; 1 for a symplectic map.
     """
 
     tunes: Array
-    alpha: Array
-    beta: Array
+    modes: ComplexArray
     closed_orbit: Array
-    growth: float
+    growth: float = 1.0
+
+    @property
+    def beta(self) -> Array:
+        """beta of each plane, m, [2]; of the mode that lives mostly in it, where they couple."""
+        return _alpha_beta(self.modes)[1]
+
+    @property
+    def alpha(self) -> Array:
+        """alpha of each plane, [2]; see `beta`."""
+        return _alpha_beta(self.modes)[0]
+
+    def normalised(self, states: Array) -> ComplexArray:
+        """The modes' complex amplitudes z of states [..., n >= 4], [..., 2], in sqrt(m).
+
+        Without coupling z = x_N - i p_N, x_N = x / sqrt(beta), p_N = (alpha x + beta px) /
+        sqrt(beta): it turns by +2 pi Q a turn. The modes need not be orthogonal, as those of a
+        symplectic map are: they are parted by the inverse of their matrix.
+        """
+        both = np.concatenate([self.modes, self.modes.conj()], axis=1)
+        return np.asarray(2 * (states[..., :4] - self.closed_orbit[:4]) @ np.linalg.inv(both)[:2].T)
 
 
 @dataclass(frozen=True)
@@ -161,12 +180,10 @@ def one_turn_optics(network: TaylorNetwork) -> Optics:
     orbit = closed_orbit(network)
     _, jacobian = network.one_turn_map(orbit)
     values, vectors = normal_modes(jacobian[:4, :4])
-    alpha, beta = _alpha_beta(vectors)
     moduli = np.abs(values)
     return Optics(
         tunes=np.asarray(np.angle(values) / (2 * np.pi) % 1.0),
-        alpha=alpha,
-        beta=beta,
+        modes=vectors,
         closed_orbit=orbit,
         growth=float(moduli[np.abs(moduli - 1).argmax()]),
     )

@@ -153,6 +153,12 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
     for name, value, form in rows:
         tunes.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
     screen.print(tunes)
+    if outcome.growth is not None and abs(outcome.growth - 1) > 1e-3:
+        alive = outcome.tune_signal.shape[1] - 1 if outcome.tune_signal is not None else 0
+        screen.print(
+            f"the fine-tuned network is not symplectic: its motion changes by "
+            f"{100 * (outcome.growth - 1):+.1f} % a turn; tunes from {alive} turns"
+        )
     if outcome.problem:
         screen.print(f"{outcome.problem}")
     before, after = outcome.orbit_rms

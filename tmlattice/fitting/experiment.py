@@ -27,10 +27,13 @@ Array = NDArray[np.float64]
 DEFAULT_LAUNCH = (1e-3, 0.0, 1e-3, 0.0)
 """x, px, y, py: off axis by 1 mm in both planes."""
 
-TUNE_AMPLITUDE = 1e-4
+TUNE_AMPLITUDE = 1e-9
 """Part of the launch at which the tunes are taken: tunes shift with the square of the amplitude
-(1e-4 at 1 mm), and the truth is the one-turn matrix's, at zero amplitude; a network with free
-weights is not symplectic, and its motion may grow a thousandfold in 500 turns."""
+(1e-4 at 1 mm), and the truth is the one-turn matrix's, at zero amplitude."""
+
+GROWTH_ALLOWED = 1e3
+"""How much a trajectory may grow while its tunes are taken. A network with free weights is not
+symplectic: one plane may grow by 10 % a turn and swamp the other through the second order."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ class TuneFit:
         noise: rms of a reading, m.
         design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2].
         network_tunes: from tracking the fine-tuned network, [2].
-        tune_signal: states of that tracking, [1, turns + 1, n].
+        tune_signal: states of that tracking, [1, turns + 1, n]; fewer where the beam was lost.
+        growth: of the fine-tuned network's amplitude in a turn, 1 where it is symplectic.
         s: of the monitors, m, [monitor].
         measured, before, after: readings, and the network's before and after fine-tuning,
             [monitor, 2], m.
@@ -65,6 +69,7 @@ class TuneFit:
     true_tunes: Array
     network_tunes: Array | None
     tune_signal: Array | None
+    growth: float | None
     s: Array
     measured: Array
     before: Array
@@ -132,6 +137,8 @@ class TuneFit:
             "regularization": self.fit.options["regularization"],
             "seed": self.seed,
             "turns": self.turns,
+            "turns_alive": 0 if self.tune_signal is None else self.tune_signal.shape[1] - 1,
+            "growth": self.growth,
             "options": self.fit.options,
             "problem": self.problem,
         }
@@ -188,7 +195,7 @@ def tune_fit(
         change: relative change of its strength.
         launch: x, px, y, py at the start of the ring, m and rad.
         noise: rms of a reading, m; drawn from the seed.
-        turns: tracked for the tunes, at a ten-thousandth of the launch's amplitude.
+        turns: tracked for the tunes, at a vanishing amplitude.
         seed: of the noise.
         progress: show a bar where there is a terminal.
         options: passed to `fine_tune`.
@@ -224,11 +231,16 @@ def tune_fit(
     measurement = Measurement(start[None], readings[:, None], network.monitors, (noise, noise))
     with watch.stage("fit"):
         fit = fine_tune(network, measurement, progress=progress, **options)
-    found, signal, problem = None, None, None
+    found, signal, growth, problem = None, None, None, None
     with watch.stage("tunes"):
         try:
             optics = one_turn_optics(fit.network)
-            signal = fit.network.track((optics.closed_orbit + TUNE_AMPLITUDE * start)[None], turns)
+            growth = optics.growth
+            first = (optics.closed_orbit + TUNE_AMPLITUDE * start)[None]
+            states = fit.network.track(first, turns, keep_lost=True)
+            size = np.abs(states[0] - optics.closed_orbit).max(axis=1)
+            grown = ~(size < GROWTH_ALLOWED * np.abs(start).max() * TUNE_AMPLITUDE)
+            signal = states[:, : int(grown.argmax()) if grown.any() else None]
             found = tunes(signal, optics).fraction[0]
         except TmlatticeError as error:
             problem = f"the fine-tuned network has no tune: {error}"
@@ -243,6 +255,7 @@ def tune_fit(
         true_tunes=true_tunes,
         network_tunes=found,
         tune_signal=signal,
+        growth=growth,
         s=network.maps.s_monitors,
         measured=readings[0],
         before=network(start[None]).detach().numpy()[0],

@@ -134,12 +134,13 @@ class TaylorNetwork(torch.nn.Module):
         W0, W1, W2 = (np.concatenate([w, c[None]]) for w, c in zip(layers, closing, strict=True))
         return W0, W1, W2
 
-    def track(self, launch: ArrayLike | Tensor, turns: int) -> Array:
+    def track(self, launch: ArrayLike | Tensor, turns: int, *, keep_lost: bool = False) -> Array:
         """States at the start of the ring after 0, 1, ..., turns turns.
 
         Args:
             launch: states at the start, [batch, n].
             turns: at least 1.
+            keep_lost: do not raise for a lost trajectory; its states are NaN from then on.
 
         Returns:
             [batch, turns + 1, n]; no gradient.
@@ -158,7 +159,11 @@ class TaylorNetwork(torch.nn.Module):
         W0, W1, W2 = self.one_turn_weights()
         sweeps.run(sweeps.track, len(packed), size, W0, W1, W2, curved(W2), history)
         states = sweeps.unpack(history, len(start))
-        self._check_alive(states)
+        if keep_lost:
+            lost = ~np.all(np.abs(states) < APERTURE, axis=2)
+            states[np.logical_or.accumulate(lost, axis=1)] = np.nan
+        else:
+            self._check_alive(states)
         return states
 
     def _check_alive(self, states: Array) -> None:

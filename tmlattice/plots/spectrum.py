@@ -33,7 +33,7 @@ def plot_spectrum(
     """
     if ax is None:
         _, ax = plt.subplots()
-    z = normalised(states[None], plane, optics)[0]
+    z = normalised(states, optics)[:, plane]
     turns = len(z)
     padded = 8 * turns
     spectrum = np.abs(np.fft.fft(z * np.hanning(turns), padded)) / turns * 2
