@@ -193,11 +193,11 @@ def test_existing_results_are_replaced_whole(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_ctrl_c_ends_soon_with_nothing_half_written(tmp_path):
     process = subprocess.Popen(
-        [sys.executable, "-m", "tmlattice", "tune-fit", SMALL, *QUICK[:4], "--epochs", "1000000",
+        [sys.executable, "-m", "tmlattice", "tune-fit", "petra3", "--epochs", "1000000",
          "--json", "a.json"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    time.sleep(12)  # imports and kernels are over: it fits
+    time.sleep(12)  # imports and kernels are over, the patience is not: it fits
     assert process.poll() is None
     process.send_signal(signal.SIGINT)
     sent = time.monotonic()

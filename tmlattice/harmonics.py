@@ -87,7 +87,7 @@ def tunes(states: Array, optics: Optics | None = None, method: Method | str = "n
     half = turns // 2
     for trajectory in range(batch):
         for plane in range(2):
-            signal = _level(z[trajectory, :, plane])
+            signal = levelled(z[trajectory, :, plane])
             fraction[trajectory, plane], amplitude[trajectory, plane] = frequency(signal, method)
             first, _ = frequency(signal[:half], method)
             second, _ = frequency(signal[-half:], method)
@@ -118,8 +118,8 @@ def normalised(states: Array, optics: Optics | None = None) -> ComplexArray:
     return np.stack(planes, axis=-1)
 
 
-def _level(signal: ComplexArray) -> ComplexArray:
-    """The signal without exponential growth; its first amplitude stays."""
+def levelled(signal: ComplexArray) -> ComplexArray:
+    """A complex signal [turns] without its exponential growth; its first amplitude stays."""
     size = np.abs(signal)
     if not (size > 0).all():  # no motion at all, or motion that passes through zero
         return signal

@@ -6,8 +6,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from tmlattice.harmonics import normalised
-from tmlattice.optics import Optics
+from tmlattice.harmonics import levelled, normalised
+from tmlattice.optics import Optics, one_turn_optics
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,7 +33,7 @@ def plot_spectrum(
     """
     if ax is None:
         _, ax = plt.subplots()
-    z = normalised(states, optics)[:, plane]
+    z = levelled(normalised(states, optics)[:, plane])
     turns = len(z)
     padded = 8 * turns
     spectrum = np.abs(np.fft.fft(z * np.hanning(turns), padded)) / turns * 2
@@ -48,9 +48,10 @@ def plot_spectrum(
 
 def plot_tune_fit_spectrum(outcome: "TuneFit", axes: "tuple[Axes, Axes]") -> None:
     """The spectra of the fine-tuned network's tracking, with the design's and the true tunes."""
+    optics = None if outcome.tune_signal is None else one_turn_optics(outcome.fit.network)
     for plane, ax in enumerate(axes):
         if outcome.tune_signal is not None:
-            plot_spectrum(outcome.tune_signal[0], plane, ax)
+            plot_spectrum(outcome.tune_signal[0], plane, ax, optics)
         for tune, name, colour, style in (
             (outcome.design_tunes, "design", "C0", ":"),
             (outcome.true_tunes, "true", "k", "--"),
