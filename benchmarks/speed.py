@@ -94,13 +94,17 @@ def main():
         states = 1e-5 * np.random.default_rng(0).standard_normal((particles, 4))
         six = np.zeros((6, particles), order="F")
         six[:4] = states.T
-        theirs = median_time(
-            lambda six=six: referee.track(six.copy(order="F"), nturns=1),
-            repeats,
-        )
         turns = 50 if particles == 1 else 2
         mine = median_time(lambda s=states, t=turns: network.track(s, t), repeats) / turns
-        rows.append((f"AT, one turn of {particles}", theirs, "compiled chain", mine))
+        for keep in (False, True):  # keep_lattice spares AT the conversion of its elements
+            theirs = median_time(
+                lambda six=six, keep=keep: referee.track(
+                    six.copy(order="F"), nturns=1, keep_lattice=keep
+                ),
+                repeats,
+            )
+            name = f"AT, one turn of {particles}{', keep_lattice' if keep else ''}"
+            rows.append((name, theirs, "compiled chain", mine))
 
     print(f"{'':42}{'ms':>10}   {'':26}{'ms':>9}{'ratio':>9}")
     for name, slow, other, fast in rows:

@@ -14,6 +14,8 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 FILE = click.Path(path_type=Path)
 
+REGULARIZATIONS = ["symplectic", "none", "l1", "l2"]
+
 
 class Launch(click.ParamType):  # type: ignore[type-arg]
     """x,px,y,py as one word."""
@@ -48,6 +50,30 @@ def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
                      help="The lattice file's variable that holds the ring."),
         click.argument("lattice", default="petra3"),
     ):  # fmt: skip
+        function = decorate(function)
+    return function
+
+
+def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """What `tune-fit` and its study share: the perturbation, the measurement, the fit."""
+    for decorate in reversed((
+        click.option("--change", type=float, default=-0.2, show_default=True,
+                     help="Relative change of the magnet's strength."),
+        click.option("--launch", type=Launch(), default="1e-3,0,1e-3,0", show_default=True,
+                     help="State at the start of the ring, m and rad."),
+        click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True,
+                     help="Rms of one reading, m."),
+        click.option("--epochs", type=click.IntRange(1), default=1000, show_default=True,
+                     help="Gradient steps at most."),
+        click.option("--turns", type=click.IntRange(16), default=500, show_default=True,
+                     help="Tracked for the tunes."),
+        click.option("--regularization-rate", type=click.FloatRange(0), default=1e-10,
+                     show_default=True, help="lambda: weight of the regularization."),
+        click.option("--learning-rate", type=click.FloatRange(0, min_open=True), default=1e-6,
+                     show_default=True, help="Adam's step."),
+        click.option("--seed", type=click.IntRange(0), default=0, show_default=True,
+                     help="Of the readings' noise."),
+    )):  # fmt: skip
         function = decorate(function)
     return function
 

@@ -7,15 +7,14 @@ from typing import Any
 import click
 
 from tmlattice.cli.options import (
-    Launch,
+    REGULARIZATIONS,
     console,
     json_option,
     lattice_argument,
     quiet_option,
+    recipe_options,
     table,
 )
-
-METHODS = ["symplectic", "none", "l1", "l2"]
 
 
 @click.group("study")
@@ -32,24 +31,15 @@ def study() -> None:
     show_default=True,
     help="Powered quadrupoles, evenly spread over the ring.",
 )
-@click.option("--change", type=float, default=-0.2, show_default=True)
-@click.option("--launch", type=Launch(), default="1e-3,0,1e-3,0", show_default=True)
-@click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True)
-@click.option("--epochs", type=click.IntRange(1), default=1000, show_default=True)
-@click.option("--turns", type=click.IntRange(16), default=500, show_default=True)
 @click.option(
     "--regularization",
     "methods",
-    type=click.Choice(METHODS),
+    type=click.Choice(REGULARIZATIONS),
     multiple=True,
     help="Repeat for several; all where none is named.",
 )
-@click.option("--regularization-rate", type=click.FloatRange(0), default=1e-10, show_default=True)
-@click.option(
-    "--learning-rate", type=click.FloatRange(0, min_open=True), default=1e-6, show_default=True
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--workers", type=click.IntRange(1), help="Processes; else one a core.")
+@recipe_options
 @json_option
 @quiet_option
 def tune_fit(
@@ -64,7 +54,7 @@ def tune_fit(
     from tmlattice.files import output_file, write_json
     from tmlattice.fitting.study import study_tune_fit, summarise
 
-    chosen = methods or tuple(METHODS)
+    chosen = methods or tuple(REGULARIZATIONS)
     with output_file(json_file) if json_file else nullcontext() as path:
         cases = list(study_tune_fit(lattice, chosen, progress=not quiet, **options))
         summary = {

@@ -8,11 +8,12 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
-    Launch,
+    REGULARIZATIONS,
     console,
     json_option,
     lattice_argument,
     quiet_option,
+    recipe_options,
     table,
 )
 
@@ -29,42 +30,10 @@ if TYPE_CHECKING:
     "middle of the first arc.",
 )
 @click.option(
-    "--change", type=float, default=-0.2, show_default=True, help="Relative change of its strength."
-)
-@click.option(
-    "--launch",
-    type=Launch(),
-    default="1e-3,0,1e-3,0",
-    show_default=True,
-    help="State at the start of the ring, m and rad.",
-)
-@click.option(
-    "--noise",
-    type=click.FloatRange(0),
-    default=2e-5,
-    show_default=True,
-    help="Rms of one reading, m.",
-)
-@click.option("--epochs", type=click.IntRange(1), default=1000, show_default=True)
-@click.option(
-    "--turns",
-    type=click.IntRange(16),
-    default=500,
-    show_default=True,
-    help="Tracked for the tunes.",
-)
-@click.option(
     "--regularization",
-    type=click.Choice(["symplectic", "none", "l1", "l2"]),
+    type=click.Choice(REGULARIZATIONS),
     default="symplectic",
     show_default=True,
-)
-@click.option("--regularization-rate", type=click.FloatRange(0), default=1e-10, show_default=True)
-@click.option(
-    "--learning-rate", type=click.FloatRange(0, min_open=True), default=1e-6, show_default=True
-)
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the readings' noise."
 )
 @click.option(
     "--out",
@@ -74,6 +43,7 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="Folder for the three figures and tune-fit.json.",
 )
+@recipe_options
 @json_option
 @quiet_option
 def tune_fit(
