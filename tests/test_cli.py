@@ -190,6 +190,13 @@ def test_existing_results_are_replaced_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
+def test_command_offers_the_regularizations_there_are():
+    from tmlattice.cli.options import REGULARIZATIONS
+    from tmlattice.fitting import Regularization
+
+    assert [kind.value for kind in Regularization] == REGULARIZATIONS
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_ctrl_c_ends_soon_with_nothing_half_written(tmp_path):
     process = subprocess.Popen(

@@ -185,3 +185,16 @@ def test_experiment_is_repeated_by_its_seed(small_ring):
     np.testing.assert_array_equal(one.network_tunes, same.network_tunes)
     assert one.fit.loss != other.fit.loss
     assert 1e-5 < (one.measured - other.measured).std() < 4e-5  # two draws of 20 micrometres
+
+
+def test_experiment_perturbs_the_magnet_that_it_names(small_ring):
+    """A weak defocusing quadrupole: the orbit differs behind it alone, and Qy falls."""
+    options = {"progress": False, "epochs": 2, "noise": 0.0, "launch": (1e-4, 0, 1e-4, 0)}
+    found = tune_fit(small_ring, "QD::6", -0.02, **options)
+    behind = found.s > small_ring["QD::6"].s
+    gap = np.abs(found.measured - found.before)
+    assert gap[~behind].max() == 0.0
+    assert (gap[behind][:4].max(axis=0) > 1e-8).all()  # in both planes
+    # dQ = -+ beta dk L / (4 pi): less defocusing raises Qx and lowers Qy
+    shift = found.true_tunes - found.design_tunes
+    assert shift[0] > 0 > shift[1]

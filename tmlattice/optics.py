@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import symplectic_form
 from tmlattice.network import TaylorNetwork
+from tmlattice.network.network import chain
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -136,6 +137,11 @@ def matrix_tunes(matrix: Array) -> Array:
         UnstableRingError: no tune exists.
     """
     values, _ = normal_modes(matrix)
+    return _fractions(values)
+
+
+def _fractions(values: ComplexArray) -> Array:
+    """Fractional tunes in [0, 1) of eigenvalues exp(2 pi i Q)."""
     return np.asarray(np.angle(values) / (2 * np.pi) % 1.0)
 
 
@@ -182,7 +188,7 @@ def one_turn_optics(network: TaylorNetwork) -> Optics:
     values, vectors = normal_modes(jacobian[:4, :4])
     moduli = np.abs(values)
     return Optics(
-        tunes=np.asarray(np.angle(values) / (2 * np.pi) % 1.0),
+        tunes=_fractions(values),
         modes=vectors,
         closed_orbit=orbit,
         growth=float(moduli[np.abs(moduli - 1).argmax()]),
@@ -208,10 +214,7 @@ def twiss(network: TaylorNetwork) -> Twiss:
     """
     orbit = closed_orbit(network)
     _, jacobians = network.jacobians(orbit)
-    total = np.eye(network.dimension)
-    for matrix in jacobians:
-        total = matrix @ total
-    values, vector = normal_modes(total[:4, :4])
+    values, vector = normal_modes(chain(jacobians)[:4, :4])
     path = [vector]
     for matrix in jacobians:
         path.append(matrix[:4, :4] @ path[-1])
@@ -221,7 +224,7 @@ def twiss(network: TaylorNetwork) -> Twiss:
     steps = (steps + 0.1) % (2 * np.pi) - 0.1
     phase = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) / (2 * np.pi)
     alpha, beta = _alpha_beta(vectors[:-1])
-    fraction = np.angle(values) / (2 * np.pi) % 1.0
+    fraction = _fractions(values)
     whole = np.round(phase[-1] - fraction)
     s = np.concatenate([[0.0], network.maps.s])
     return Twiss(s=s, beta=beta, alpha=alpha, phase=phase[:-1], total_tunes=whole + fraction)
@@ -245,10 +248,7 @@ def off_momentum(network: TaylorNetwork, length: float, delta: float = 1e-4) -> 
     for side in (delta, -delta):
         orbit = closed_orbit(network, side)
         path, jacobians = network.jacobians(orbit)
-        total = np.eye(6)
-        for matrix in jacobians:
-            total = matrix @ total
-        tunes.append(matrix_tunes(total[:4, :4]))
+        tunes.append(matrix_tunes(chain(jacobians)[:4, :4]))
         paths.append(path)
     shift = (tunes[0] - tunes[1] + 0.5) % 1.0 - 0.5  # a tune may cross an integer in between
     change = (paths[0] - paths[1]) / (2 * delta)

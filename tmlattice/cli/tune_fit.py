@@ -91,8 +91,9 @@ def _draw(outcome: "TuneFit", folder: Path) -> None:
     spectrum, axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True, layout="constrained")
     plot_tune_fit_spectrum(outcome, tuple(axes))
     axes[0].set_xlabel("")
-    turns = 0 if outcome.tune_signal is None else outcome.tune_signal.shape[1] - 1
-    axes[0].set_title(f"{turns} turns through the fine-tuned network, growth taken out")
+    axes[0].set_title(
+        f"{outcome.turns_alive} turns through the fine-tuned network, growth taken out"
+    )
     loss, ax = plt.subplots(figsize=(8, 5), layout="constrained")
     monitors = len(outcome.fit.network.monitors)
     plot_loss(outcome.fit, ax, floor=2 * monitors * outcome.noise**2)
@@ -125,10 +126,10 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
         tunes.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
     screen.print(tunes)
     if outcome.growth is not None and abs(outcome.growth - 1) > 1e-3:
-        alive = outcome.tune_signal.shape[1] - 1 if outcome.tune_signal is not None else 0
         screen.print(
             "the fine-tuned network is not symplectic: amplitudes change by up to "
-            f"{100 * abs(outcome.growth - 1):.1f} % a turn; tunes from the first {alive} turns"
+            f"{100 * abs(outcome.growth - 1):.1f} % a turn; "
+            f"tunes from the first {outcome.turns_alive} turns"
         )
     if outcome.problem:
         screen.print(f"{outcome.problem}")

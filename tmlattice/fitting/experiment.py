@@ -48,7 +48,7 @@ class TuneFit:
         noise: rms of a reading, m.
         design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2].
         network_tunes: from tracking the fine-tuned network, [2].
-        tune_signal: states of that tracking, [1, turns + 1, n]; fewer where the beam was lost.
+        tune_signal: states of that tracking, [1, turns + 1, n]; fewer where the motion grew.
         growth: of the fine-tuned network's amplitude in a turn, 1 where it is symplectic.
         s: of the monitors, m, [monitor].
         measured, before, after: readings, and the network's before and after fine-tuning,
@@ -79,6 +79,11 @@ class TuneFit:
     seed: int
     turns: int
     problem: str | None = None
+
+    @property
+    def turns_alive(self) -> int:
+        """Turns that the tunes come from: fewer than asked for where the motion grew."""
+        return 0 if self.tune_signal is None else self.tune_signal.shape[1] - 1
 
     @property
     def absolute_error(self) -> Array | None:
@@ -137,7 +142,7 @@ class TuneFit:
             "regularization": self.fit.options["regularization"],
             "seed": self.seed,
             "turns": self.turns,
-            "turns_alive": 0 if self.tune_signal is None else self.tune_signal.shape[1] - 1,
+            "turns_alive": self.turns_alive,
             "growth": self.growth,
             "options": self.fit.options,
             "problem": self.problem,

@@ -17,6 +17,14 @@ from tmlattice.network.autograd import APERTURE, Sweep, curved
 Array = NDArray[np.float64]
 
 
+def chain(matrices: Array) -> Array:
+    """The product of matrices [step, n, n] in beam order: the last one stands on the left."""
+    total = np.eye(matrices.shape[1])
+    for matrix in matrices:
+        total = matrix @ total
+    return total
+
+
 class TaylorNetwork(torch.nn.Module):
     """A ring as a chain of second-order layers, one per magnet, read by its monitors.
 
@@ -193,10 +201,7 @@ class TaylorNetwork(torch.nn.Module):
         """
         x = np.zeros(self.dimension) if x is None else np.asarray(x, dtype=float)
         path, matrices = self.jacobians(x)
-        total = np.eye(self.dimension)
-        for matrix in matrices:
-            total = matrix @ total
-        return path[-1], total
+        return path[-1], chain(matrices)
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
