@@ -32,6 +32,10 @@ class MeasurementError(TmlatticeError):
     """A measurement that does not fit the ring, or is not a measurement."""
 
 
+class EffectError(TmlatticeError):
+    """An effect that cannot be as it was asked for."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """The error for a `name` that is not among the `known` ones, with the nearest of them."""
     known = list(known)

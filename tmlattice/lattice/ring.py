@@ -31,6 +31,41 @@ PASSIVE: frozenset[str] = frozenset({"drift", "monitor", "marker", "cavity"})
 
 
 @dataclass(frozen=True)
+class Errors:
+    """How one magnet differs from its design, beyond its strengths: what OCELOT has no name for.
+
+    The maps feel them in this order: the entrance kick; the shift and the turn of the body, inside
+    which the kicks and the loss sit at its middle; the body back.
+
+    Attributes:
+        dx, dy: offset of the magnet's centre, m.
+        roll: about the beam axis, rad; positive turns x towards y.
+        kick_x, kick_y: px and py gain these at the middle, rad.
+        k1l, k1sl: thin quadrupole at the middle: px -= k1l x, py += k1l y; thin skew quadrupole:
+            px += k1sl y, py += k1sl x; 1/m.
+        entrance_k1l: thin quadrupole at the entrance, 1/m.
+        loss: relative energy loss at the middle (six coordinates only).
+    """
+
+    dx: float = 0.0
+    dy: float = 0.0
+    roll: float = 0.0
+    kick_x: float = 0.0
+    kick_y: float = 0.0
+    k1l: float = 0.0
+    k1sl: float = 0.0
+    entrance_k1l: float = 0.0
+    loss: float = 0.0
+
+    def plus(self, **amounts: float) -> "Errors":
+        """These errors and more of the named ones."""
+        return replace(self, **{name: getattr(self, name) + a for name, a in amounts.items()})
+
+
+NO_ERRORS = Errors()
+
+
+@dataclass(frozen=True)
 class Element:
     """One place in the ring.
 
@@ -44,7 +79,8 @@ class Element:
         angle: bend angle, or the kick of a corrector, rad.
         tilt: rotation about the beam axis, rad.
         source: the OCELOT element; shared by all places of one object, so never change it
-            (`Ring.with_changed` copies).
+            (`changed` copies).
+        errors: how it differs from what `source` can say.
     """
 
     name: str
@@ -57,11 +93,38 @@ class Element:
     angle: float
     tilt: float
     source: Any = field(repr=False, compare=False)
+    errors: Errors = NO_ERRORS
 
     @property
     def is_magnet(self) -> bool:
         """True for everything that is not a drift, a monitor, a marker or a cavity."""
         return self.kind not in PASSIVE
+
+    def changed(self, **attributes: float) -> "Element":
+        """A copy with other strengths; this one, and others of its family, stay as they are.
+
+        Args:
+            attributes: OCELOT's names and units: k1=, k2=, angle=, tilt=, ...
+
+        Raises:
+            LatticeError: it has no such attribute, or its length would change.
+        """
+        source = copy.deepcopy(self.source)  # the object may stand in many places
+        for attribute, amount in attributes.items():
+            if attribute == "l" or not hasattr(source, attribute):
+                raise LatticeError(
+                    f"'{attribute}' of {self.kind} '{self.name}' cannot be changed; "
+                    "strengths and angles can (k1, k2, angle, tilt)"
+                )
+            setattr(source, attribute, amount)
+        known: dict[str, Any] = {
+            k: v for k, v in attributes.items() if k in ("k1", "k2", "angle", "tilt")
+        }
+        return replace(self, source=source, **known)
+
+    def with_errors(self, **amounts: float) -> "Element":
+        """A copy with these amounts added to its `errors`."""
+        return replace(self, errors=self.errors.plus(**amounts))
 
 
 @dataclass(frozen=True)
@@ -133,24 +196,15 @@ class Ring:
         """
         place = self.index(name)
         old = self.elements[place]
-        source = copy.deepcopy(old.source)  # the object may stand in many places
-        for attribute, amount in attributes.items():
-            if attribute == "l" or not hasattr(source, attribute):
-                raise LatticeError(
-                    f"'{attribute}' of {old.kind} '{old.name}' cannot be changed; "
-                    "strengths and angles can (k1, k2, angle, tilt)"
-                )
-            setattr(source, attribute, amount)
-        known: dict[str, Any] = {
-            k: v for k, v in attributes.items() if k in ("k1", "k2", "angle", "tilt")
-        }
-        new = replace(old, source=source, **known)
         changed = {**self.changes, old.name: {**self.changes.get(old.name, {}), **attributes}}
-        return replace(
-            self,
-            elements=(*self.elements[:place], new, *self.elements[place + 1 :]),
-            changes=changed,
-        )
+        return replace(self.with_elements({place: old.changed(**attributes)}), changes=changed)
+
+    def with_elements(self, elements: Mapping[int, Element]) -> "Ring":
+        """A new ring with other elements at these places of `elements`."""
+        new = list(self.elements)
+        for place, element in elements.items():
+            new[place] = element
+        return replace(self, elements=tuple(new))
 
 
 def number_names(names: Iterable[str]) -> list[str]:

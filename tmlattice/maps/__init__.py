@@ -6,10 +6,11 @@
 >>> maps = ring_maps(load_ring("petra3"))            # stacked weights of all layers
 """
 
-from tmlattice.maps.magnets import RingMaps, element_map, ring_maps, ring_matrix
+from tmlattice.maps.magnets import LayerMaps, RingMaps, element_map, ring_maps, ring_matrix
 from tmlattice.maps.taylor import TaylorMap, kronecker_exponents, symplectic_form
 
 __all__ = [
+    "LayerMaps",
     "RingMaps",
     "TaylorMap",
     "element_map",

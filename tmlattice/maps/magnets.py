@@ -6,40 +6,41 @@ each x -> B + R x + x^T T x. The parts are composed to second order; what lies b
 way from the exit of magnet k - 1 to the exit of magnet k, and the chain of layers is the ring.
 """
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import sqrtm
 
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
 from tmlattice.maps.taylor import TaylorMap
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class _Quadratic:
+class Quadratic:
     """x -> B + R x + x^T T x with T [out, n, n] symmetric in its last two indices, or None if 0."""
 
     B: Array
     R: Array
     T: Array | None
 
-    def after(self, first: "_Quadratic") -> "_Quadratic":
+    def after(self, first: "Quadratic") -> "Quadratic":
         """This after `first`, to second order in x."""
         if self.T is None:
             bent = None if first.T is None else np.tensordot(self.R, first.T, 1)
-            return _Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
+            return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
         fed = self.T @ first.B  # [out, n]: what the constant part feeds down, half of it
         slope = self.R + 2.0 * fed
         bent = first.R.T @ self.T @ first.R
         if first.T is not None:
             bent = bent + np.tensordot(slope, first.T, 1)
-        return _Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
+        return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
 
     def reduced(self) -> tuple[Array, Array, Array]:
         """W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
@@ -50,20 +51,26 @@ class _Quadratic:
         return self.B, self.R, np.where(i == j, 1.0, 2.0) * self.T[:, i, j]
 
 
-def _identity(n: int) -> _Quadratic:
-    return _Quadratic(np.zeros(n), np.eye(n), None)
+def _identity(n: int) -> Quadratic:
+    return Quadratic(np.zeros(n), np.eye(n), None)
 
 
-def _parts(source: Any, energy: float) -> list[tuple[Array, Array, Array]]:
-    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element."""
-    from tmlattice.lattice.ocelot import SecondTM, TMTypes
+def _parts(source: Any, energy: float, split: bool) -> list[tuple[Array, Array, Array]]:
+    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element.
+
+    With `split` the body comes as two halves, in the middle of the list.
+    """
+    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
 
     atom = source.element
     supported = source.supported_tms  # None: the family declares nothing, and takes any
+    bare = isinstance(source, elements.Matrix)  # OCELOT does not know its inside
+    body = [(TMTypes.MAIN, atom.l / 2)] * 2 if split and not bare else [(TMTypes.MAIN, None)]
+    edges = [(TMTypes.ENTRANCE, None)], [(TMTypes.EXIT, None)]
+    parts = [*edges[0], *body, *edges[1]] if atom.has_edge else body
     if supported is None or SecondTM in supported:
-        parts = [TMTypes.ENTRANCE, TMTypes.MAIN, TMTypes.EXIT] if atom.has_edge else [TMTypes.MAIN]
         try:
-            second = [SecondTM.from_element(atom, part).get_params(energy) for part in parts]
+            second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
             return [(p.B.ravel(), p.get_rotated_R(), p.get_rotated_T()) for p in second]
         except (AttributeError, NotImplementedError):
             pass  # it has no second order: a linear element
@@ -73,7 +80,7 @@ def _parts(source: Any, energy: float) -> list[tuple[Array, Array, Array]]:
 
 
 def _physics(source: Any) -> Hashable:
-    """Equal for elements with equal maps: the class and every attribute but those for people."""
+    """Equal for sources with equal maps: the class and every attribute but those for people."""
     values = vars(source.element)
     physics = tuple(values[k] for k in values if k not in ("id", "color", "params"))
     if not values.get("params") and all(isinstance(v, int | float | None) for v in physics):
@@ -81,19 +88,110 @@ def _physics(source: Any) -> Hashable:
     return id(source)  # it holds more than numbers: a matrix, a field map
 
 
-def _quadratic(element: Element, energy: float, n: int) -> _Quadratic:
-    total = _identity(n)
-    for B, R, T in _parts(element.source, energy):
-        bent = T[:n, :n, :n]
-        bent = 0.5 * (bent + bent.swapaxes(1, 2))
-        part = _Quadratic(B[:n], R[:n, :n], bent if bent.any() else None)
-        total = part.after(total)
+def _of_ocelot(part: tuple[Array, Array, Array], n: int) -> Quadratic:
+    B, R, T = part
+    bent = T[:n, :n, :n]
+    bent = 0.5 * (bent + bent.swapaxes(1, 2))
+    return Quadratic(B[:n], R[:n, :n], bent if bent.any() else None)
+
+
+def _quadratic(element: Element, energy: float, n: int) -> Quadratic:
+    errors = element.errors
+    if errors == NO_ERRORS:
+        total = _chain(_of_ocelot(part, n) for part in _parts(element.source, energy, False))
+    else:
+        first, second = _halves(element, energy, n)
+        total = _chain(
+            [
+                _thin(n, k1l=errors.entrance_k1l),
+                _shift(n, -errors.dx, -errors.dy),
+                _turn(n, errors.roll),
+                first,
+                _thin(n, errors.kick_x, errors.kick_y, errors.k1l, errors.k1sl),
+                _loss(n, errors.loss, element),
+                second,
+                _turn(n, -errors.roll),
+                _shift(n, errors.dx, errors.dy),
+            ]
+        )
     finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
     if not finite or (total.T is not None and not np.isfinite(total.T).all()):
         raise LatticeError(
             f"OCELOT's map of {element.kind} '{element.name}' is not finite; check its strengths"
         )
     return total
+
+
+def _chain(parts: Iterable[Quadratic | None]) -> Quadratic:
+    """The parts in beam order, composed; None moves nothing."""
+    given = [part for part in parts if part is not None]
+    total = given[0]
+    for part in given[1:]:
+        total = part.after(total)
+    return total
+
+
+def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
+    """The maps to and from the middle of an element's body."""
+    if element.length == 0:  # as thin as what is put into it
+        parts = [_of_ocelot(part, n) for part in _parts(element.source, energy, False)]
+        return _identity(n), _chain(parts)
+    parts = [_of_ocelot(part, n) for part in _parts(element.source, energy, True)]
+    if len(parts) > 1:
+        middle = len(parts) // 2
+        return _chain(parts[:middle]), _chain(parts[middle:])
+    root = np.real(np.array(sqrtm(parts[0].R), dtype=np.complex128))  # a bare matrix
+    first = Quadratic(np.zeros(n), root, None)
+    return first, parts[0].after(Quadratic(np.zeros(n), np.linalg.inv(root), None))
+
+
+def _thin(
+    n: int, kick_x: float = 0.0, kick_y: float = 0.0, k1l: float = 0.0, k1sl: float = 0.0
+) -> Quadratic | None:
+    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x."""
+    if kick_x == kick_y == k1l == k1sl == 0:
+        return None
+    B, R = np.zeros(n), np.eye(n)
+    B[1], B[3] = kick_x, kick_y
+    R[1, 0], R[3, 2] = -k1l, k1l
+    R[1, 2] = R[3, 0] = k1sl
+    return Quadratic(B, R, None)
+
+
+def _shift(n: int, dx: float, dy: float) -> Quadratic | None:
+    if dx == dy == 0:
+        return None
+    B = np.zeros(n)
+    B[0], B[2] = dx, dy
+    return Quadratic(B, np.eye(n), None)
+
+
+def _turn(n: int, roll: float) -> Quadratic | None:
+    """Coordinates in axes that are turned by `roll` from x towards y."""
+    if roll == 0:
+        return None
+    R = np.eye(n)
+    cos, sin = np.cos(roll), np.sin(roll)
+    R[0, 0] = R[1, 1] = R[2, 2] = R[3, 3] = cos
+    R[0, 2] = R[1, 3] = sin
+    R[2, 0] = R[3, 1] = -sin
+    return Quadratic(np.zeros(n), R, None)
+
+
+def _loss(n: int, loss: float, element: Element) -> Quadratic | None:
+    """The energy falls by loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
+    if loss == 0:
+        return None
+    if n != 6:
+        raise LatticeError(
+            f"{element.kind} '{element.name}' loses energy, which four coordinates cannot hold; "
+            "take six (dimension=6)"
+        )
+    B, R = np.zeros(n), np.eye(n)
+    B[5] = -loss
+    R[5, 5] = 1 - 2 * loss
+    R[1, 1] = R[3, 3] = 1 - loss
+    return Quadratic(B, R, None)
 
 
 def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMap:
@@ -148,53 +246,132 @@ class RingMaps:
         return np.searchsorted(self.at, np.arange(len(self.layers) + 2)).astype(np.int64)
 
 
-def ring_maps(ring: Ring, dimension: int = 4) -> RingMaps:
-    """Second-order maps of all magnets of a ring, and the read-outs of its monitors.
+Weights = tuple[Array, Array, Array]
+
+
+class LayerMaps:
+    """The layers of one ring, made one by one, also with some elements replaced.
+
+    Elements with equal physics share one map, and what was asked of OCELOT once is kept, so that a
+    hypothesis or a shot's settings cost only the layers that they touch.
 
     Args:
         ring: at least one magnet.
         dimension: 4 for (x, px, y, py) at the nominal energy, 6 for OCELOT's six coordinates.
 
+    Attributes:
+        layer_of: the layer whose map holds each element; the number of layers for those behind the
+            last magnet, [element].
+
     Raises:
         LatticeError: a ring without magnets, or a map that is not finite.
         ValueError: another dimension.
     """
-    if dimension not in (4, 6):
-        raise ValueError(f"OCELOT's maps have 4 or 6 coordinates, not {dimension}")
-    if not ring.magnets:
-        raise LatticeError(f"'{ring.name}' has no magnet; a network needs one at least")
-    known: dict[Hashable, _Quadratic] = {}  # OCELOT is asked once for equal elements
-    layers: list[tuple[Array, Array, Array]] = []
-    exits: list[float] = []
-    readouts: list[tuple[Array, Array, Array]] = []
+
+    def __init__(self, ring: Ring, dimension: int = 4) -> None:
+        if dimension not in (4, 6):
+            raise ValueError(f"OCELOT's maps have 4 or 6 coordinates, not {dimension}")
+        if not ring.magnets:
+            raise LatticeError(f"'{ring.name}' has no magnet; a network needs one at least")
+        self.ring = ring
+        self.dimension = dimension
+        magnet = np.array([element.is_magnet for element in ring.elements])
+        self.layer_of = np.concatenate([[0], np.cumsum(magnet)[:-1]])
+        self._first = np.searchsorted(self.layer_of, np.arange(len(ring.magnets) + 2))
+        self._known: dict[Hashable, Quadratic] = {}
+        self._kept: list[Any] = []
+        self._ways: dict[int, Quadratic] = {}
+
+    @staticmethod
+    def physics(element: Element) -> Hashable:
+        """Equal for elements with equal maps."""
+        return (_physics(element.source), element.errors)
+
+    def map(self, element: Element) -> Quadratic:
+        """The map of one element, of this ring or not."""
+        key = self.physics(element)
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = _quadratic(element, self.ring.energy, self.dimension)
+            self._kept.append(element.source)  # where the key is its id, it must not be freed
+        return known
+
+    def first_element(self, k: int) -> int:
+        """The place in `ring.elements` of the first element of layer k."""
+        return int(self._first[k])
+
+    def way(self, k: int) -> Quadratic:
+        """From the exit of layer k - 1 to the entrance of its magnet."""
+        if k not in self._ways:
+            between = self.ring.elements[self._first[k] : self._first[k + 1] - 1]
+            parts = [self.map(e) for e in between if _moves(e)]
+            self._ways[k] = _chain([_identity(self.dimension), *parts])
+        return self._ways[k]
+
+    def layer(
+        self, k: int, replaced: Mapping[int, Element] | None = None
+    ) -> tuple[Weights, list[Weights]]:
+        """The weights of layer k, and the read-outs of the monitors before its magnet.
+
+        Args:
+            k: up to the number of layers, which names the way from the last magnet to the end.
+            replaced: other elements at places of the ring.
+        """
+        way = _identity(self.dimension)
+        readouts = []
+        for place in range(self._first[k], self._first[k + 1]):
+            element = self.ring.elements[place]
+            if replaced:
+                element = replaced.get(place, element)
+            if element.kind == "monitor":  # read in its middle; nearly all have no length
+                half = element.length / 2
+                here = _drift(half, self.dimension).after(way) if half else way
+                W0, W1, W2 = here.reduced()
+                readouts.append((W0[:3:2], W1[:3:2], W2[:3:2]))
+            if _moves(element):
+                way = self.map(element).after(way)
+        return way.reduced(), readouts
+
+
+def _moves(element: Element) -> bool:
+    """False for what is thin and empty."""
+    thin = element.kind in ("monitor", "marker") and element.length == 0
+    return not thin or element.errors != NO_ERRORS
+
+
+def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -> RingMaps:
+    """Second-order maps of all magnets of a ring, and the read-outs of its monitors.
+
+    Args:
+        ring: at least one magnet.
+        dimension: 4 for (x, px, y, py) at the nominal energy, 6 for OCELOT's six coordinates.
+        layers: the same ring's, where they are at hand already.
+
+    Raises:
+        LatticeError: a ring without magnets, or a map that is not finite.
+        ValueError: another dimension.
+    """
+    layers = LayerMaps(ring, dimension) if layers is None else layers
+    magnets = ring.magnets
+    weights: list[Weights] = []
+    readouts: list[Weights] = []
     at: list[int] = []
-    way = _identity(dimension)
-    s = 0.0
-    for element in ring.elements:
-        physics = _physics(element.source)
-        own = known.get(physics)
-        if own is None:
-            own = known[physics] = _quadratic(element, ring.energy, dimension)
-        s += element.length
-        if element.kind == "monitor":  # read in its middle; nearly all have no length
-            here = way if element.length == 0 else _half_drift(element.length, dimension).after(way)
-            W0, W1, W2 = here.reduced()
-            readouts.append((W0[:3:2], W1[:3:2], W2[:3:2]))
-            at.append(len(layers))
-        if element.is_magnet:
-            layers.append(own.after(way).reduced())
-            exits.append(s)
-            way = _identity(dimension)
-        else:
-            way = own.after(way)
-    W0, W1, W2 = (np.ascontiguousarray(w) for w in map(np.stack, zip(*layers, strict=True)))
+    for k in range(len(magnets) + 1):
+        own, read = layers.layer(k)
+        weights.append(own)
+        readouts += read
+        at += [k] * len(read)
+    ends = np.cumsum([element.length for element in ring.elements])
+    exits = ends[[i for i, element in enumerate(ring.elements) if element.is_magnet]]
+    *chain, closing = weights
+    W0, W1, W2 = (np.ascontiguousarray(w) for w in map(np.stack, zip(*chain, strict=True)))
     pairs = dimension * (dimension + 1) // 2
     R0, R1, R2 = np.empty((0, 2)), np.empty((0, 2, dimension)), np.empty((0, 2, pairs))
     if readouts:
         R0, R1, R2 = (np.ascontiguousarray(r) for r in map(np.stack, zip(*readouts, strict=True)))
     return RingMaps(
-        layers=tuple(e.name for e in ring.magnets),
-        s=np.array(exits),
+        layers=tuple(e.name for e in magnets),
+        s=exits,
         W0=W0,
         W1=W1,
         W2=W2,
@@ -204,23 +381,27 @@ def ring_maps(ring: Ring, dimension: int = 4) -> RingMaps:
         R0=R0,
         R1=R1,
         R2=R2,
-        closing=TaylorMap(way.reduced()),
+        closing=TaylorMap(closing),
     )
 
 
-def _half_drift(length: float, n: int) -> _Quadratic:
+def _drift(length: float, n: int) -> Quadratic:
     matrix = np.eye(n)
-    matrix[0, 1] = matrix[2, 3] = length / 2
-    return _Quadratic(np.zeros(n), matrix, None)
+    matrix[0, 1] = matrix[2, 3] = length
+    return Quadratic(np.zeros(n), matrix, None)
 
 
 def ring_matrix(ring: Ring) -> Array:
     """OCELOT's one-turn matrix, the product of its first-order R of every element, [4, 4].
 
-    The truth that tunes are held against; it shares nothing with the network but OCELOT.
+    The truth that tunes are held against; it shares nothing with the network but OCELOT. Where an
+    element has `errors`, its linear map about the design axis stands in.
     """
     total = np.eye(4)
     for element in ring.elements:
+        if element.errors != NO_ERRORS:
+            total = _quadratic(element, ring.energy, 4).R @ total
+            continue
         for matrix in element.source.R(ring.energy):
             total = matrix[:4, :4] @ total
     return total

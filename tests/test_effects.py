@@ -1,0 +1,295 @@
+"""Every effect of the catalogue: its derivative against the finite change of the tracked turn."""
+
+import numpy as np
+import pytest
+
+from tmlattice.diagnosis.model import Model
+from tmlattice.effects import (
+    CATALOGUE,
+    Cause,
+    Monitors,
+    apply,
+    beams,
+    check,
+    expected_loss,
+    find,
+    monitors_with,
+    names,
+)
+from tmlattice.errors import EffectError, LatticeError, UnknownNameError
+from tmlattice.maps import element_map
+from tmlattice.maps.magnets import ring_maps, ring_matrix
+
+SETTINGS = {
+    "hcor_sw_4": {"kick": 1e-4},
+    "vcor_a1_5": {"kick": -1e-4},
+    "qd::4": {"k1_relative": 0.01},
+}
+CORRECTORS = ["hcor_sw_4", "vcor_a1_5"]
+
+# Where each effect is tried: an effect without a row here fails the test.
+PLACES = {
+    "quadrupole_gradient": ["qd::12", "qa4::14", "q1_se"],
+    "gradient_absolute": ["qd::12", "s1::48", "wiggler::3", "a3", "qskew_nw_1"],
+    "skew_gradient": ["qd::12", "s1::48", "wiggler::3", "a3", "qskew_nw_1"],
+    "quadrupole_roll": ["qd::12", "qa2::13"],
+    "quadrupole_offset_x": ["qd::12", "qa3::2"],
+    "quadrupole_offset_y": ["qd::12", "qa3::2"],
+    "family_gradient": ["qd", "qe5"],
+    "dipole_field": ["b::28", "b_in::10", "bo_out::5"],
+    "dipole_roll": ["b::28", "b_in::10", "bo_out::5"],
+    "corrector_kick_x": CORRECTORS,
+    "corrector_kick_y": CORRECTORS,
+    "corrector_calibration": CORRECTORS,
+    "corrector_roll": CORRECTORS,
+    "sextupole_strength": ["s1::48", "s4::26"],
+    "sextupole_offset_x": ["s1::48", "s4::26"],
+    "sextupole_offset_y": ["s1::48", "s4::26"],
+    "insertion_device_focusing": ["wiggler::0", "wiggler::12"],
+    "monitor_offset_x": ["bpm_a4_3"],
+    "monitor_offset_y": ["bpm_a4_3"],
+    "monitor_gain_x": ["bpm_a4_3"],
+    "monitor_gain_y": ["bpm_a4_3"],
+    "monitor_roll": ["bpm_a4_3"],
+    "monitor_coupling": ["bpm_a4_3"],
+    "monitor_swap": ["bpm_a4_3"],
+    "monitor_dead": ["bpm_a4_3"],
+    "energy_offset": [None],
+    "energy_spread": [None],
+    "radiation_loss_bends": [None],
+    "radiation_loss_wigglers": [None],
+}
+
+
+@pytest.fixture(scope="module")
+def launches(petra3):
+    from tmlattice.machine import draw_shots
+
+    return draw_shots(petra3, 2, 1e-3, seed=1).launches[:, [0, 1, 2, 3, 5]]
+
+
+@pytest.fixture(scope="module")
+def model(petra3):
+    return Model(petra3, [{}, SETTINGS])
+
+
+@pytest.fixture(scope="module")
+def paths(model, launches):
+    return model.paths(launches)
+
+
+def finite_change(model, launches, effect, place):
+    """d readings / d amount^power of the tracked turn, by differences around no effect."""
+    if effect.discrete:
+        return model.readings(launches, [Cause(effect.name, place, 1.0)]) - model.readings(launches)
+    h = (1e-2 if effect.power == 2 else 1e-3) * effect.largest
+    up = model.readings(launches, [Cause(effect.name, place, h)])
+    if effect.power == 2:
+        return (up - model.readings(launches)) / h**2
+    return (up - model.readings(launches, [Cause(effect.name, place, -h)])) / (2 * h)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_derivative_vs_finite_change_of_the_tracked_turn(model, launches, paths, name):
+    assert name in PLACES, f"'{name}' has no test: add the places where it is to be tried"
+    effect = find(name)
+    for place in PLACES[name]:
+        signature = model.signatures(paths, [(name, place)], launches)[0]
+        change = finite_change(model, launches, effect, place)
+        size = np.linalg.norm(np.nan_to_num(change, nan=1.0))
+        assert size > 0
+        # central differences leave (1e-3)^2 of an effect's own nonlinearity
+        assert np.linalg.norm(np.nan_to_num(change - signature)) < 3e-6 * size, place
+        assert np.array_equal(np.isnan(change), np.isnan(signature))
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_an_effect_leaves_the_given_ring_unchanged(petra3, name):
+    before = ring_matrix(petra3)
+    errors = [element.errors for element in petra3.elements]
+    k1 = [element.k1 for element in petra3.elements]
+    apply(petra3, [Cause(name, PLACES[name][0], 0.3 * CATALOGUE[name].largest)], SETTINGS)
+    assert np.array_equal(ring_matrix(petra3), before)
+    assert [element.errors for element in petra3.elements] == errors
+    assert [element.k1 for element in petra3.elements] == k1
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_an_effect_says_what_it_is(petra3, name):
+    effect = CATALOGUE[name]
+    assert effect.name == name
+    assert all([effect.unit, effect.sign, effect.sits_on_text])
+    assert effect.largest > (effect.background or 0) >= 0
+    places = effect.places(petra3)
+    assert set(PLACES[name]) <= set(places)
+    assert len(set(places)) == len(places)
+
+
+def test_no_test_case_is_left_of_an_effect_that_went():
+    assert set(PLACES) == set(CATALOGUE)
+
+
+def test_tangents_vs_finite_change_of_the_launch(model, launches, paths):
+    for column in range(5):
+        h = np.zeros(5)
+        h[column] = 1e-6
+        change = (model.readings(launches + h) - model.readings(launches - h)) / 2e-6
+        slope = paths.launch[..., column]
+        assert np.abs(change - slope).max() < 1e-6 * np.abs(slope).max()
+
+
+def test_two_turns_are_one_chain(petra3, launches):
+    """The second turn of a shot is the first turn of where it ended; signatures carry on."""
+    model = Model(petra3, [{}], turns=2)
+    paths = model.paths(launches[:1])
+    for hypothesis in [("quadrupole_gradient", "qd::12"), ("skew_gradient", "a3")]:
+        signature = model.signatures(paths, [hypothesis], launches[:1])[0]
+        change = finite_change(model, launches[:1], find(hypothesis[0]), hypothesis[1])
+        assert np.linalg.norm(change - signature) < 1e-5 * np.linalg.norm(change)
+    states = petra3_turns(petra3, launches[0])
+    assert np.abs(paths.states[0, [0, len(model.maps.W0) + 1, -1]] - states).max() < 1e-12
+
+
+def petra3_turns(ring, launch):
+    from tmlattice import TaylorNetwork
+
+    return TaylorNetwork.from_ring(ring, 6).track([[*launch[:4], 0.0, launch[4]]], 2)[0]
+
+
+def test_kicks_have_the_signs_of_the_table(petra3):
+    """Thin limits by hand: what px and py gain at one millimetre in x and two in y."""
+    x, y = 1e-3, 2e-3
+    state = np.array([x, 0.0, y, 0.0])
+
+    def gain(name, element, amount, **settings):
+        changed = apply(petra3, [Cause(name, element, amount)], settings)
+        change = element_map(changed[element], 6.0)(state) - element_map(
+            apply(petra3, [], settings)[element], 6.0
+        )(state)
+        return change[[1, 3]]
+
+    quad, sextupole, bend = petra3["qd::12"], petra3["s1::48"], petra3["b::28"]
+    k1l = quad.k1 * quad.length
+    # a thick quadrupole of 0.7 m bends the way inside it: 10 %
+    assert gain("quadrupole_gradient", quad.name, 0.01) == pytest.approx(
+        [-0.01 * k1l * x, 0.01 * k1l * y], rel=0.1
+    )
+    assert gain("gradient_absolute", quad.name, 0.01) == pytest.approx(
+        [-0.01 * x, 0.01 * y], rel=0.1
+    )
+    assert gain("skew_gradient", sextupole.name, 0.01) == pytest.approx(
+        [0.01 * y, 0.01 * x], rel=0.01
+    )
+    # the centre moves: the beam is at x - dx in the field
+    assert gain("quadrupole_offset_x", quad.name, 1e-3) == pytest.approx([k1l * 1e-3, 0], rel=0.1)
+    assert gain("quadrupole_offset_y", quad.name, 1e-3) == pytest.approx([0, -k1l * 1e-3], rel=0.1)
+    # a field turned by theta: k1s = k1 sin 2 theta; the kick is that of a skew quadrupole -2 theta
+    assert gain("quadrupole_roll", quad.name, 1e-3) == pytest.approx(
+        [-2e-3 * k1l * y, -2e-3 * k1l * x], rel=0.1
+    )
+    assert gain("dipole_field", bend.name, 1e-3) == pytest.approx(
+        [-1e-3 * bend.angle, 0], rel=1e-3, abs=1e-9
+    )
+    assert gain("dipole_roll", bend.name, 1e-2) == pytest.approx(
+        [1e-4 * bend.angle / 2, -1e-2 * bend.angle], rel=2e-3
+    )
+    k2l = sextupole.k2 * sextupole.length
+    assert gain("sextupole_strength", sextupole.name, 0.1) == pytest.approx(
+        [-0.1 * k2l / 2 * (x**2 - y**2), 0.1 * k2l * x * y], rel=1e-3
+    )
+    assert gain("sextupole_offset_x", sextupole.name, 1e-3) == pytest.approx(
+        [-k2l / 2 * ((x - 1e-3) ** 2 - x**2), -k2l * 1e-3 * y], rel=1e-3
+    )
+    kick = {"hcor_sw_4": {"kick": 1e-4}}
+    assert gain("corrector_calibration", "hcor_sw_4", 0.1, **kick) == pytest.approx([1e-5, 0])
+    assert gain("corrector_roll", "hcor_sw_4", 0.01, **kick) == pytest.approx(
+        [-0.5e-8, 1e-6], rel=1e-3
+    )
+    assert gain("corrector_kick_y", "hcor_sw_4", 1e-5) == pytest.approx([0, 1e-5])
+    assert gain("insertion_device_focusing", "wiggler::3", 0.01) == pytest.approx(
+        [-0.01 * x, 0.01 * y], rel=0.03
+    )
+
+
+def test_monitor_model_in_the_order_of_the_design_page():
+    monitors = Monitors.perfect(1)
+    for name, amount in [
+        ("monitor_gain_x", 0.1),
+        ("monitor_gain_y", -0.2),
+        ("monitor_coupling", 0.05),
+        ("monitor_roll", 0.3),
+        ("monitor_offset_x", 1e-3),
+        ("monitor_swap", 1.0),
+    ]:
+        find(name).set(monitors, 0, amount)
+    x, y = 2e-3, -1e-3
+    turned = [x * np.cos(0.3) + y * np.sin(0.3), -x * np.sin(0.3) + y * np.cos(0.3)]
+    mixed = [turned[0] + 0.05 * turned[1], turned[1] + 0.05 * turned[0]]
+    by_hand = [1.1 * mixed[0] + 1e-3, 0.8 * mixed[1]]
+    assert monitors.read(np.array([[x, y]]))[0] == pytest.approx(by_hand[::-1])
+
+
+def test_radiation_vs_published_loss(petra3):
+    loss = dict.fromkeys(("bend", "wiggler"), 0.0)
+    for element in petra3.elements:
+        if element.kind in loss:
+            loss[element.kind] += expected_loss(element, petra3.energy) * petra3.energy * 1e3
+    assert loss["bend"] == pytest.approx(1.3, abs=0.1)  # MeV a turn, facts of the ring
+    assert loss["wiggler"] == pytest.approx(3.9, abs=0.1)
+
+
+def test_energy_spread_is_a_gaussian_average():
+    launches = np.zeros((1, 6))
+    weights, nodes = beams(launches, [Cause("energy_spread", None, 1e-3)])
+    p = nodes[:, 0, 5]
+    assert weights.sum() == pytest.approx(1)
+    assert weights @ p**2 == pytest.approx(1e-6)
+    assert weights @ p**4 == pytest.approx(3e-12)
+
+
+@pytest.mark.parametrize(
+    ("cause", "error", "says"),
+    [
+        (Cause("quadrupole_gradiant", "qd::12", 0.1), UnknownNameError, "quadrupole_gradient"),
+        (Cause("quadrupole_gradient", "qd_12", 0.1), UnknownNameError, "qd::12"),
+        (Cause("quadrupole_gradient", "s1::48", 0.1), EffectError, "a sextupole"),
+        (Cause("quadrupole_gradient", None, 0.1), EffectError, "needs an element"),
+        (Cause("quadrupole_gradient", "qskew_nw_1", 0.1), EffectError, "k1 not 0"),
+        (Cause("energy_offset", "qd::12", 0.1), EffectError, "leave 'qd::12' out"),
+        (Cause("monitor_gain_x", "qd::12", 0.1), EffectError, "monitors"),
+        (Cause("quadrupole_gradient", "qd::12", float("nan")), EffectError, "give a number"),
+    ],
+)
+def test_impossible_causes_are_refused_with_the_mend(petra3, cause, error, says):
+    with pytest.raises(error, match=says):
+        check(petra3, [cause])
+
+
+def test_wrong_settings_are_refused(petra3):
+    with pytest.raises(EffectError, match="correctors have kick"):
+        apply(petra3, [], {"qd::12": {"kick": 1e-5}})
+
+
+def test_energy_loss_needs_six_coordinates(petra3):
+    lossy = apply(petra3, [Cause("radiation_loss_bends", None, 1.0)])
+    with pytest.raises(LatticeError, match="six"):
+        ring_maps(lossy, 4)
+
+
+def test_causes_add_up(petra3):
+    both = apply(
+        petra3,
+        [
+            Cause("quadrupole_offset_x", "qd::12", 1e-4),
+            Cause("quadrupole_offset_x", "qd::12", 2e-4),
+        ],
+    )
+    assert both["qd::12"].errors.dx == pytest.approx(3e-4)
+    monitors = monitors_with(petra3, [Cause("monitor_gain_x", "bpm_a4_3", 0.1)] * 2)
+    assert monitors.gain.max() == pytest.approx(0.21)
+
+
+def test_names_come_in_the_order_of_the_catalogue():
+    assert names(["dipole_field", "quadrupole_roll"]) == ["quadrupole_roll", "dipole_field"]
+    with pytest.raises(UnknownNameError):
+        names(["dipole"])

@@ -1,0 +1,94 @@
+"""Compiled loops of the diagnosis: tangent maps along trajectories, signatures of all hypotheses.
+
+A chain has `step` maps: the layers of every turn, each turn closed by the way to the ring's end.
+Axes: states [shot, step + 1, n], tangents C [shot, step + 1, n, n] = d state / d launch.
+"""
+
+import numba
+
+_jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+
+
+@_jit
+def trajectories(W0, W1, W2, curved, layers, states, tangents):  # type: ignore[no-untyped-def]
+    """Fill states [shot, 1:] and tangents [shot, 1:] from states[:, 0] and tangents[:, 0].
+
+    Step k applies map layers[k] of W0 [map, n], W1 [map, n, n], W2 [map, n, pairs].
+    """
+    n = states.shape[2]
+    for shot in range(states.shape[0]):
+        for k in range(len(layers)):
+            w = layers[k]
+            x, y = states[shot, k], states[shot, k + 1]
+            before, after = tangents[shot, k], tangents[shot, k + 1]
+            for a in range(n):
+                for j in range(n):
+                    after[a, j] = 0.0
+                total = W0[w, a]
+                m = 0
+                for i in range(n):
+                    slope = W1[w, a, i]
+                    value = W1[w, a, i]
+                    if curved[w]:
+                        # row i of the Jacobian: products (j, i) for j < i, (i, i), (i, j) for j > i
+                        for j in range(i, n):
+                            value += W2[w, a, m] * x[j]
+                            m += 1
+                        for j in range(n):
+                            low, high = min(i, j), max(i, j)
+                            place = low * n - low * (low - 1) // 2 + high - low
+                            bend = W2[w, a, place] * x[j]
+                            slope += 2.0 * bend if i == j else bend
+                    total += value * x[i]
+                    if slope != 0.0:
+                        for j in range(n):
+                            after[a, j] += slope * before[i, j]
+                y[a] = total
+
+
+@_jit
+def kicks(layer, D0, D1, D2, states, steps, out):  # type: ignore[no-untyped-def]
+    """out [shot, turn, row, n] = D0 + D1 x + D2 x^2 at the entrance of each row's layer.
+
+    The state is states[shot, turn * steps + layer].
+    """
+    n = states.shape[2]
+    for shot in range(out.shape[0]):
+        for turn in range(out.shape[1]):
+            for row in range(len(layer)):
+                x = states[shot, turn * steps + layer[row]]
+                for a in range(n):
+                    total = D0[row, a]
+                    m = 0
+                    for i in range(n):
+                        slope = D1[row, a, i]
+                        for j in range(i, n):
+                            slope += D2[row, a, m] * x[j]
+                            m += 1
+                        total += slope * x[i]
+                    out[shot, turn, row, a] = total
+
+
+@_jit
+def carry(first, last, owner, start, pulled, G, out):  # type: ignore[no-untyped-def]
+    """out [hypothesis, shot, reading, 2] += G v: kicks carried to all readings downstream.
+
+    Args:
+        first, last: shots.
+        owner: hypothesis of each row, [row].
+        start: the first reading downstream of the row, [row, turn].
+        pulled: the kick as a change of the launch, C^-1 kick, [shot, turn, row, n].
+        G: d reading / d launch, [shot, reading, 2, n].
+    """
+    n = G.shape[3]
+    for shot in range(first, last):
+        for row in range(len(owner)):
+            h = owner[row]
+            for turn in range(start.shape[1]):
+                v = pulled[shot, turn, row]
+                for m in range(start[row, turn], G.shape[1]):
+                    for plane in range(2):
+                        total = 0.0
+                        for i in range(n):
+                            total += G[shot, m, plane, i] * v[i]
+                        out[h, shot, m, plane] += total

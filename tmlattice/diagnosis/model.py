@@ -1,0 +1,340 @@
+"""The model's side of a diagnosis: what a ring with causes makes the monitors read.
+
+Launches are (x, px, y, py, delta), one for each shot; readings are [shot, reading, 2] with the
+turns of a shot one after another, `reading = turn * monitors + monitor`.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis import kernels
+from tmlattice.effects import (
+    CATALOGUE,
+    Cause,
+    Directions,
+    LaunchEffect,
+    ReadingEffect,
+    RingEffect,
+    Settings,
+    apply,
+    beams,
+    changed_elements,
+    directions,
+    find,
+    monitors_with,
+    set_elements,
+)
+from tmlattice.effects.settings import groups
+from tmlattice.lattice import Element, Ring
+from tmlattice.maps import LayerMaps, ring_maps
+from tmlattice.network.autograd import curved
+from tmlattice.network.monitors import positions
+from tmlattice.network.threads import share
+
+Array = NDArray[np.float64]
+Hypothesis = tuple[str, str | None]
+"""An effect and the place where it might sit."""
+
+Patch = tuple[list[Array], int, list[Array]]
+LAUNCH = ("x", "px", "y", "py", "delta")
+_COLUMNS = [0, 1, 2, 3, 5]  # of OCELOT's six coordinates
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The model's trajectories, and how they depend on their launches.
+
+    Attributes:
+        readings: [shot, reading, 2], m.
+        launch: d readings / d (x, px, y, py, delta), [shot, reading, 2, 5].
+        beam: where the beam is, [shot, reading, 2], m: readings before the monitors' errors.
+        states, tangents: at every exit, [shot, step + 1, n], [shot, step + 1, n, n].
+        beam_launch: d beam / d launch, all coordinates, [shot, reading, 2, n].
+        monitors: d reading / d beam, [monitor, 2, 2].
+    """
+
+    readings: Array
+    launch: Array
+    beam: Array
+    states: Array
+    tangents: Array
+    beam_launch: Array
+    monitors: Array
+
+
+class _Group:
+    """Shots with equal settings, and the stacked weights of their ring."""
+
+    def __init__(self, shots: NDArray[np.intp], settings: Settings) -> None:
+        self.shots = shots
+        self.settings = settings
+        self.W: list[Array] = []
+        self.R: list[Array] = []
+
+
+class Model:
+    """A ring as the shots of a measurement saw it, and every hypothesis about it.
+
+    Args:
+        ring: the design.
+        settings: of each shot.
+        turns: of each shot.
+        known: causes that are no hypothesis (radiation where it is asked for).
+        dimension: 6; 4 where no cause touches the energy.
+    """
+
+    def __init__(
+        self,
+        ring: Ring,
+        settings: Sequence[Settings],
+        turns: int = 1,
+        known: Sequence[Cause] = (),
+        dimension: int = 6,
+    ) -> None:
+        self.design = ring
+        self.ring = apply(ring, known)
+        self.turns = turns
+        self.shots = len(settings)
+        self.dimension = dimension
+        self.layers = LayerMaps(self.ring, dimension)
+        maps = ring_maps(self.ring, dimension, self.layers)
+        self.maps = maps
+        self.at = maps.at
+        base = [
+            np.concatenate([w, c[None]])
+            for w, c in zip((maps.W0, maps.W1, maps.W2), maps.closing.coefficients, strict=True)
+        ]
+        self.groups = []
+        for shots, setting in groups(settings, self.shots):
+            group = _Group(shots, setting)
+            group.W = [w.copy() for w in base]
+            group.R = [r.copy() for r in (maps.R0, maps.R1, maps.R2)]
+            self._patch(group, set_elements(self.ring, setting))
+            self.groups.append(group)
+        self._base_directions: dict[tuple[Hypothesis, ...], Directions] = {}
+
+    # --- weights with causes in them ------------------------------------------------------------
+    def _patch(self, group: _Group, replaced: dict[int, Element]) -> list[Patch]:
+        undo: list[Patch] = []
+        touched = sorted({int(self.layers.layer_of[place]) for place in replaced})
+        for k in touched:
+            own, reads = self.layers.layer(k, replaced)
+            undo.append((group.W, k, [w[k].copy() for w in group.W]))
+            for stack, new in zip(group.W, own, strict=True):
+                stack[k] = new
+            first = int(self.maps.start[k])
+            for i, read in enumerate(reads):
+                undo.append((group.R, first + i, [r[first + i].copy() for r in group.R]))
+                for stack, new in zip(group.R, read, strict=True):
+                    stack[first + i] = new
+        return undo
+
+    @contextmanager
+    def _with(self, group: _Group, causes: Sequence[Cause]) -> Iterator[None]:
+        ring_causes = [c for c in causes if isinstance(find(c.effect), RingEffect)]
+        if not ring_causes:
+            yield
+            return
+        undo = self._patch(group, changed_elements(self.ring, ring_causes, group.settings))
+        try:
+            yield
+        finally:
+            for stacks, k, old in undo:
+                for stack, values in zip(stacks, old, strict=True):
+                    stack[k] = values
+
+    def _states(self, launches: Array) -> Array:
+        states = np.zeros((len(launches), self.dimension))
+        columns = _COLUMNS[: 4 + (self.dimension == 6)]
+        states[:, columns] = launches[:, : len(columns)]
+        return states
+
+    # --- readings -------------------------------------------------------------------------------
+    def beam(self, launches: Array, causes: Sequence[Cause] = ()) -> Array:
+        """Where the beam is, [shot, reading, 2], m; NaN where it is lost."""
+        states = self._states(launches)
+        weights, nodes = (np.ones(1), states[None])
+        if self.dimension == 6:
+            weights, nodes = beams(states, causes)
+        total = np.zeros((self.shots, self.turns * len(self.at), 2))
+        for group in self.groups:
+            with self._with(group, causes):
+                for weight, node in zip(weights, nodes, strict=True):
+                    found = positions(node[group.shots], self.turns, group.W, group.R, self.at)
+                    total[group.shots] += weight * found.reshape(len(found), -1, 2)
+        return total
+
+    def readings(self, launches: Array, causes: Sequence[Cause] = ()) -> Array:
+        """What the monitors read, [shot, reading, 2], m.
+
+        Args:
+            launches: (x, px, y, py, delta), [shot, 5].
+            causes: of all three kinds.
+        """
+        return self._read(self.beam(launches, causes), causes)
+
+    def _read(self, beam: Array, causes: Sequence[Cause]) -> Array:
+        monitors = monitors_with(self.ring, causes)
+        by_turn = beam.reshape(self.shots, self.turns, -1, 2)
+        return monitors.read(by_turn).reshape(beam.shape)
+
+    def paths(self, launches: Array, causes: Sequence[Cause] = ()) -> Paths:
+        """Trajectories, readings and their derivatives by the launches."""
+        n, maps = self.dimension, self.maps
+        steps = len(maps.W0) + 1
+        order = np.tile(np.arange(steps), self.turns)
+        states = np.empty((self.shots, len(order) + 1, n))
+        tangents = np.empty((self.shots, len(order) + 1, n, n))
+        states[:, 0] = self._states(launches)
+        for cause in causes:
+            if cause.effect == "energy_offset":
+                states[:, 0, 5] += cause.amount
+        tangents[:, 0] = np.eye(n)
+        slopes = np.empty((self.shots, self.turns * len(self.at), 2, n))
+        where = self._where()
+        for group in self.groups:
+            with self._with(group, causes):
+                part = states[group.shots], tangents[group.shots]
+                bends = curved(group.W[2])
+                share(_trajectories, len(group.shots), *group.W, bends, order, *part)
+                states[group.shots], tangents[group.shots] = part
+                R1, R2 = (np.tile(r, (self.turns, *(1,) * (r.ndim - 1))) for r in group.R[1:])
+                i, j = np.triu_indices(n)
+                x = part[0][:, where]  # [shot, reading, n]
+                own = np.broadcast_to(R1, (len(x), *R1.shape)).copy()
+                if R2.any():
+                    for pair, (a, b) in enumerate(zip(i, j, strict=True)):
+                        own[..., a] += R2[..., pair] * x[:, :, None, b]
+                        own[..., b] += R2[..., pair] * x[:, :, None, a]
+                slopes[group.shots] = own @ part[1][:, where]
+        beam = self.beam(launches, causes)
+        monitors = monitors_with(self.ring, causes).matrix()
+        turned = np.einsum(
+            "mij,stmjk->stmik", monitors, slopes.reshape(self.shots, self.turns, -1, 2, n)
+        ).reshape(slopes.shape)
+        launch = np.zeros((*slopes.shape[:3], 5))
+        columns = _COLUMNS[: 4 + (n == 6)]
+        launch[..., : len(columns)] = turned[..., columns]
+        return Paths(self._read(beam, causes), launch, beam, states, tangents, slopes, monitors)
+
+    def _where(self) -> NDArray[np.int64]:
+        steps = len(self.maps.W0) + 1
+        return np.concatenate([self.at + turn * steps for turn in range(self.turns)])
+
+    # --- hypotheses -----------------------------------------------------------------------------
+    def hypotheses(self, effects: Sequence[str] | None = None) -> list[Hypothesis]:
+        """Every effect at every place that it can sit on, in the catalogue's order.
+
+        Effects that are there or not (swapped, dead) are included; the energy's only in six
+        coordinates.
+        """
+        chosen = list(CATALOGUE) if effects is None else list(effects)
+        found: list[Hypothesis] = []
+        for name in chosen:
+            energy = isinstance(CATALOGUE[name], LaunchEffect) or name.startswith("radiation")
+            if not (energy and self.dimension == 4):
+                found += [(name, place) for place in CATALOGUE[name].places(self.ring)]
+        return found
+
+    def signatures(self, paths: Paths, hypotheses: Sequence[Hypothesis], launches: Array) -> Array:
+        """d readings / d amount ** power of every hypothesis, [hypothesis, shot, reading, 2].
+
+        For what is discrete: the change when it is there.
+
+        Args:
+            paths: of the model as it stands.
+            hypotheses: see `hypotheses`.
+            launches: those of the paths.
+        """
+        out = np.zeros((len(hypotheses), *paths.readings.shape))
+        ring = [i for i, (name, _) in enumerate(hypotheses) if isinstance(find(name), RingEffect)]
+        if ring:
+            self._ring_signatures(paths, [hypotheses[i] for i in ring], np.array(ring), out)
+        index = {monitor: i for i, monitor in enumerate(self.maps.monitors)}
+        count = len(self.at)
+        for i, (name, place) in enumerate(hypotheses):
+            effect = find(name)
+            if isinstance(effect, ReadingEffect):
+                assert place is not None
+                m = slice(index[place], None, count)
+                h = 1.0 if effect.discrete else 1e-6
+                out[i, :, m] = effect.change(paths.beam[:, m], h) / h
+            elif isinstance(effect, LaunchEffect):
+                h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
+                up = self.beam(launches, [Cause(name, None, h)])
+                if effect.power == 1:
+                    out[i] = (up - self.beam(launches, [Cause(name, None, -h)])) / (2 * h)
+                else:
+                    out[i] = (up - self.beam(launches)) / h**effect.power
+        return out
+
+    def _ring_signatures(
+        self, paths: Paths, hypotheses: list[Hypothesis], index: NDArray[np.int64], out: Array
+    ) -> None:
+        steps = len(self.maps.W0) + 1
+        inverse = np.linalg.inv(paths.tangents)  # [shot, step + 1, n, n]
+        where = self._where()
+        turns = np.arange(self.turns) * steps
+        for group in self.groups:
+            d = self._directions(hypotheses, group)
+            shots = group.shots
+            kicks = np.empty((len(shots), self.turns, len(d.owner), self.dimension))
+            states = np.ascontiguousarray(paths.states[shots])
+            kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, steps, kicks)
+            exits = d.layer[:, None] + 1 + turns[None]  # [row, turn]
+            pulled = np.einsum("strij,strj->stri", inverse[shots][:, exits.T], kicks)
+            start = np.searchsorted(where, exits)
+            part = np.zeros((len(hypotheses), len(shots), *out.shape[2:]))
+            slopes = np.ascontiguousarray(paths.beam_launch[shots])
+            share(kernels.carry, len(shots), d.owner, start, pulled, slopes, part)
+            for row, (owner, monitor) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
+                for turn in range(self.turns):
+                    x = states[:, turns[turn] + self.at[monitor]]
+                    i, j = np.triu_indices(self.dimension)
+                    moved = d.E0[row] + x @ d.E1[row].T + (x[:, i] * x[:, j]) @ d.E2[row].T
+                    part[owner, :, turn * len(self.at) + monitor] += moved
+            by_turn = part.reshape(*part.shape[:2], self.turns, -1, 2)
+            turned = np.einsum("mij,hstmj->hstmi", paths.monitors, by_turn)
+            out[index[:, None], shots[None]] = turned.reshape(part.shape)
+
+    def _directions(self, hypotheses: list[Hypothesis], group: _Group) -> Directions:
+        key = tuple(hypotheses)
+        if key not in self._base_directions:
+            self._base_directions[key] = directions(self.layers, hypotheses)
+        base = self._base_directions[key]
+        replaced = set_elements(self.ring, group.settings)
+        if not replaced:
+            return base
+        touched = {self.ring.elements[place].name for place in replaced}
+        families = {self.ring.elements[place].family for place in replaced}
+        again = [
+            i for i, (_, place) in enumerate(hypotheses) if place in touched or place in families
+        ]
+        layers = LayerMaps(self.ring.with_elements(replaced), self.dimension)
+        fresh = directions(layers, [hypotheses[i] for i in again])
+        keep = ~np.isin(base.owner, again)
+        keep_read = ~np.isin(base.read_owner, again)
+        owner = np.array(again, dtype=np.int64)
+        joined = {
+            name: np.concatenate([getattr(base, name)[kept], getattr(fresh, name)])
+            for names, kept in (
+                (("layer", "D0", "D1", "D2"), keep),
+                (("monitor", "E0", "E1", "E2"), keep_read),
+            )
+            for name in names
+        }
+        return Directions(
+            hypotheses=base.hypotheses,
+            owner=np.concatenate([base.owner[keep], owner[fresh.owner]]),
+            read_owner=np.concatenate([base.read_owner[keep_read], owner[fresh.read_owner]]),
+            **joined,
+        )
+
+
+def _trajectories(first: int, last: int, *arguments: Array) -> None:
+    W0, W1, W2, bends, order, states, tangents = arguments
+    kernels.trajectories(W0, W1, W2, bends, order, states[first:last], tangents[first:last])

@@ -1,0 +1,66 @@
+"""The catalogue: every imperfection that the project knows, in one registry.
+
+>>> CATALOGUE["quadrupole_gradient"].places(ring)            # where it can sit
+>>> weaker = apply(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)])
+>>> monitors = monitors_with(ring, [Cause("monitor_gain_x", "bpm_w_1", 0.1)])
+>>> weights, launches = beams(launches, [Cause("energy_offset", None, 1e-3)])
+"""
+
+# Each registers its effects, in the order of the catalogue.
+# isort: off
+from tmlattice.effects import quadrupoles as quadrupoles
+from tmlattice.effects import bends as bends
+from tmlattice.effects import correctors as correctors
+from tmlattice.effects import sextupoles as sextupoles
+from tmlattice.effects import insertion_devices as insertion_devices
+from tmlattice.effects import monitors as monitors
+from tmlattice.effects import beam as beam
+from tmlattice.effects import radiation as radiation
+
+# isort: on
+from tmlattice.effects.apply import (
+    Settings,
+    apply,
+    beams,
+    changed_elements,
+    check,
+    monitors_with,
+    set_elements,
+)
+from tmlattice.effects.cause import Cause
+from tmlattice.effects.directions import Directions, directions
+from tmlattice.effects.effect import (
+    CATALOGUE,
+    Effect,
+    LaunchEffect,
+    Monitors,
+    ReadingEffect,
+    RingEffect,
+    find,
+    names,
+    register,
+)
+from tmlattice.effects.radiation import expected_loss
+
+__all__ = [
+    "CATALOGUE",
+    "Cause",
+    "Directions",
+    "Effect",
+    "LaunchEffect",
+    "Monitors",
+    "ReadingEffect",
+    "RingEffect",
+    "Settings",
+    "apply",
+    "beams",
+    "changed_elements",
+    "check",
+    "directions",
+    "expected_loss",
+    "find",
+    "monitors_with",
+    "names",
+    "register",
+    "set_elements",
+]

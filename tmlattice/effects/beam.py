@@ -1,0 +1,46 @@
+"""What the beam brings along."""
+
+import numpy as np
+from numpy.polynomial.hermite_e import hermegauss
+from numpy.typing import NDArray
+
+from tmlattice.effects.effect import LaunchEffect, register
+
+Array = NDArray[np.float64]
+
+NODES = 5
+"""Energies that stand for a Gaussian spread: exact for readings to the ninth power of delta."""
+
+
+@register
+class EnergyOffset(LaunchEffect):
+    """All shots arrive with another energy than the ring's."""
+
+    name = "energy_offset"
+    unit = "relative"
+    sign = "p of the launch += amount, common to all shots"
+    largest = 5e-3
+
+    def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
+        """The launches at the other energy."""
+        moved = launches.copy()
+        moved[..., 5] += amount
+        return np.ones(1), moved[None]
+
+
+@register
+class EnergySpread(LaunchEffect):
+    """Particles of a shot differ in energy; a monitor reads their centroid."""
+
+    name = "energy_spread"
+    unit = "relative"
+    sign = "rms of the particles' relative energy deviation"
+    largest = 3e-3
+    power = 2
+
+    def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
+        """The nodes and weights of Gauss and Hermite."""
+        nodes, weights = hermegauss(NODES)
+        moved = np.repeat(launches[None], NODES, axis=0)
+        moved[..., 5] += amount * nodes[:, None]
+        return weights / weights.sum(), moved

@@ -1,0 +1,48 @@
+"""What goes wrong with bends: the design geometry stays, the field differs from it.
+
+OCELOT's `tilt` and `angle` change the geometry, so neither is an error: a bend's errors are kicks
+spread over its body (in its middle, which for a body of 28 mrad is the same to 3e-5).
+"""
+
+from tmlattice.effects.effect import RingEffect, register
+from tmlattice.lattice import Element
+
+
+class _OnBend(RingEffect):
+    sits_on_text = "bends"
+
+    def sits_on(self, element: Element) -> bool:
+        """Bends with an angle."""
+        return element.kind == "bend" and element.angle != 0
+
+
+@register
+class DipoleField(_OnBend):
+    """A bend's field is off."""
+
+    name = "dipole_field"
+    unit = "relative"
+    sign = "px -= angle x amount: a stronger field bends towards the inside"
+    background = 5e-4
+    largest = 5e-3
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """A horizontal kick."""
+        return element.with_errors(kick_x=-element.angle * amount)
+
+
+@register
+class DipoleRoll(_OnBend):
+    """A bend turned about the beam axis: its field has a horizontal part."""
+
+    name = "dipole_roll"
+    unit = "rad"
+    sign = "kick (amount^2 angle / 2, -amount angle)"
+    background = 2e-4
+    largest = 5e-3
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """A vertical kick, and a second-order horizontal one."""
+        return element.with_errors(
+            kick_x=amount**2 * element.angle / 2, kick_y=-amount * element.angle
+        )

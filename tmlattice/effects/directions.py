@@ -1,0 +1,134 @@
+"""How a network's weights move when an effect grows: each effect as a direction in weight space.
+
+An effect of the ring changes the map of the layer that its element lies in. The derivative of that
+layer's weights by the amount, evaluated at the state at the layer's entrance, is the effect's kick
+on the trajectory at the layer's exit. Where the element is no magnet (a marker), monitors may read
+between it and the exit: then their read-outs move too.
+
+The derivatives are central differences of the layers' own maps; every map that OCELOT was asked
+for is kept by `LayerMaps`, so that equal magnets cost one.
+"""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects.effect import RingEffect, find
+from tmlattice.lattice import Element
+from tmlattice.maps import LayerMaps
+from tmlattice.maps.magnets import Quadratic, Weights
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+STEP = 1e-3
+"""Of the largest fault, for differences: their error is STEP^2 of an effect's nonlinearity."""
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Derivatives of weights by the amounts of hypotheses; members of a family have a row each.
+
+    Attributes:
+        hypotheses: (effect, place), effects of the ring only.
+        owner, layer: the hypothesis and the layer of each row, [row].
+        D0, D1, D2: d weights / d amount, [row, n], [row, n, n], [row, n, n (n + 1) / 2].
+        read_owner, monitor: the same for rows that move a read-out, [read].
+        E0, E1, E2: d read-out / d amount, [read, 2], [read, 2, n], [read, 2, n (n + 1) / 2].
+    """
+
+    hypotheses: tuple[tuple[str, str | None], ...]
+    owner: Indices
+    layer: Indices
+    D0: Array
+    D1: Array
+    D2: Array
+    read_owner: Indices
+    monitor: Indices
+    E0: Array
+    E1: Array
+    E2: Array
+
+
+def directions(
+    layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], step: float = STEP
+) -> Directions:
+    """The directions of effects in the weights of a ring's layers.
+
+    Args:
+        layers: of the ring, with its settings.
+        hypotheses: (effect, place); see `Effect.places`.
+        step: of the central differences, in units of the effect's largest fault.
+    """
+    ring, n = layers.ring, layers.dimension
+    known: dict[Hashable, Quadratic | None] = {}
+    rows = _Rows(n, n)
+    reads = _Rows(2, n)
+    first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
+    for owner, (name, place) in enumerate(hypotheses):
+        effect = find(name)
+        if not isinstance(effect, RingEffect):
+            raise TypeError(f"{name} does not act on the ring")
+        h = step * effect.largest
+        for member in effect.members(ring, place):
+            element = ring.elements[member]
+            k = int(layers.layer_of[member])
+            if element.is_magnet:
+                key = (name, layers.physics(element))
+                if key not in known:
+                    known[key] = _derivative(layers, effect, element, h)
+                own = known[key]
+                if own is not None:
+                    rows.add(owner, k, own.after(layers.way(k)).reduced())
+                continue
+            (up, up_read), (down, down_read) = (
+                layers.layer(k, {member: effect.changed(element, a, ring.energy)}) for a in (h, -h)
+            )
+            rows.add(owner, k, _slope(up, down, h))
+            start = first_monitor[layers.first_element(k)]
+            for i, (a, b) in enumerate(zip(up_read, down_read, strict=True)):
+                moved = _slope(a, b, h)
+                if any(m.any() for m in moved):
+                    reads.add(owner, int(start + i), moved)
+    return Directions(tuple(hypotheses), *rows.stacked(), *reads.stacked())
+
+
+def _derivative(
+    layers: LayerMaps, effect: RingEffect, element: Element, h: float
+) -> Quadratic | None:
+    """d (map of the element) / d amount; None where the effect does not change it."""
+    energy = layers.ring.energy
+    plus, minus = (effect.changed(element, a, energy) for a in (h, -h))
+    if plus is minus:  # a corrector's calibration without a kick
+        return None
+    up, down = layers.map(plus), layers.map(minus)
+    zero = np.zeros((layers.dimension,) * 3)
+    bends = [zero if m.T is None else m.T for m in (up, down)]
+    return Quadratic(*_slope((up.B, up.R, bends[0]), (down.B, down.R, bends[1]), h))
+
+
+def _slope(up: Weights, down: Weights, h: float) -> Weights:
+    a, b, c = ((p - m) / (2 * h) for p, m in zip(up, down, strict=True))
+    return a, b, c
+
+
+class _Rows:
+    def __init__(self, height: int, n: int) -> None:
+        self._empty = tuple(
+            np.empty(shape)
+            for shape in ((0, height), (0, height, n), (0, height, n * (n + 1) // 2))
+        )
+        self._rows: list[tuple[int, int, Weights]] = []
+
+    def add(self, owner: int, at: int, weights: Weights) -> None:
+        self._rows.append((owner, at, weights))
+
+    def stacked(self) -> tuple[Indices, Indices, Array, Array, Array]:
+        owner = np.array([row[0] for row in self._rows], dtype=np.int64)
+        at = np.array([row[1] for row in self._rows], dtype=np.int64)
+        d0, d1, d2 = self._empty
+        if self._rows:
+            d0, d1, d2 = (np.stack([row[2][i] for row in self._rows]) for i in range(3))
+        return owner, at, d0, d1, d2

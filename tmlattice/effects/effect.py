@@ -1,0 +1,209 @@
+"""What an effect is: its name, unit and sizes, where it can sit, and how it acts.
+
+There are three kinds, by what they act on: the ring (a magnet has another map), the readings (a
+monitor tells something else than where the beam is), and the launch (the beam starts otherwise).
+To add an effect, write a class of one of them and `register` it; a test fails until it has its own.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects.cause import Cause
+from tmlattice.errors import EffectError, unknown_name
+from tmlattice.lattice import Element, Ring
+
+Array = NDArray[np.float64]
+
+
+class Effect(ABC):
+    """One imperfection that the project knows.
+
+    Attributes:
+        name: in commands, reports and files.
+        unit: of the amount; "relative" and "discrete" have none.
+        sign: what a positive amount does.
+        background: rms of the amount on a machine in good order, or None where such a machine
+            does not have it.
+        largest: the largest amount of a fault, by modulus.
+        sits_on_text: the elements it can sit on, for people.
+        power: readings change as amount ** power to leading order.
+        discrete: it is there or not; the amount says in which form.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str]
+    sign: ClassVar[str]
+    background: ClassVar[float | None] = None
+    largest: ClassVar[float]
+    sits_on_text: ClassVar[str]
+    power: ClassVar[int] = 1
+    discrete: ClassVar[bool] = False
+
+    @abstractmethod
+    def places(self, ring: Ring) -> list[str | None]:
+        """The elements, or families, that it can sit on, in beam order; [None] for the beam."""
+
+    def check(self, ring: Ring, cause: Cause) -> None:
+        """Raise where a cause of this effect is impossible in the ring.
+
+        Raises:
+            UnknownNameError: no such element.
+            EffectError: an element that cannot have it, a missing name, an amount not finite.
+        """
+        places = self.places(ring)
+        if not np.isfinite(cause.amount):
+            raise EffectError(f"{self.name}: the amount is {cause.amount}; give a number")
+        if places == [None]:
+            if cause.element is not None:
+                raise EffectError(f"{self.name} has no element; leave '{cause.element}' out")
+            return
+        if cause.element is None:
+            raise EffectError(f"{self.name} needs an element: {self.sits_on_text}")
+        if cause.element not in set(places):
+            kind = ring[cause.element].kind
+            raise EffectError(
+                f"{self.name} cannot sit on '{cause.element}', a {kind}; "
+                f"it sits on: {self.sits_on_text}"
+            )
+
+
+class RingEffect(Effect):
+    """An effect on elements: the given one is copied, never changed."""
+
+    def sits_on(self, element: Element) -> bool:
+        """Whether an element can have it."""
+        raise NotImplementedError
+
+    def places(self, ring: Ring) -> list[str | None]:
+        """Names of the elements that can have it, in beam order."""
+        return [element.name for element in ring.elements if self.sits_on(element)]
+
+    def members(self, ring: Ring, place: str | None) -> list[int]:
+        """The places in `ring.elements` that a cause at `place` changes."""
+        assert place is not None
+        return [ring.index(place)]
+
+    @abstractmethod
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """The element with this much of it more; energy in GeV."""
+
+
+class ReadingEffect(Effect):
+    """An effect on what one monitor tells."""
+
+    sits_on_text: ClassVar[str] = "monitors"
+
+    def places(self, ring: Ring) -> list[str | None]:
+        """All monitors."""
+        return [monitor.name for monitor in ring.monitors]
+
+    @abstractmethod
+    def change(self, beam: Array, amount: float) -> Array:
+        """What a monitor with this amount alone reads of the beam [..., 2] (x, y), m, less beam."""
+
+    @abstractmethod
+    def set(self, monitors: "Monitors", at: int, amount: float) -> None:
+        """Put this much more of it into monitor `at` of `monitors`, in place."""
+
+
+class LaunchEffect(Effect):
+    """An effect on the beam at its start."""
+
+    sits_on_text: ClassVar[str] = "the beam"
+
+    def places(self, ring: Ring) -> list[str | None]:
+        """The beam."""
+        return [None]
+
+    @abstractmethod
+    def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
+        """Launches whose weighted mean reading is the reading: weights [node], [node, shot, 6]."""
+
+
+@dataclass
+class Monitors:
+    """What each monitor makes of the beam: all errors at once.
+
+    reading = diag(1 + gain) C Rot(roll) beam + offset, C = [[1, c], [c, 1]], then the swap, then
+    noise; Rot: x_read = x cos + y sin, y_read = -x sin + y cos.
+
+    Attributes:
+        gain, offset: [monitor, 2], relative and m.
+        roll, coupling: [monitor], rad and 1.
+        swapped, silent, frozen: [monitor], true or false.
+    """
+
+    gain: Array
+    offset: Array
+    roll: Array
+    coupling: Array
+    swapped: NDArray[np.bool_]
+    silent: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
+
+    @classmethod
+    def perfect(cls, count: int) -> "Monitors":
+        """Monitors that read where the beam is."""
+        plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
+        one = np.zeros(count)
+        return cls(plane, plane.copy(), one, one.copy(), flag, flag.copy(), flag.copy())
+
+    def copy(self) -> "Monitors":
+        """Monitors of their own with the same errors."""
+        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
+
+    def matrix(self) -> Array:
+        """diag(1 + gain) C Rot(roll), then the swap: d reading / d beam, [monitor, 2, 2]."""
+        cos, sin, c = np.cos(self.roll), np.sin(self.roll), self.coupling
+        turned = np.array([[cos + -c * sin, sin + c * cos], [c * cos - sin, c * sin + cos]])
+        matrix = (1 + self.gain)[:, :, None] * np.moveaxis(turned, -1, 0)
+        matrix[self.swapped] = matrix[self.swapped][:, ::-1]
+        return np.asarray(matrix)
+
+    def constant(self) -> Array:
+        """What they read without a beam, [monitor, 2], m."""
+        return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
+
+    def read(self, beam: Array) -> Array:
+        """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
+
+        A frozen monitor goes on telling what it does: see `machine`.
+        """
+        readings = np.einsum("mij,...mj->...mi", self.matrix(), beam) + self.constant()
+        readings[..., self.silent, :] = np.nan
+        return np.asarray(readings)
+
+
+CATALOGUE: dict[str, Effect] = {}
+"""Every effect by its name, in the order in which reports list them."""
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Put an effect into the catalogue (a class decorator)."""
+    CATALOGUE[effect.name] = effect()
+    return effect
+
+
+def find(name: str) -> Effect:
+    """The effect of this name.
+
+    Raises:
+        UnknownNameError: with the nearest names.
+    """
+    try:
+        return CATALOGUE[name.strip().casefold()]
+    except KeyError:
+        raise unknown_name("effect", name, CATALOGUE) from None
+
+
+def names(chosen: Iterable[str] | None = None) -> list[str]:
+    """Names of the chosen effects, checked, in the catalogue's order; all of them by default."""
+    if chosen is None:
+        return list(CATALOGUE)
+    wanted = {find(name).name for name in chosen}
+    return [name for name in CATALOGUE if name in wanted]

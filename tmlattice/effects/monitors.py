@@ -1,0 +1,156 @@
+"""What goes wrong with monitors: see `Monitors` for all of it at once."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects.effect import Monitors, ReadingEffect, register
+
+Array = NDArray[np.float64]
+
+
+class _Offset(ReadingEffect):
+    unit = "m"
+    sign = "reading minus beam"
+    background = 2e-4
+    largest = 2e-3
+    plane: int
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """The offset."""
+        change = np.zeros_like(beam)
+        change[..., self.plane] = amount
+        return change
+
+    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+        """Add to the offset."""
+        monitors.offset[at, self.plane] += amount
+
+
+@register
+class MonitorOffsetX(_Offset):
+    """A monitor whose zero is not on the axis, in x."""
+
+    name = "monitor_offset_x"
+    plane = 0
+
+
+@register
+class MonitorOffsetY(_Offset):
+    """A monitor whose zero is not on the axis, in y."""
+
+    name = "monitor_offset_y"
+    plane = 1
+
+
+class _Gain(ReadingEffect):
+    unit = "relative"
+    sign = "reading = (1 + amount) beam; -2 is a reversed one"
+    background = 0.025
+    largest = 2.0
+    plane: int
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """The share that is read too much."""
+        change = np.zeros_like(beam)
+        change[..., self.plane] = amount * beam[..., self.plane]
+        return change
+
+    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+        """Multiply the gain."""
+        monitors.gain[at, self.plane] = (1 + monitors.gain[at, self.plane]) * (1 + amount) - 1
+
+
+@register
+class MonitorGainX(_Gain):
+    """A monitor that reads x too large or too small."""
+
+    name = "monitor_gain_x"
+    plane = 0
+
+
+@register
+class MonitorGainY(_Gain):
+    """A monitor that reads y too large or too small."""
+
+    name = "monitor_gain_y"
+    plane = 1
+
+
+@register
+class MonitorRoll(ReadingEffect):
+    """A monitor turned about the beam axis."""
+
+    name = "monitor_roll"
+    unit = "rad"
+    sign = "x_read = x cos + y sin, y_read = -x sin + y cos"
+    background = 5e-3
+    largest = 0.3
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """Coordinates in turned axes, less those in the ring's."""
+        cos, sin = np.cos(amount), np.sin(amount)
+        return np.asarray(beam @ np.array([[cos - 1, -sin], [sin, cos - 1]]))
+
+    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+        """Add to the angle."""
+        monitors.roll[at] += amount
+
+
+@register
+class MonitorCoupling(ReadingEffect):
+    """A monitor whose electronics mix the planes."""
+
+    name = "monitor_coupling"
+    unit = "relative"
+    sign = "x_read += amount y, y_read += amount x"
+    background = 5e-3
+    largest = 0.3
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """The other plane's share."""
+        return np.asarray(amount * beam[..., ::-1])
+
+    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+        """Add to the coupling."""
+        monitors.coupling[at] += amount
+
+
+@register
+class MonitorSwap(ReadingEffect):
+    """A monitor whose two planes are exchanged."""
+
+    name = "monitor_swap"
+    unit = "discrete"
+    sign = "1: x and y are exchanged"
+    largest = 1.0
+    discrete = True
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """The other plane instead of the own."""
+        return np.asarray(amount * (beam[..., ::-1] - beam))
+
+    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+        """Exchange the planes (0 does not)."""
+        monitors.swapped[at] ^= amount != 0
+
+
+@register
+class MonitorDead(ReadingEffect):
+    """A monitor without a signal, or one whose reading is frozen."""
+
+    name = "monitor_dead"
+    unit = "discrete"
+    sign = "1: no signal; 2: frozen at its first reading of the measurement"
+    largest = 2.0
+    discrete = True
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """No reading, or the first one of all, [shot, turn, ..., 2]."""
+        if amount == 1:
+            return np.full_like(beam, np.nan)
+        first = beam[(0,) * (beam.ndim - 1)] if amount == 2 else beam
+        return np.asarray(first - beam)
+
+    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+        """Silence it, or freeze it."""
+        (monitors.frozen if amount == 2 else monitors.silent)[at] = amount != 0

@@ -1,0 +1,68 @@
+"""Energy that the beam radiates: known physics that a first model may leave out.
+
+The expected loss of an element is U = C_gamma E^4 / (2 pi) x the integral of h^2 ds. A bend's
+curvature is h = angle / length. A wiggler's matrix does not hold its field, but its vertical
+focusing does: k = mean of h^2, and R33 = cos(sqrt(k) L).
+"""
+
+import numpy as np
+
+from tmlattice.effects.effect import RingEffect, register
+from tmlattice.lattice import Element, Ring
+
+C_GAMMA = 8.846e-5
+"""m / GeV^3, of electrons. Source: M. Sands, SLAC-121 (1970)."""
+
+
+def expected_loss(element: Element, energy: float) -> float:
+    """Relative energy loss of one pass; energy in GeV; 0 for what does not radiate."""
+    if element.kind == "bend" and element.length > 0:
+        squares = element.angle**2 / element.length
+    elif element.kind == "wiggler" and hasattr(element.source, "r"):
+        cosine = float(element.source.r[2, 2])
+        focusing = float(np.arccos(cosine)) / element.length if abs(cosine) < 1 else 0.0
+        squares = focusing**2 * element.length
+    else:
+        return 0.0
+    return C_GAMMA * energy**3 / (2 * np.pi) * squares
+
+
+class _Loss(RingEffect):
+    unit = "scale"
+    sign = "0: no loss, 1: the expected loss; adds to what the model has"
+    largest = 1.2
+    kind: str
+
+    def sits_on(self, element: Element) -> bool:
+        """Elements of the kind that radiate."""
+        return element.kind == self.kind and expected_loss(element, 1.0) > 0
+
+    def places(self, ring: Ring) -> list[str | None]:
+        """All of them at once; nowhere in a ring without any."""
+        return [None] if any(self.sits_on(e) for e in ring.elements) else []
+
+    def members(self, ring: Ring, place: str | None) -> list[int]:
+        """Every element of the kind."""
+        return [i for i, element in enumerate(ring.elements) if self.sits_on(element)]
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """The expected loss times the amount."""
+        return element.with_errors(loss=amount * expected_loss(element, energy))
+
+
+@register
+class RadiationLossBends(_Loss):
+    """Radiation in all bends."""
+
+    name = "radiation_loss_bends"
+    kind = "bend"
+    sits_on_text = "all bends at once"
+
+
+@register
+class RadiationLossWigglers(_Loss):
+    """Radiation in all wigglers."""
+
+    name = "radiation_loss_wigglers"
+    kind = "wiggler"
+    sits_on_text = "all wigglers at once"

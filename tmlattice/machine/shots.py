@@ -1,0 +1,165 @@
+"""What the operator asks for: the launch and the settings of every shot, drawn from a seed.
+
+Launches, settings, noise and background errors have one random stream each: the same seed gives the
+same launches with either engine, with or without a fault.
+"""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import CATALOGUE, Cause, Settings, find
+from tmlattice.errors import EffectError, TmlatticeError
+from tmlattice.lattice import Ring
+from tmlattice.network import TaylorNetwork
+from tmlattice.optics import one_turn_optics
+
+Array = NDArray[np.float64]
+
+LAUNCH_SIGMA = (1e-4, 2e-5, 1e-4, 2e-5, 0.0)
+"""rms of the launch's x, px, y, py, delta about what was asked for, m and rad."""
+
+
+def stream(seed: int, *purpose: str | int) -> np.random.Generator:
+    """The random numbers of one purpose: independent of those of any other."""
+    words = [zlib.crc32(p.encode()) if isinstance(p, str) else p for p in purpose]
+    return np.random.default_rng([seed, *words])
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Launches and settings.
+
+    Attributes:
+        nominal: what was asked for, (x, px, y, py, delta), [shot, 5].
+        launches: what the beam did, OCELOT's six coordinates, [shot, 6].
+        sigma: rms of the difference, [5].
+        settings: of each shot.
+    """
+
+    nominal: Array
+    launches: Array
+    sigma: Array
+    settings: tuple[Settings, ...]
+
+    def __len__(self) -> int:
+        return len(self.nominal)
+
+
+def draw_shots(
+    ring: Ring,
+    shots: int,
+    amplitude: float = 1e-3,
+    *,
+    sigma: Sequence[float] = LAUNCH_SIGMA,
+    kicks: float = 0.0,
+    settings: Sequence[Settings] = (),
+    seed: int = 0,
+) -> Shots:
+    """Shots with random betatron phases in both planes.
+
+    Args:
+        ring: the design; the amplitude is that of its own first turn.
+        shots: how many.
+        amplitude: rms orbit over monitors and planes, m; both planes have the same rms on average
+            over phases.
+        sigma: rms of x, px, y, py, delta about the nominal launch.
+        kicks: rms of random settings of all correctors, rad, on top of `settings`' own.
+        settings: of each shot.
+        seed: of launches and kicks.
+
+    Raises:
+        TmlatticeError: no shot, or an amplitude that is not positive.
+        UnstableRingError: a design without betatron phases.
+    """
+    if shots < 1 or not 0 < amplitude < np.inf:
+        raise TmlatticeError(
+            f"{shots} shots of {amplitude:g} m cannot be made; ask for one at least, above 0 m"
+        )
+    network = TaylorNetwork.from_ring(ring)
+    modes = one_turn_optics(network).modes
+    random = stream(seed, "launches")
+    phases = random.uniform(0, 2 * np.pi, (shots, 2))
+    turned = np.exp(1j * phases)[:, :, None] * modes.T  # [shot, plane, 4]
+    planes = 1e-6 * np.real(turned)
+    for plane in (0, 1):  # each alone to the same rms, then both together
+        planes[:, plane] /= _rms(network, planes[:, plane])[:, None]
+    launch = 1e-6 * planes.sum(axis=1)
+    for _ in range(3):
+        launch *= (amplitude / _rms(network, launch))[:, None]
+    nominal = np.concatenate([launch, np.zeros((shots, 1))], axis=1)
+    spread = np.asarray(sigma, dtype=float)
+    actual = nominal + spread * random.standard_normal(nominal.shape)
+    launches = np.zeros((shots, 6))
+    launches[:, :4], launches[:, 5] = actual[:, :4], actual[:, 4]
+    return Shots(nominal, launches, spread, _draw_settings(ring, shots, kicks, settings, seed))
+
+
+def _rms(network: TaylorNetwork, launch: Array) -> Array:
+    readings = network(launch).detach().numpy()
+    return np.asarray(np.sqrt((readings**2).mean(axis=(1, 2))))
+
+
+def _draw_settings(
+    ring: Ring, shots: int, kicks: float, given: Sequence[Settings], seed: int
+) -> tuple[Settings, ...]:
+    if given and len(given) != shots:
+        raise TmlatticeError(f"{len(given)} settings do not fit {shots} shots; give one for each")
+    own = [{k: dict(v) for k, v in one.items()} for one in given] or [{} for _ in range(shots)]
+    if kicks:
+        correctors = [e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
+        drawn = kicks * stream(seed, "kicks").standard_normal((shots, len(correctors)))
+        for setting, row in zip(own, drawn.tolist(), strict=True):
+            for name, kick in zip(correctors, row, strict=True):
+                setting.setdefault(name, {"kick": kick})
+    return tuple(own)
+
+
+def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
+    """The rms of each background effect.
+
+    Args:
+        wanted: effect -> rms, or None for the catalogue's own; "all" -> a scale of the
+            catalogue's (None: 1) for every effect that has one. Named effects win over "all".
+
+    Raises:
+        EffectError: an effect that has no background, or a negative rms.
+    """
+    wanted = dict(wanted)
+    chosen: dict[str, float] = {}
+    if "all" in wanted:
+        scale = wanted.pop("all")
+        scale = 1.0 if scale is None else scale
+        chosen = {
+            name: scale * effect.background
+            for name, effect in CATALOGUE.items()
+            if effect.background is not None
+        }
+    for name, rms in wanted.items():
+        effect = find(name)
+        rms = effect.background if rms is None else rms  # noqa: PLW2901
+        if rms is None:
+            raise EffectError(f"{effect.name} has no usual size; say {effect.name}=RMS")
+        chosen[effect.name] = rms
+    if any(not 0 <= rms < np.inf for rms in chosen.values()):
+        raise EffectError("a background's rms is zero or more")
+    return {name: rms for name, rms in chosen.items() if rms}
+
+
+def draw_background(ring: Ring, rms: Mapping[str, float], seed: int = 0) -> list[Cause]:
+    """Random small errors: every effect at every place that can have it, Gaussian.
+
+    Args:
+        ring: the design.
+        rms: by effect, see `background_rms`.
+        seed: each effect has a stream of its own.
+    """
+    causes = []
+    for name, size in rms.items():
+        places = find(name).places(ring)
+        amounts = size * stream(seed, "background", name).standard_normal(len(places))
+        causes += [Cause(name, p, float(a)) for p, a in zip(places, amounts, strict=True)]
+    return causes
