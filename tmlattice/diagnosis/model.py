@@ -4,7 +4,7 @@ Launches are (x, px, y, py, delta), one for each shot; readings are [shot, readi
 turns of a shot one after another, `reading = turn * monitors + monitor`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -40,6 +40,10 @@ Hypothesis = tuple[str, str | None]
 """An effect and the place where it might sit."""
 
 Patch = tuple[list[Array], int, list[Array]]
+Kicks = Mapping[int, Array]
+"""By layer: (px, py) of every shot in the middle of its magnet, rad, [shot, 2]."""
+
+NO_KICKS: Kicks = {}
 LAUNCH = ("x", "px", "y", "py", "delta")
 _COLUMNS = [0, 1, 2, 3, 5]  # of OCELOT's six coordinates
 
@@ -54,7 +58,7 @@ class Paths:
         beam: where the beam is, [shot, reading, 2], m: readings before the monitors' errors.
         states, tangents: at every exit, [shot, step + 1, n], [shot, step + 1, n, n].
         beam_launch: d beam / d launch, all coordinates, [shot, reading, 2, n].
-        monitors: d reading / d beam, [monitor, 2, 2].
+        monitors: d reading / d beam, [shot, monitor, 2, 2].
     """
 
     readings: Array
@@ -69,8 +73,9 @@ class Paths:
 class _Group:
     """Shots with equal settings, and the stacked weights of their ring."""
 
-    def __init__(self, shots: NDArray[np.intp], settings: Settings) -> None:
+    def __init__(self, shots: NDArray[np.intp], settings: Settings, active: bool) -> None:
         self.shots = shots
+        self.active = active
         self.settings = settings
         self.W: list[Array] = []
         self.R: list[Array] = []
@@ -85,6 +90,7 @@ class Model:
         turns: of each shot.
         known: causes that are no hypothesis (radiation where it is asked for).
         dimension: 6; 4 where no cause touches the energy.
+        active: shots in which causes are there; the others are of the ring without, [shot].
     """
 
     def __init__(
@@ -94,8 +100,10 @@ class Model:
         turns: int = 1,
         known: Sequence[Cause] = (),
         dimension: int = 6,
+        active: NDArray[np.bool_] | None = None,
     ) -> None:
         self.design = ring
+        self.active = np.ones(len(settings), dtype=bool) if active is None else active
         self.ring = apply(ring, known)
         self.turns = turns
         self.shots = len(settings)
@@ -109,13 +117,22 @@ class Model:
             for w, c in zip((maps.W0, maps.W1, maps.W2), maps.closing.coefficients, strict=True)
         ]
         self.groups = []
-        for shots, setting in groups(settings, self.shots):
-            group = _Group(shots, setting)
+        for shots, setting, active in self._alike(settings):
+            group = _Group(shots, setting, active)
             group.W = [w.copy() for w in base]
             group.R = [r.copy() for r in (maps.R0, maps.R1, maps.R2)]
             self._patch(group, set_elements(self.ring, setting))
             self.groups.append(group)
         self._base_directions: dict[tuple[Hypothesis, ...], Directions] = {}
+
+    def _alike(
+        self, settings: Sequence[Settings]
+    ) -> Iterator[tuple[NDArray[np.intp], Settings, bool]]:
+        for shots, setting in groups(settings, self.shots):
+            for active in (True, False):
+                own = shots[self.active[shots] == active]
+                if len(own):
+                    yield own, setting, active
 
     # --- weights with causes in them ------------------------------------------------------------
     def _patch(self, group: _Group, replaced: dict[int, Element]) -> list[Patch]:
@@ -136,7 +153,7 @@ class Model:
     @contextmanager
     def _with(self, group: _Group, causes: Sequence[Cause]) -> Iterator[None]:
         ring_causes = [c for c in causes if isinstance(find(c.effect), RingEffect)]
-        if not ring_causes:
+        if not ring_causes or not group.active:
             yield
             return
         undo = self._patch(group, changed_elements(self.ring, ring_causes, group.settings))
@@ -147,6 +164,33 @@ class Model:
                 for stack, values in zip(stacks, old, strict=True):
                     stack[k] = values
 
+    def _runs(
+        self, causes: Sequence[Cause], kicks: Kicks
+    ) -> Iterator[tuple[_Group, NDArray[np.intp]]]:
+        """Shots with equal weights, the weights with causes and kicks in them meanwhile."""
+        for group in self.groups:
+            with self._with(group, causes):
+                if not kicks or not group.active:
+                    yield group, group.shots
+                    continue
+                W0 = group.W[0]
+                for shot in group.shots:
+                    old = {layer: W0[layer].copy() for layer in kicks}
+                    for layer, amounts in kicks.items():
+                        W0[layer] += amounts[shot] @ self._kick(layer)
+                    try:
+                        yield group, np.array([shot])
+                    finally:
+                        for layer, values in old.items():
+                            W0[layer] = values
+
+    def _kick(self, layer: int) -> Array:
+        """Change of the state at a layer's exit by (px, py) in the middle of its magnet, [2, n]."""
+        half = self.ring.magnets[layer].length / 2
+        change = np.zeros((2, self.dimension))
+        change[0, :2] = change[1, 2:4] = half, 1.0
+        return change
+
     def _states(self, launches: Array) -> Array:
         states = np.zeros((len(launches), self.dimension))
         columns = _COLUMNS[: 4 + (self.dimension == 6)]
@@ -154,35 +198,43 @@ class Model:
         return states
 
     # --- readings -------------------------------------------------------------------------------
-    def beam(self, launches: Array, causes: Sequence[Cause] = ()) -> Array:
+    def beam(self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS) -> Array:
         """Where the beam is, [shot, reading, 2], m; NaN where it is lost."""
         states = self._states(launches)
         weights, nodes = (np.ones(1), states[None])
         if self.dimension == 6:
             weights, nodes = beams(states, causes)
         total = np.zeros((self.shots, self.turns * len(self.at), 2))
-        for group in self.groups:
-            with self._with(group, causes):
-                for weight, node in zip(weights, nodes, strict=True):
-                    found = positions(node[group.shots], self.turns, group.W, group.R, self.at)
-                    total[group.shots] += weight * found.reshape(len(found), -1, 2)
+        for group, shots in self._runs(causes, kicks):
+            beam = (weights, nodes) if group.active else (np.ones(1), states[None])
+            for weight, node in zip(*beam, strict=True):
+                found = positions(node[shots], self.turns, group.W, group.R, self.at)
+                total[shots] += weight * found.reshape(len(found), -1, 2)
         return total
 
-    def readings(self, launches: Array, causes: Sequence[Cause] = ()) -> Array:
+    def readings(
+        self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS
+    ) -> Array:
         """What the monitors read, [shot, reading, 2], m.
 
         Args:
             launches: (x, px, y, py, delta), [shot, 5].
             causes: of all three kinds.
+            kicks: by layer, in the middle of its magnet, for each shot, [shot, 2], rad.
         """
-        return self._read(self.beam(launches, causes), causes)
+        return self._read(self.beam(launches, causes, kicks), causes)
 
     def _read(self, beam: Array, causes: Sequence[Cause]) -> Array:
         monitors = monitors_with(self.ring, causes)
         by_turn = beam.reshape(self.shots, self.turns, -1, 2)
-        return monitors.read(by_turn).reshape(beam.shape)
+        readings = monitors.read(by_turn)
+        if not self.active.all():
+            readings[~self.active] = by_turn[~self.active]
+        return readings.reshape(beam.shape)
 
-    def paths(self, launches: Array, causes: Sequence[Cause] = ()) -> Paths:
+    def paths(
+        self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS
+    ) -> Paths:
         """Trajectories, readings and their derivatives by the launches."""
         n, maps = self.dimension, self.maps
         steps = len(maps.W0) + 1
@@ -192,29 +244,27 @@ class Model:
         states[:, 0] = self._states(launches)
         for cause in causes:
             if cause.effect == "energy_offset":
-                states[:, 0, 5] += cause.amount
+                states[self.active, 0, 5] += cause.amount
         tangents[:, 0] = np.eye(n)
         slopes = np.empty((self.shots, self.turns * len(self.at), 2, n))
         where = self._where()
-        for group in self.groups:
-            with self._with(group, causes):
-                part = states[group.shots], tangents[group.shots]
-                bends = curved(group.W[2])
-                share(_trajectories, len(group.shots), *group.W, bends, order, *part)
-                states[group.shots], tangents[group.shots] = part
-                R1, R2 = (np.tile(r, (self.turns, *(1,) * (r.ndim - 1))) for r in group.R[1:])
-                i, j = np.triu_indices(n)
-                x = part[0][:, where]  # [shot, reading, n]
-                own = np.broadcast_to(R1, (len(x), *R1.shape)).copy()
-                if R2.any():
-                    for pair, (a, b) in enumerate(zip(i, j, strict=True)):
-                        own[..., a] += R2[..., pair] * x[:, :, None, b]
-                        own[..., b] += R2[..., pair] * x[:, :, None, a]
-                slopes[group.shots] = own @ part[1][:, where]
-        beam = self.beam(launches, causes)
-        monitors = monitors_with(self.ring, causes).matrix()
+        for group, shots in self._runs(causes, kicks):
+            part = states[shots], tangents[shots]
+            share(_trajectories, len(shots), *group.W, curved(group.W[2]), order, *part)
+            states[shots], tangents[shots] = part
+            R1, R2 = (np.tile(r, (self.turns, *(1,) * (r.ndim - 1))) for r in group.R[1:])
+            x = part[0][:, where]  # [shot, reading, n]
+            own = np.broadcast_to(R1, (len(x), *R1.shape)).copy()
+            if R2.any():
+                for pair, (a, b) in enumerate(zip(*np.triu_indices(n), strict=True)):
+                    own[..., a] += R2[..., pair] * x[:, :, None, b]
+                    own[..., b] += R2[..., pair] * x[:, :, None, a]
+            slopes[shots] = own @ part[1][:, where]
+        beam = self.beam(launches, causes, kicks)
+        monitors = np.tile(np.eye(2), (self.shots, len(self.at), 1, 1))
+        monitors[self.active] = monitors_with(self.ring, causes).matrix()
         turned = np.einsum(
-            "mij,stmjk->stmik", monitors, slopes.reshape(self.shots, self.turns, -1, 2, n)
+            "smij,stmjk->stmik", monitors, slopes.reshape(self.shots, self.turns, -1, 2, n)
         ).reshape(slopes.shape)
         launch = np.zeros((*slopes.shape[:3], 5))
         columns = _COLUMNS[: 4 + (n == 6)]
@@ -272,6 +322,27 @@ class Model:
                     out[i] = (up - self.beam(launches)) / h**effect.power
         return out
 
+    def kick_signatures(self, paths: Paths, layers: NDArray[np.int64]) -> Array:
+        """d readings / d (px, py) kick in the middle of layers' magnets.
+
+        Returns:
+            [layer, 2, shot, reading, 2], m / rad.
+        """
+        steps = len(self.maps.W0) + 1
+        turns = np.arange(self.turns) * steps
+        exits = np.asarray(layers)[:, None] + 1 + turns[None]  # [layer, turn]
+        kick = np.stack([self._kick(k) for k in layers])
+        inverse = np.linalg.inv(paths.tangents[:, exits])  # [shot, layer, turn, n, n]
+        pulled = np.einsum("slTij,lpj->sTlpi", inverse, kick, optimize=True)
+        pulled = np.ascontiguousarray(pulled.reshape(self.shots, self.turns, -1, self.dimension))
+        start = np.repeat(np.searchsorted(self._where(), exits), 2, axis=0)
+        out = np.zeros((2 * len(kick), *paths.readings.shape))
+        owner = np.arange(2 * len(kick))
+        share(kernels.carry, self.shots, owner, start, pulled, paths.beam_launch, out)
+        by_turn = out.reshape(len(out), self.shots, self.turns, -1, 2)
+        turned = _through(paths.monitors, by_turn)
+        return np.asarray(turned.reshape(len(kick), 2, *paths.readings.shape))
+
     def _ring_signatures(
         self, paths: Paths, hypotheses: list[Hypothesis], index: NDArray[np.int64], out: Array
     ) -> None:
@@ -298,7 +369,7 @@ class Model:
                     moved = d.E0[row] + x @ d.E1[row].T + (x[:, i] * x[:, j]) @ d.E2[row].T
                     part[owner, :, turn * len(self.at) + monitor] += moved
             by_turn = part.reshape(*part.shape[:2], self.turns, -1, 2)
-            turned = np.einsum("mij,hstmj->hstmi", paths.monitors, by_turn)
+            turned = _through(paths.monitors[shots], by_turn)
             out[index[:, None], shots[None]] = turned.reshape(part.shape)
 
     def _directions(self, hypotheses: list[Hypothesis], group: _Group) -> Directions:
@@ -333,6 +404,13 @@ class Model:
             read_owner=np.concatenate([base.read_owner[keep_read], owner[fresh.read_owner]]),
             **joined,
         )
+
+
+def _through(monitors: Array, beam: Array) -> Array:
+    """What monitors [shot, monitor, 2, 2] make of [hypothesis, shot, turn, monitor, 2]."""
+    if np.array_equal(monitors, np.broadcast_to(np.eye(2), monitors.shape)):
+        return beam
+    return np.asarray(np.einsum("smij,hstmj->hstmi", monitors, beam))
 
 
 def _trajectories(first: int, last: int, *arguments: Array) -> None:

@@ -1,0 +1,127 @@
+"""What was measured, as the diagnosis needs it: readings, their noise, what is known of launches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import Settings
+from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+LARGEST_LAUNCH_ERROR = 1.0
+"""m, rad or relative: an unknown launch has no prior; this only keeps numbers finite."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """Shots in the order of the ring's monitors.
+
+    Attributes:
+        readings: [shot, reading, 2], m, with reading = turn * monitors + monitor; 0 where missing.
+        valid: which readings there are, [shot, reading, 2].
+        sigma: noise of each reading, m, [shot, reading, 2]; NaN where it is not known yet.
+        launches: nominal (x, px, y, py, delta), [shot, 5].
+        launch_sigma: its rms; inf where unknown, 0 where exact, [shot, 5].
+        settings: of each shot.
+        turns: of each shot.
+        active: shots in which the causes that are looked for are there; not those of a reference
+            from before the fault, [shot].
+    """
+
+    readings: Array
+    valid: Flags
+    sigma: Array
+    launches: Array
+    launch_sigma: Array
+    settings: tuple[Settings, ...]
+    turns: int
+    active: Flags
+
+    @property
+    def shots(self) -> int:
+        """Their number."""
+        return len(self.readings)
+
+    def with_sigma(self, planes: Array) -> "Data":
+        """The same with the noise of each plane [2] put in where it is not known."""
+        filled = np.where(np.isfinite(self.sigma), self.sigma, planes)
+        return replace(self, sigma=filled)
+
+    def without(self, dropped: Flags) -> "Data":
+        """The same with these readings missing."""
+        return replace(self, valid=self.valid & ~dropped)
+
+    def shot(self, chosen: Sequence[int] | Flags) -> "Data":
+        """Some of the shots."""
+        index = np.arange(self.shots)[np.asarray(chosen)]
+        return Data(
+            self.readings[index],
+            self.valid[index],
+            self.sigma[index],
+            self.launches[index],
+            self.launch_sigma[index],
+            tuple(self.settings[i] for i in index),
+            self.turns,
+            self.active[index],
+        )
+
+
+def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False) -> Data:
+    """The shots of a measurement.
+
+    Raises:
+        UnknownNameError: a monitor that the ring does not have.
+        MeasurementError: no reading at all.
+    """
+    names = [monitor.name for monitor in ring.monitors]
+    ordered = measurement.in_order_of(names)
+    shots, turns = ordered.readings.shape[:2]
+    readings = ordered.readings.reshape(shots, -1, 2)
+    valid = np.isfinite(readings)
+    if not valid.any():
+        raise MeasurementError("every reading is missing; nothing can be diagnosed")
+    noise = np.full((len(names), 2), np.nan) if ordered.noise is None else ordered.noise
+    sigma = np.broadcast_to(np.tile(noise, (turns, 1)), readings.shape).copy()
+    launch_sigma = ordered.launch_sigma
+    if launch_sigma is None:
+        launch_sigma = np.tile([np.inf] * 4 + [0.0], (shots, 1))
+    settings = ordered.settings or tuple({} for _ in range(shots))
+    return Data(
+        np.where(valid, readings, 0.0),
+        valid,
+        sigma,
+        ordered.launches,
+        launch_sigma,
+        tuple(settings),
+        turns,
+        np.full(shots, not reference),
+    )
+
+
+def joined(first: Data, second: Data) -> Data:
+    """The shots of both.
+
+    Raises:
+        MeasurementError: different numbers of turns.
+    """
+    if first.turns != second.turns:
+        raise MeasurementError(
+            f"the reference has {first.turns} turns and the measurement {second.turns}; "
+            "give both the same number (Measurement.select)"
+        )
+    arrays = (
+        np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("readings", "valid", "sigma", "launches", "launch_sigma")
+    )
+    return Data(
+        *arrays,
+        first.settings + second.settings,
+        first.turns,
+        np.concatenate([first.active, second.active]),
+    )

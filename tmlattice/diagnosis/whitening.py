@@ -1,0 +1,124 @@
+"""Readings in units of their noise, with everything taken out that a launch can explain.
+
+The noise of a reading is its own, and, where it is asked for, a dense background of small errors
+that is the same in all shots: C = sigma^2 + sum_h tau_h^2 s_h s_h^T. Launches are nuisance
+parameters: their directions are projected out of data and signatures alike. What is known of a
+launch stands in further rows: rows are [shot, 2 readings + 5 coordinates], flattened.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+
+from tmlattice.diagnosis.data import Data
+
+Array = NDArray[np.float64]
+
+EXACT = 1e-12
+"""m, rad or relative: stands for a launch coordinate that is known exactly."""
+
+
+class Whitening:
+    """Divides by the noise, or solves with its Cholesky factor.
+
+    Args:
+        data: readings and their noise, launches and what is known of them.
+        background: tau_h s_h of every background error, [error, shot, reading, 2], m, or None.
+
+    Attributes:
+        columns: the coordinates of the launch that are free.
+        rows: number of rows of a whitened vector.
+    """
+
+    def __init__(self, data: Data, background: Array | None = None) -> None:
+        self.weight = np.where(data.valid, 1.0 / data.sigma, 0.0)
+        self.shots = data.shots
+        sigma = np.maximum(data.launch_sigma, EXACT)
+        self.columns = np.flatnonzero((data.launch_sigma > 0).any(axis=0))
+        self._prior = np.where(np.isfinite(sigma), 1.0 / sigma, 0.0)  # [shot, 5]
+        self._prior[:, (data.launch_sigma == 0).all(axis=0)] = 0.0
+        self._nominal = data.launches
+        self.rows = self.shots * (self.weight[0].size + 5)
+        self._factor: Array | None = None
+        if background is not None and len(background):
+            B = (self.weight * background).reshape(len(background), -1)
+            covariance = B.T @ B
+            covariance[np.diag_indices(len(covariance))] += 1.0
+            self._factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
+
+    @property
+    def dense(self) -> bool:
+        """Whether readings of different shots are correlated."""
+        return self._factor is not None
+
+    def _flat(self, x: Array) -> Array:
+        rows = (self.weight * x).reshape(*x.shape[:-3], -1)
+        if self._factor is None:
+            return np.asarray(rows)
+        flat = rows.reshape(-1, rows.shape[-1])
+        solved = solve_triangular(self._factor, flat.T, lower=True, check_finite=False)
+        return np.ascontiguousarray(solved.T).reshape(rows.shape)
+
+    def signature(self, x: Array) -> Array:
+        """x [..., shot, reading, 2] in m as rows [..., row]; zero in the launch's rows."""
+        flat = self._flat(x)
+        out = np.zeros((*flat.shape[:-1], self.shots, self.weight[0].size + 5))
+        out[..., :-5] = flat.reshape(*flat.shape[:-1], self.shots, -1)
+        return out.reshape(*flat.shape[:-1], -1)
+
+    def residual(self, difference: Array, launches: Array) -> Array:
+        """Readings less model [shot, reading, 2], and nominal less fitted launches, as rows."""
+        rows = self.signature(difference).reshape(self.shots, -1)
+        rows[:, -5:] = self._prior * (self._nominal - launches)
+        return rows.reshape(-1)
+
+    def launch(self, slopes: Array) -> Array:
+        """d rows / d free launch coordinates from d readings / d launch [shot, reading, 2, 5].
+
+        Returns:
+            [shot, row of the shot, column]; where shots are correlated, one block for all:
+            [1, row, shot * column].
+        """
+        p = len(self.columns)
+        moved = np.moveaxis(slopes[..., self.columns], -1, 0)  # [column, shot, reading, 2]
+        if not self.dense:
+            blocks = self.signature(moved).reshape(p, self.shots, -1)
+            for i, column in enumerate(self.columns):
+                blocks[i, :, -5 + column] = self._prior[:, column]
+            return np.ascontiguousarray(np.moveaxis(blocks, 0, 2))
+        alone = np.zeros((self.shots, p, *slopes.shape[:3]))
+        for shot in range(self.shots):
+            alone[shot, :, shot] = moved[:, shot]
+        rows = self.signature(alone).reshape(self.shots, p, self.shots, -1)
+        for shot in range(self.shots):
+            for i, column in enumerate(self.columns):
+                rows[shot, i, shot, -5 + column] = self._prior[shot, column]
+        return np.ascontiguousarray(rows.reshape(self.shots * p, -1).T)[None]
+
+
+class Projection:
+    """The launches' directions among whitened rows.
+
+    Args:
+        directions: d rows / d launch coordinates by block, see `Whitening.launch`.
+    """
+
+    def __init__(self, directions: Array) -> None:
+        self.Q, self._R = np.linalg.qr(directions)
+
+    def out(self, rows: Array) -> Array:
+        """Rows [..., row] less what launches explain, the same shape."""
+        blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
+        kept = np.empty_like(blocks)
+        for b, Q in enumerate(self.Q):
+            part = blocks[:, b]
+            kept[:, b] = part - (part @ Q) @ Q.T
+        return kept.reshape(rows.shape)
+
+    def coordinates(self, rows: Array) -> Array:
+        """The launch coordinates that explain rows [row] best: changes, one after another."""
+        blocks = rows.reshape(len(self.Q), -1)
+        inside = np.einsum("bri,br->bi", self.Q, blocks)
+        return np.concatenate(
+            [np.linalg.lstsq(R, c, rcond=None)[0] for R, c in zip(self._R, inside, strict=True)]
+        )
