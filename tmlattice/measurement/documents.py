@@ -1,12 +1,14 @@
 """JSON documents that carry `format` and `version`: read strictly, checked by their schema."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, UnknownNameError
 
 
 @cache
@@ -54,10 +56,19 @@ def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[
         )
     from jsonschema.exceptions import best_match
 
-    error = best_match(_validator(schema).iter_errors(document))
-    if error is not None:
-        raise MeasurementError(f"{path}: {_explain(error)}")
+    wrong = best_match(_validator(schema).iter_errors(document))
+    if wrong is not None:
+        raise MeasurementError(f"{path}: {_explain(wrong)}")
     return document
+
+
+@contextmanager
+def located(place: Path) -> Iterator[None]:
+    """Puts the file in front of what is wrong in it."""
+    try:
+        yield
+    except (MeasurementError, UnknownNameError) as error:
+        raise MeasurementError(f"{place}: {error}") from error
 
 
 def not_utf8(path: Path, error: UnicodeDecodeError, before: int = 0) -> MeasurementError:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.files import output_folder, write_json
-from tmlattice.measurement.documents import read_document
+from tmlattice.measurement.documents import located, read_document
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
-from tmlattice.measurement.rows import LARGEST_READING, Rows, read_rows
+from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read_rows
 from tmlattice.measurement.tables import read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import (
     COORDINATES,
@@ -30,15 +30,11 @@ from tmlattice.measurement.trajectory import (
 )
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 FORMAT = "tmlattice-measurement"
 READINGS = ("shot", "turn", "monitor", "x", "y")
 RESPONSE = ("corrector", "monitor", "x", "y")
 RF = "rf"
-
-_MOST_CELLS = 50_000_000
-"""Readings that an array may have without having a hundredth of them in the table: 0.8 GB."""
 
 
 def read_measurement(
@@ -74,16 +70,8 @@ def read_measurement(
     if not file.is_file():
         raise MeasurementError(f"no '{file}'; a measurement folder has one")
     document = read_document(file, "measurement", FORMAT)
-    try:
-        if document["kind"] == "trajectory":
-            return _trajectory(folder, document, monitors)
-        return _orbit_response(folder, document, monitors)
-    except (_Wrong, UnknownNameError) as error:
-        raise MeasurementError(f"{file}: {error}") from error
-
-
-class _Wrong(Exception):
-    """Something in measurement.json that its schema cannot say."""
+    read = _trajectory if document["kind"] == "trajectory" else _orbit_response
+    return read(file, document, monitors)
 
 
 def _number(value: Any, missing: float) -> float:
@@ -92,35 +80,12 @@ def _number(value: Any, missing: float) -> float:
 
 
 def _trajectory(
-    folder: Path, document: dict[str, Any], monitors: Sequence[str] | None
+    file: Path, document: dict[str, Any], monitors: Sequence[str] | None
 ) -> Measurement:
-    listed = document["shots"]
-    shots = [int(shot["id"]) for shot in listed]
+    with located(file):
+        shots, launches, sigma, settings = _shots(document["shots"])
     index = {shot: i for i, shot in enumerate(shots)}
-    if len(index) < len(shots):
-        twice = next(s for i, s in enumerate(shots) if index[s] != i)
-        raise _Wrong(f"shot {twice} stands twice; give each shot an id of its own")
-    launches = np.zeros((len(shots), 5))
-    sigma = np.tile(UNKNOWN_LAUNCH, (len(shots), 1))
-    settings: list[Settings] = []
-    known = False
-    for i, shot in enumerate(listed):
-        for j, name in enumerate(COORDINATES):
-            value = _number(shot.get("launch", {}).get(name, 0.0), np.nan)
-            if not np.isfinite(value):
-                raise _Wrong(f"shots[{i}].launch.{name} is not finite; give a number, or leave it")
-            launches[i, j] = value
-            stated = shot.get("launch_sigma") or {}
-            known |= shot.get("launch_sigma") is not None
-            if name in stated:
-                sigma[i, j] = _number(stated[name], np.inf)
-        settings.append(shot.get("settings") or {})
-        try:
-            check_settings(shots[i], settings[i])
-        except (MeasurementError, UnknownNameError) as error:
-            raise _Wrong(f"shots[{i}].settings: {error}") from error
-
-    rows = read_rows(folder / "readings.csv", READINGS)
+    rows = read_rows(file.with_name("readings.csv"), READINGS)
     rows.check("shot", "turn", "monitor")
     order = np.array([index.get(s, -1) for s in rows.whole["shot"].tolist()])
     if (order < 0).any():
@@ -130,76 +95,56 @@ def _trajectory(
             "add it there, or take the row out",
         )  # fmt: skip
     names, place = match_names(rows, "monitor", monitors)
-    return Measurement(
-        launches=launches,
-        readings=dense(rows, order, len(shots), place, len(names)),
-        monitors=names,
-        noise=_read_noise(document.get("noise"), names, monitors),
-        launch_sigma=sigma if known else None,
-        settings=tuple(settings),
-        shots=tuple(shots),
-        lattice=document.get("lattice"),
-        energy=document.get("energy_gev"),
-    )
+    readings = dense(rows, order, len(shots), place, len(names))
+    with located(file):
+        return Measurement(
+            launches=launches,
+            readings=readings,
+            monitors=names,
+            noise=_read_noise(document.get("noise"), names, monitors),
+            launch_sigma=sigma,
+            settings=settings,
+            shots=shots,
+            lattice=document.get("lattice"),
+            energy=document.get("energy_gev"),
+        )
 
 
-def match_names(
-    rows: Rows, column: str, known: Sequence[str] | None
-) -> tuple[tuple[str, ...], Integers]:
-    """The names of a column and each row's place among them; the known ones' order if given.
-
-    Raises:
-        MeasurementError: a name that is not among the known ones, with its line.
-    """
-    found, place = rows.names[column]
-    if known is None:
-        return found, place
-    names = Names(column, known)
-    there = np.empty(len(found), dtype=np.int64)
-    for i, name in enumerate(found):
-        try:
-            there[i] = names[name]
-        except UnknownNameError as error:
-            raise rows.error(int((place == i).argmax()), str(error)) from error
-    kept = np.unique(there)
-    return tuple(names.names[i] for i in kept), np.searchsorted(kept, there)[place]
-
-
-def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: int) -> Array:
-    """Readings [shot, turn, monitor, 2] of rows, NaN where there is none.
-
-    Raises:
-        MeasurementError: a turn so late that the array would be all but empty.
-    """
-    turn = rows.whole.get("turn", np.zeros(len(rows), dtype=np.int64))
-    turns = int(turn.max()) + 1
-    if shots * turns * monitors > max(_MOST_CELLS, 100 * len(rows)):
-        row = int(turn.argmax())
-        raise rows.error(row, f"turn {turn[row]} is far behind the others; turns count from 0")
-    readings = np.full((shots, turns, monitors, 2), np.nan)
-    readings[shot, turn, monitor] = rows.xy
-    return readings
+def _shots(
+    listed: list[dict[str, Any]],
+) -> tuple[tuple[int, ...], Array, Array | None, tuple[Settings, ...]]:
+    """Ids, launches, their sigma where one is stated, and settings of the document's shots."""
+    shots: dict[int, Settings] = {}
+    launches = np.zeros((len(listed), 5))
+    sigma = np.tile(UNKNOWN_LAUNCH, (len(listed), 1))
+    for i, shot in enumerate(listed):
+        number = int(shot["id"])
+        if number in shots:
+            raise MeasurementError(f"shot {number} stands twice; give each shot an id of its own")
+        for j, name in enumerate(COORDINATES):
+            launches[i, j] = shot.get("launch", {}).get(name, 0.0)
+            stated = (shot.get("launch_sigma") or {}).get(name, sigma[i, j])
+            sigma[i, j] = _number(stated, np.inf)
+            if not np.isfinite(launches[i, j]):
+                raise MeasurementError(f"shots[{i}].launch.{name} is not finite; give a number")
+        shots[number] = shot.get("settings") or {}
+        with located(Path(f"shots[{i}].settings")):
+            check_settings(number, shots[number])
+    stated = any(shot.get("launch_sigma") is not None for shot in listed)
+    return tuple(shots), launches, sigma if stated else None, tuple(shots.values())
 
 
 def _orbit_response(
-    folder: Path, document: dict[str, Any], monitors: Sequence[str] | None
+    file: Path, document: dict[str, Any], monitors: Sequence[str] | None
 ) -> OrbitResponse:
     columns = document["columns"]
-    try:
-        correctors = Names("corrector", [column["corrector"] for column in columns])
-    except MeasurementError as error:
-        raise _Wrong(str(error)) from error
-    for i, column in enumerate(columns):
-        if column["corrector"].casefold() == RF or not 0 < abs(column["kick"]) < np.inf:
-            raise _Wrong(
-                f"columns[{i}] has no kick that can be, or takes the RF's name; a column is a "
-                "corrector with a step in rad that is finite and not zero"
-            )
     rf, dispersion = document.get("rf"), bool(document.get("dispersion"))
-    if dispersion and rf is None:
-        raise _Wrong('"dispersion" is true but "rf" does not say the RF step; add it')
+    with located(file):
+        correctors = Names("corrector", [column["corrector"] for column in columns])
+        if dispersion and rf is None:
+            raise MeasurementError('"dispersion" is true but "rf" does not say the step; add it')
 
-    rows = read_rows(folder / "response.csv", RESPONSE)
+    rows = read_rows(file.with_name("response.csv"), RESPONSE)
     rows.check("corrector", "monitor")
     stepped, of_row = rows.names["corrector"]
     column_of = np.empty(len(stepped), dtype=np.int64)
@@ -220,24 +165,27 @@ def _orbit_response(
     names, place = match_names(rows, "monitor", monitors)
     response = np.full((len(columns) + 1, len(names), 2), np.nan)
     response[column_of[of_row], place] = rows.xy
-    if dispersion and len(columns) not in column_of:
-        raise _Wrong('"dispersion" is true but response.csv has no row of "rf"; set it to false')
-    return OrbitResponse(
-        correctors=correctors.names,
-        planes=tuple(column["plane"] for column in columns),
-        kicks=np.array([column["kick"] for column in columns], dtype=float),
-        monitors=names,
-        response=response[:-1],
-        noise=_read_noise(document.get("noise"), names, monitors),
-        rf=rf and RfStep(
-            frequency=float(rf["frequency_hz"]),
-            harmonic=int(rf["harmonic"]),
-            step=float(rf["step_hz"]),
-            orbit=response[-1] if dispersion else None,
-        ),
-        lattice=document.get("lattice"),
-        energy=document.get("energy_gev"),
-    )  # fmt: skip
+    with located(file):
+        if dispersion and len(columns) not in column_of:
+            raise MeasurementError(
+                '"dispersion" is true but response.csv has no row of "rf"; set it to false'
+            )
+        return OrbitResponse(
+            correctors=correctors.names,
+            planes=tuple(column["plane"] for column in columns),
+            kicks=np.array([column["kick"] for column in columns], dtype=float),
+            monitors=names,
+            response=response[:-1],
+            noise=_read_noise(document.get("noise"), names, monitors),
+            rf=rf and RfStep(
+                frequency=float(rf["frequency_hz"]),
+                harmonic=int(rf["harmonic"]),
+                step=float(rf["step_hz"]),
+                orbit=response[-1] if dispersion else None,
+            ),
+            lattice=document.get("lattice"),
+            energy=document.get("energy_gev"),
+        )  # fmt: skip
 
 
 def _read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) -> Array | None:
@@ -245,22 +193,15 @@ def _read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) ->
     if noise is None:
         return None
     if not any(isinstance(entry, dict) for entry in noise.values()):
-        return _noise_of(lambda: noise_table(_pair(noise), read))
+        return noise_table(_pair(noise), read)
+    table = Names("monitor", noise)
     if known is not None:
         every = Names("monitor", known)
-        for name in noise:
+        for name in table.names:
             every[name]  # an UnknownNameError where the ring has no such monitor
     names = Names("monitor", read)
     there = {name: _pair(entry) for name, entry in noise.items() if names.find(name) is not None}
-    return _noise_of(lambda: noise_table(there, read))
-
-
-def _noise_of(make: Any) -> Array | None:
-    try:
-        table: Array | None = make()
-    except MeasurementError as error:
-        raise _Wrong(str(error)) from error
-    return table
+    return noise_table(there, read)
 
 
 def _pair(entry: Mapping[str, Any] | None) -> tuple[float, float]:
@@ -333,7 +274,7 @@ def _header(kind: str, monitors: Sequence[str], source: Any) -> dict[str, Any]:
         "package": __version__,
         "kind": kind,
         "lattice": source.lattice,
-        "energy_gev": source.energy,
+        "energy_gev": None if source.energy is None else float(source.energy),
         "noise": _write_noise(source.noise, monitors),
     }
     return {key: value for key, value in header.items() if value is not None}

@@ -11,15 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement.documents import not_utf8
-from tmlattice.measurement.monitors import merge_spellings
+from tmlattice.measurement.monitors import Names, merge_spellings
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LARGEST_READING = 0.2
 """m: more than any beam pipe has, less than any reading in mm that is worth a fit."""
+
+_MOST_CELLS = 50_000_000
+"""Readings that an array may have without having a hundredth of them in the table: 0.8 GB."""
 
 _CHUNK = 50_000  # rows: 20 MB of Python objects, whatever the size of the file
 _WHOLE = frozenset({"shot", "turn"})
@@ -121,7 +124,10 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
     except UnicodeDecodeError:
         raise _encoding(path) from None
     except csv.Error as error:
-        raise _error(path, done, f"not CSV ({error})") from None
+        *_, line = _walk(path)  # it ends where the reader did
+        raise MeasurementError(
+            f"{path}, line {line}: not CSV ({error}); is a quotation mark left open?"
+        ) from None
     if not done:
         raise MeasurementError(f"{path}: no rows below the header; nothing was read")
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
@@ -135,6 +141,44 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
         names=names,
         xy=np.stack([joined["x"], joined["y"]], axis=1),
     )
+
+
+def match_names(
+    rows: Rows, column: str, known: Sequence[str] | None
+) -> tuple[tuple[str, ...], Integers]:
+    """The names of a column and each row's place among them; the known ones' order if given.
+
+    Raises:
+        MeasurementError: a name that is not among the known ones, with its line.
+    """
+    found, place = rows.names[column]
+    if known is None:
+        return found, place
+    names = Names(column, known)
+    there = np.empty(len(found), dtype=np.int64)
+    for i, name in enumerate(found):
+        try:
+            there[i] = names[name]
+        except UnknownNameError as error:
+            raise rows.error(int((place == i).argmax()), str(error)) from error
+    kept = np.unique(there)
+    return tuple(names.names[i] for i in kept), np.searchsorted(kept, there)[place]
+
+
+def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: int) -> Array:
+    """Readings [shot, turn, monitor, 2] of rows, NaN where there is none.
+
+    Raises:
+        MeasurementError: a turn so late that the array would be all but empty.
+    """
+    turn = rows.whole.get("turn", np.zeros(len(rows), dtype=np.int64))
+    turns = int(turn.max()) + 1
+    if shots * turns * monitors > max(_MOST_CELLS, 100 * len(rows)):
+        row = int(turn.argmax())
+        raise rows.error(row, f"turn {turn[row]} is far behind the others; turns count from 0")
+    readings = np.full((shots, turns, monitors, 2), np.nan)
+    readings[shot, turn, monitor] = rows.xy
+    return readings
 
 
 def _columns(
