@@ -55,9 +55,7 @@ if TYPE_CHECKING:
 @recipe_options
 @json_option
 @quiet_option
-@click.pass_context
 def tune_fit(
-    context: click.Context,
     lattice: str,
     sequence: str | None,
     energy: float | None,
@@ -75,7 +73,7 @@ def tune_fit(
     With --measurement the data are a folder's, and the true tunes are not known.
     """  # fmt: skip
     if measurement is not None:
-        _refuse_own_data(context)
+        _refuse_own_data(click.get_current_context())
     from tmlattice.files import output_file, output_folder, write_json
 
     with ExitStack() as files:
