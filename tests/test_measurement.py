@@ -49,7 +49,7 @@ def test_states_of_six_coordinates_put_delta_last_and_tau_zero(measurement):
     np.testing.assert_array_equal(states[:, :4], launches[:, :4])
     np.testing.assert_array_equal(states[:, 4], 0.0)
     np.testing.assert_array_equal(states[:, 5], launches[:, 4])
-    with pytest.raises(MeasurementError, match="shot 12 .*delta = 0.001.*six"):
+    with pytest.raises(MeasurementError, match=r"shot 12 .*delta = 0.001.*six"):
         off.states(4)
     with pytest.raises(MeasurementError, match="4 or 6"):
         off.states(5)
@@ -62,7 +62,7 @@ def test_ring_order_puts_missing_monitors_back(measurement):
     assert np.isnan(full.readings[:, :, 0]).all()
     np.testing.assert_array_equal(full.readings[:, :, 1:], measurement.readings[:, :, [2, 0, 1]])
     np.testing.assert_array_equal(full.noise[1:], measurement.noise[[2, 0, 1]])
-    with pytest.raises(UnknownNameError, match="no monitor 'bpm_c'; did you mean 'bpm_a'"):
+    with pytest.raises(UnknownNameError, match="no monitor 'bpm_c'; did you mean"):
         measurement.in_order_of(("bpm_a", "bpm_b"))
 
 
@@ -168,7 +168,7 @@ def test_chi2_of_pure_noise_is_one(rng):
         ({"launch_sigma": np.full((5, 5), np.nan)}, "NaN"),
         ({"shots": (1, 2, 3, 4, 4)}, "each once"),
         ({"settings": ({},)}, "one a shot"),
-        ({"settings": ({"q": {"k1": 1.0}}, {}, {}, {}, {})}, "no setting 'k1'; did you mean"),
+        ({"settings": ({"q": {"k1": 1.0}}, {}, {}, {}, {})}, "no setting 'k1'; known are 'kick'"),
         ({"settings": ({"q": {"kick": np.nan}}, {}, {}, {}, {})}, "finite"),
         ({"settings": ({"q": {"frequency_relative": 1.0}}, {}, {}, {}, {})}, "the name 'rf'"),
         ({"settings": ({"rf": {"kick": 1.0}}, {}, {}, {}, {})}, "the name 'rf'"),
