@@ -185,6 +185,8 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
         ("absolute error", outcome.absolute_error, "{:.6f}"),
         ("error relative to the fraction", outcome.relative_error, "{:.2%}"),
     ]
+    if outcome.true_tunes is None:
+        rows = [row for row in rows if row[1] is not None]
     for name, value, form in rows:
         tunes.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
     screen.print(tunes)
