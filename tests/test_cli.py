@@ -215,6 +215,87 @@ def test_ctrl_c_ends_soon_with_nothing_half_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory, small_ring):
+    """Folders written from networks of the small ring with one weak magnet: an on-momentum one of
+    two shots, one off momentum, an orbit response, and one with a changed corrector."""
+    import numpy as np
+
+    from tmlattice import Measurement, OrbitResponse, TaylorNetwork, write_measurement
+    from tmlattice.fitting.experiment import perturbed_ring
+
+    place = tmp_path_factory.mktemp("folders")
+    machine = perturbed_ring(small_ring, "QD::5", -0.02)
+    launches = np.array([[1e-4, 0, 1e-4, 0, 0], [-1e-4, 1e-5, 5e-5, 0, 0]])
+    off = launches + np.array([0, 0, 0, 0, 5e-4])
+    for name, start in (("on", launches), ("off", off)):
+        dimension = 6 if start[:, 4].any() else 4
+        network = TaylorNetwork.from_ring(machine, dimension)
+        empty = Measurement(start, np.zeros((2, 1, len(network.monitors), 2)), network.monitors)
+        readings = network(empty.states(dimension)).detach().numpy()[:, None]
+        readings[0, 0, 3:6] = np.nan
+        data = Measurement(start, readings, network.monitors, (1e-6, 2e-6))
+        write_measurement(place / name, data.select(monitors=network.monitors[::-1]))
+    write_measurement(
+        place / "corrector",
+        Measurement(launches, readings, network.monitors, settings=({}, {"v1": {"kick": 1e-5}})),
+    )
+    write_measurement(place / "axis", Measurement(np.zeros((2, 4)), readings, network.monitors))
+    write_measurement(
+        place / "response",
+        OrbitResponse(("v1",), ("y",), np.ones(1), ("last_a",), np.zeros((1, 1, 2))),
+    )
+    (place / "strange").mkdir()
+    for file in (place / "on").iterdir():
+        text = file.read_text().replace("last_a", "last_c")
+        (place / "strange" / file.name).write_text(text)
+    return place
+
+
+@pytest.mark.parametrize(("name", "coordinates"), [("on", 4), ("off", 6)])
+def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
+    done = tmlattice(
+        "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 150, "--learning-rate",
+        "1e-4", "--out", "fit", cwd=tmp_path, check=0,
+    )  # fmt: skip
+    result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
+    jsonschema.validate(result, schema("tune-fit"))
+    assert result["shots"] == 2
+    assert result["measurement"] == str(folders / name)
+    assert result["magnet"] is result["change"] is result["tunes"]["true"] is None
+    assert result["error"] == {"absolute": None, "relative": None}
+    assert result["noise"] == pytest.approx((2.5 * 1e-12) ** 0.5)
+    assert len(result["launch"]) == coordinates
+    assert result["orbit_rms"]["after"] < 0.3 * result["orbit_rms"]["before"]
+    assert all(0 < tune < 1 for tune in result["tunes"]["network"])
+    assert "2 shots of" in done.stdout
+    assert done.stderr == ""
+    for figure in ("loss", "orbit", "spectrum"):
+        assert (tmp_path / "fit" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "words"),
+    [
+        ("on", ["--magnet", "QD::5"], "--magnet makes data"),
+        ("on", ["--change", "-0.2"], "--change makes data"),
+        ("on", ["--noise", "1e-5"], "--noise makes data"),
+        ("on", ["--launch", "1e-3,0,1e-3,0"], "--launch makes data"),
+        ("nowhere", [], "no measurement folder"),
+        ("response", [], "is an orbit response"),
+        ("corrector", [], "shot 1 has settings"),
+        ("axis", [], "every launch is on the axis"),
+        ("strange", [], "no monitor 'last_c'; did you mean"),
+    ],
+)
+def test_tune_fit_refuses_a_measurement(folders, tmp_path, name, more, words):
+    done = tmlattice("tune-fit", SMALL, "--measurement", folders / name, *more, cwd=tmp_path,
+                     check=2)  # fmt: skip
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_study_prints_median_and_worst(tmp_path):
     done = tmlattice(
         "study", "tune-fit", SMALL, "--magnets", 2, *QUICK, "--regularization", "none",

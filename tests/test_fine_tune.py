@@ -27,7 +27,9 @@ def fit(network, measurement, **options):
 
 
 def rms(network, measurement):
-    left = network(measurement.launches).detach().numpy() - measurement.readings[:, 0]
+    left = (
+        network(measurement.states(network.dimension)).detach().numpy() - measurement.readings[:, 0]
+    )
     return np.sqrt(np.nanmean(left**2))
 
 

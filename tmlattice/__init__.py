@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from tmlattice.maps import element_map as element_map
     from tmlattice.maps import ring_maps as ring_maps
     from tmlattice.measurement import Measurement as Measurement
+    from tmlattice.measurement import OrbitResponse as OrbitResponse
+    from tmlattice.measurement import read_measurement as read_measurement
+    from tmlattice.measurement import write_measurement as write_measurement
     from tmlattice.network import TaylorNetwork as TaylorNetwork
     from tmlattice.network import symplectic_penalty as symplectic_penalty
     from tmlattice.optics import Optics as Optics
@@ -47,7 +50,7 @@ _HOME = {
     "fitting": ["FitResult", "TuneFit", "fine_tune", "tune_fit"],
     "lattice": ["Element", "Ring", "load_ring"],
     "maps": ["TaylorMap", "element_map", "ring_maps"],
-    "measurement": ["Measurement"],
+    "measurement": ["Measurement", "OrbitResponse", "read_measurement", "write_measurement"],
     "network": ["TaylorNetwork", "symplectic_penalty"],
     "optics": ["Optics", "off_momentum", "one_turn_optics", "twiss"],
 }

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from tmlattice.cli.options import (
     FILE,
@@ -19,6 +20,8 @@ from tmlattice.cli.options import (
 
 if TYPE_CHECKING:
     from tmlattice.fitting import TuneFit
+    from tmlattice.lattice import Ring
+    from tmlattice.measurement import Measurement
 
 
 @click.command("tune-fit")
@@ -28,6 +31,12 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="Quadrupole or sextupole to change; else the defocusing quadrupole in the "
     "middle of the first arc.",
+)
+@click.option(
+    "--measurement",
+    type=FILE,
+    metavar="DIR",
+    help="Fit these data, a measurement folder, and change no magnet; all shots together.",
 )
 @click.option(
     "--regularization",
@@ -50,6 +59,7 @@ def tune_fit(
     lattice: str,
     sequence: str | None,
     energy: float | None,
+    measurement: Path | None,
     out: Path,
     json_file: Path | None,
     quiet: bool,
@@ -59,7 +69,11 @@ def tune_fit(
 
     One magnet of LATTICE is weakened, the monitors read one noisy first turn, the network of the
     unperturbed design is fine-tuned on it, and its tunes are held against OCELOT's true ones.
+
+    With --measurement the data are a folder's, and the true tunes are not known.
     """  # fmt: skip
+    if measurement is not None:
+        _refuse_own_data(click.get_current_context())
     from tmlattice.files import output_file, output_folder, write_json
 
     with ExitStack() as files:
@@ -68,8 +82,13 @@ def tune_fit(
         from tmlattice.fitting import tune_fit as run
         from tmlattice.lattice import load_ring
 
-        ring = load_ring(lattice, sequence, energy)
-        outcome = run(ring, progress=not quiet, **options)
+        if measurement is None:
+            ring = load_ring(lattice, sequence, energy)
+            outcome = run(ring, progress=not quiet, **options)
+        else:
+            data = _trajectory(measurement)
+            ring = load_ring(lattice, sequence, energy)
+            outcome = _fit(ring, data, measurement, quiet, options)
         _draw(outcome, folder)
         result = outcome.as_json()
         for path in (folder / "tune-fit.json", extra):
@@ -77,6 +96,43 @@ def tune_fit(
                 write_json(path, result)
     if not quiet:
         _print(outcome, out, json_file)
+
+
+OWN_DATA = ("magnet", "change", "launch", "noise")
+"""Options that say how data are made: of no use for data that are there."""
+
+
+def _refuse_own_data(context: click.Context) -> None:
+    for name in OWN_DATA:
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise click.UsageError(
+                f"--{name} makes data and --measurement reads them: leave one of the two out"
+            )
+
+
+def _trajectory(path: Path) -> "Measurement":
+    from tmlattice.errors import MeasurementError
+    from tmlattice.measurement import Measurement, read_measurement
+
+    data = read_measurement(path)
+    if not isinstance(data, Measurement):
+        raise MeasurementError(
+            f"'{path}' is an orbit response; tune-fit takes a trajectory, the first turn of a beam"
+        )
+    return data
+
+
+def _fit(
+    ring: "Ring", data: "Measurement", path: Path, quiet: bool, options: dict[str, Any]
+) -> "TuneFit":
+    from tmlattice.errors import MeasurementError, UnknownNameError
+    from tmlattice.fitting import tune_fit_measurement
+
+    recipe = {k: v for k, v in options.items() if k not in (*OWN_DATA, "seed")}
+    try:
+        return tune_fit_measurement(ring, data, source=str(path), progress=not quiet, **recipe)
+    except (MeasurementError, UnknownNameError) as error:
+        raise MeasurementError(f"{path}: {error}") from error
 
 
 def _draw(outcome: "TuneFit", folder: Path) -> None:
@@ -96,8 +152,9 @@ def _draw(outcome: "TuneFit", folder: Path) -> None:
     )
     loss, ax = plt.subplots(figsize=(8, 5), layout="constrained")
     monitors = len(outcome.fit.network.monitors)
-    plot_loss(outcome.fit, ax, floor=2 * monitors * outcome.noise**2)
-    ax.set_title(f"Fine-tuning on one orbit of {monitors} monitors")
+    plot_loss(outcome.fit, ax, floor=2 * monitors * (outcome.noise or 0.0) ** 2)
+    orbits = "one orbit" if outcome.shots == 1 else f"{outcome.shots} orbits"
+    ax.set_title(f"Fine-tuning on {orbits} of {monitors} monitors")
     for figure, name in ((orbit, "orbit"), (spectrum, "spectrum"), (loss, "loss")):
         figure.savefig(folder / f"{name}.png", dpi=150)
         plt.close(figure)
@@ -105,14 +162,20 @@ def _draw(outcome: "TuneFit", folder: Path) -> None:
 
 def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
     screen = console()
-    magnet = outcome.ring[outcome.magnet]
+    noise = "-" if outcome.noise is None else f"{1e6 * outcome.noise:g}"
+    if outcome.magnet is None or outcome.change is None:
+        what = f"{outcome.shots} shots of {outcome.source}, noise {noise} µm"
+    else:
+        magnet = outcome.ring[outcome.magnet]
+        what = (
+            f"{magnet.kind} {magnet.name} at s = {magnet.s:.2f} m "
+            f"changed by {100 * outcome.change:+g} %, noise {noise} µm"
+        )
     network = outcome.fit.network
     screen.print(
         f"{outcome.ring.name}: {outcome.ring.length:.3f} m, "
         f"{outcome.ring.energy:g} GeV, {len(network.layers)} layers, "
-        f"{len(network.monitors)} monitors\n"
-        f"{magnet.kind} {magnet.name} at s = {magnet.s:.2f} m "
-        f"changed by {100 * outcome.change:+g} %, noise {1e6 * outcome.noise:g} µm"
+        f"{len(network.monitors)} monitors\n{what}"
     )
     tunes = table("fractional tunes", "Qx", "Qy")
     rows = [
@@ -122,6 +185,8 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
         ("absolute error", outcome.absolute_error, "{:.6f}"),
         ("error relative to the fraction", outcome.relative_error, "{:.2%}"),
     ]
+    if outcome.true_tunes is None:
+        rows = [row for row in rows if row[1] is not None]
     for name, value, form in rows:
         tunes.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
     screen.print(tunes)
@@ -138,7 +203,7 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
     how = "patience ran out" if fit.stopped_early else "all epochs"
     orbit = table("readings less network", "rms [µm]")
     for name, rms in (("before", before), ("after", after), ("noise", outcome.noise)):
-        orbit.add_row(name, f"{1e6 * rms:.2f}")
+        orbit.add_row(name, "-" if rms is None else f"{1e6 * rms:.2f}")
     screen.print(orbit)
     stages = table("stage", *outcome.seconds)
     stages.add_row("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))

@@ -5,6 +5,13 @@
 """
 
 from tmlattice.fitting.adam import FitResult, Regularization, fine_tune
-from tmlattice.fitting.experiment import TuneFit, tune_fit
+from tmlattice.fitting.experiment import TuneFit, tune_fit, tune_fit_measurement
 
-__all__ = ["FitResult", "Regularization", "TuneFit", "fine_tune", "tune_fit"]
+__all__ = [
+    "FitResult",
+    "Regularization",
+    "TuneFit",
+    "fine_tune",
+    "tune_fit",
+    "tune_fit_measurement",
+]

@@ -95,7 +95,8 @@ def fine_tune(
         progress: show a bar where there is a terminal.
 
     Raises:
-        MeasurementError: no reading of the first turn.
+        MeasurementError: no reading of the first turn, or a launch off the nominal energy for a
+            network of four coordinates.
         UnknownNameError: a monitor that the network does not have.
         BeamLostError: the fit diverged (the learning rate is too high), or the launch is lost.
         ValueError: an unknown regularization, or an unknown weight.
@@ -104,8 +105,8 @@ def fine_tune(
     learning of dynamical systems.
     """
     regularization = Regularization(regularization)
-    launch = torch.from_numpy(np.ascontiguousarray(measurement.launches, dtype=float))
-    first_turn = measurement.in_order_of(network.monitors)[:, 0]
+    launch = torch.from_numpy(measurement.states(network.dimension))
+    first_turn = measurement.in_order_of(network.monitors).readings[:, 0]
     present = np.isfinite(first_turn)
     if not present.any():
         raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import TmlatticeError, TooFewTurnsError
+from tmlattice.errors import MeasurementError, TmlatticeError, TooFewTurnsError
 from tmlattice.fitting.adam import FitResult, fine_tune
 from tmlattice.harmonics import MIN_TURNS, tunes
 from tmlattice.lattice import Ring, middle_of_first_arc
@@ -42,31 +42,35 @@ class TuneFit:
 
     Attributes:
         ring: the design.
-        magnet: name of the perturbed magnet.
-        change: relative change of its strength.
-        launch: state at the start of the ring, [n].
-        noise: rms of a reading, m.
-        design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2].
+        magnet: name of the perturbed magnet; None for data from elsewhere.
+        change: relative change of its strength; None for data from elsewhere.
+        launch: state at the start of the ring, [n], of the shot shown.
+        noise: rms of a reading, m, over monitors and planes; None where it is not known.
+        design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2]; no
+            truth is known of data from elsewhere.
         network_tunes: from tracking the fine-tuned network, [2].
         tune_signal: states of that tracking, [1, turns + 1, n]; fewer where the motion grew.
         growth: of the fine-tuned network's amplitude in a turn, 1 where it is symplectic.
         s: of the monitors, m, [monitor].
-        measured, before, after: readings, and the network's before and after fine-tuning,
-            [monitor, 2], m.
+        measured, before, after: readings of one shot, and the network's before and after
+            fine-tuning, [monitor, 2], m; NaN where nothing was read.
+        orbit_rms: of the first turn's residual before and after, over all shots, m.
         fit: the fine-tuned network and its history.
         seconds: of wall clock, by stage.
         seed: of the noise.
         turns: tracked for the tunes.
         problem: why there are no network tunes, or None.
+        shots: number of shots fitted together.
+        source: where the data are from; None for the experiment's own.
     """
 
     ring: Ring
-    magnet: str
-    change: float
+    magnet: str | None
+    change: float | None
     launch: Array
-    noise: float
+    noise: float | None
     design_tunes: Array
-    true_tunes: Array
+    true_tunes: Array | None
     network_tunes: Array | None
     tune_signal: Array | None
     growth: float | None
@@ -74,11 +78,14 @@ class TuneFit:
     measured: Array
     before: Array
     after: Array
+    orbit_rms: tuple[float, float]
     fit: FitResult
     seconds: dict[str, float]
     seed: int
     turns: int
     problem: str | None = None
+    shots: int = 1
+    source: str | None = None
 
     @property
     def turns_alive(self) -> int:
@@ -88,7 +95,7 @@ class TuneFit:
     @property
     def absolute_error(self) -> Array | None:
         """|network tune - true tune|, the short way round the circle, [2]."""
-        if self.network_tunes is None:
+        if self.network_tunes is None or self.true_tunes is None:
             return None
         return np.abs((self.network_tunes - self.true_tunes + 0.5) % 1.0 - 0.5)
 
@@ -96,16 +103,7 @@ class TuneFit:
     def relative_error(self) -> Array | None:
         """The absolute error over the true fraction, [2]."""
         error = self.absolute_error
-        return None if error is None else error / self.true_tunes
-
-    @property
-    def orbit_rms(self) -> tuple[float, float]:
-        """rms over monitors and planes of the residual before and after, m."""
-        before, after = (
-            float(np.sqrt(np.mean((self.measured - model) ** 2)))
-            for model in (self.before, self.after)
-        )
-        return before, after
+        return None if error is None or self.true_tunes is None else error / self.true_tunes
 
     def as_json(self) -> dict[str, Any]:
         """The result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""
@@ -146,6 +144,8 @@ class TuneFit:
             "growth": self.growth,
             "options": self.fit.options,
             "problem": self.problem,
+            "shots": self.shots,
+            "measurement": self.source,
         }
 
 
@@ -233,49 +233,147 @@ def tune_fit(
         compile_kernels(network)
     readings = truth(start[None]).detach().numpy()
     readings = readings + noise * np.random.default_rng(seed).standard_normal(readings.shape)
-    measurement = Measurement(start[None], readings[:, None], network.monitors, (noise, noise))
+    rms = np.full((len(network.monitors), 2), noise) if noise else None
+    measurement = Measurement(start[None], readings[:, None], network.monitors, rms)
+    found = _fit_and_track(network, measurement, start, turns, watch, progress, options)
+    watch["total"] = time.perf_counter() - begun
+    return TuneFit(
+        ring=ring,
+        magnet=name,
+        change=change,
+        noise=noise,
+        design_tunes=design_tunes,
+        true_tunes=true_tunes,
+        seconds=dict(watch),
+        seed=seed,
+        **found,
+    )
+
+
+def tune_fit_measurement(
+    ring: Ring,
+    measurement: Measurement,
+    turns: int = 500,
+    *,
+    source: str | None = None,
+    progress: bool = True,
+    **options: Any,
+) -> TuneFit:
+    """Fine-tune the design's network on the first turns of a measurement, predict the tunes.
+
+    All shots are fitted together, from their nominal launches. A launch off the nominal energy
+    takes a network of six coordinates; the tunes are those at the nominal energy.
+
+    Args:
+        ring: the design.
+        measurement: of one shot or more.
+        turns: tracked for the tunes, at a vanishing amplitude.
+        source: where the data are from, for the report.
+        progress: show a bar where there is a terminal.
+        options: passed to `fine_tune`.
+
+    Raises:
+        MeasurementError: nothing of the first turn was read, every launch is on the axis, or a
+            shot's settings are not the design's.
+        UnknownNameError: a monitor that the ring does not have.
+        UnstableRingError: the design has no tune.
+        BeamLostError: a launch is lost on the first turn, or the fit diverged.
+    """
+    if turns < MIN_TURNS:
+        raise TooFewTurnsError(f"{turns} turns are too few for a tune; {MIN_TURNS} at least do")
+    if not measurement.launches.any():
+        raise MeasurementError(
+            "every launch is on the axis at the nominal energy, from where no weight is learnt; "
+            "state the launches of the shots"
+        )
+    changed = [s for s, set_ in zip(measurement.shots, measurement.settings, strict=False) if set_]
+    if changed:
+        raise MeasurementError(
+            f"shot {changed[0]} has settings other than the design's, which this fit does not "
+            "model; select the shots without them"
+        )
+    watch = _Stopwatch()
+    begun = time.perf_counter()
+    dimension = 6 if measurement.launches[:, 4].any() else 4
+    with watch.stage("compile"):
+        for element in {e.kind: e for e in ring.elements}.values():
+            element_map(element, ring.energy, dimension)
+    with watch.stage("maps"):
+        network = TaylorNetwork.from_ring(ring, dimension)
+        design_tunes = matrix_tunes(ring_matrix(ring))
+    measurement = measurement.in_order_of(network.monitors)
+    start = np.zeros(dimension)
+    start[:4] = DEFAULT_LAUNCH  # both planes move, whatever the shots did
+    found = _fit_and_track(network, measurement, start, turns, watch, progress, options)
+    watch["total"] = time.perf_counter() - begun
+    noise = measurement.noise
+    return TuneFit(
+        ring=ring,
+        magnet=None,
+        change=None,
+        noise=None if noise is None else float(np.sqrt(np.nanmean(noise**2))),
+        design_tunes=design_tunes,
+        true_tunes=None,
+        seconds=dict(watch),
+        seed=0,
+        source=source,
+        **found,
+    )
+
+
+def _fit_and_track(
+    network: TaylorNetwork,
+    measurement: Measurement,
+    start: Array,
+    turns: int,
+    watch: _Stopwatch,
+    progress: bool,
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """The fit, and the tunes of what it made: the attributes of TuneFit that come from there."""
+    with watch.stage("compile"):
+        compile_kernels(network)
     with watch.stage("fit"):
         fit = fine_tune(network, measurement, progress=progress, **options)
-    found, signal, growth, problem = None, None, None, None
+    tune, signal, growth, problem = None, None, None, None
     with watch.stage("tunes"):
         try:
             optics = one_turn_optics(fit.network)
             growth = optics.growth
             first = (optics.closed_orbit + TUNE_AMPLITUDE * start)[None]
             states = fit.network.track(first, turns, keep_lost=True)
-            size = np.abs(states[0] - optics.closed_orbit).max(axis=1)
+            # the transverse plane: off the nominal energy, tau drifts without end
+            size = np.abs(states[0] - optics.closed_orbit)[:, :4].max(axis=1)
             grown = ~(size < GROWTH_ALLOWED * np.abs(start).max() * TUNE_AMPLITUDE)
             signal = states[:, : int(grown.argmax()) if grown.any() else None]
-            found = tunes(signal, optics).fraction[0]
+            tune = tunes(signal, optics).fraction[0]
         except TmlatticeError as error:
             problem = f"the fine-tuned network has no tune: {error}"
-    watch["total"] = time.perf_counter() - begun
-    return TuneFit(
-        ring=ring,
-        magnet=name,
-        change=change,
-        launch=start,
-        noise=noise,
-        design_tunes=design_tunes,
-        true_tunes=true_tunes,
-        network_tunes=found,
-        tune_signal=signal,
-        growth=growth,
-        s=network.maps.s_monitors,
-        measured=readings[0],
-        before=network(start[None]).detach().numpy()[0],
-        after=fit.network(start[None]).detach().numpy()[0],
-        fit=fit,
-        seconds=dict(watch),
-        seed=seed,
-        turns=turns,
-        problem=problem,
-    )
+    launches = measurement.states(network.dimension)
+    first_turn = measurement.readings[:, 0]
+    models = [n(launches).detach().numpy() for n in (network, fit.network)]
+    shown = int(np.isfinite(first_turn).any(axis=(1, 2)).argmax())  # the first shot with a reading
+    before, after = (float(np.sqrt(np.nanmean((first_turn - m) ** 2))) for m in models)
+    return {
+        "launch": launches[shown],
+        "network_tunes": tune,
+        "tune_signal": signal,
+        "growth": growth,
+        "s": network.maps.s_monitors,
+        "measured": first_turn[shown],
+        "before": models[0][shown],
+        "after": models[1][shown],
+        "orbit_rms": (before, after),
+        "fit": fit,
+        "turns": turns,
+        "problem": problem,
+        "shots": len(launches),
+    }
 
 
 def compile_kernels(network: TaylorNetwork) -> None:
     """Compile, or load from the cache, every kernel that a fit of one shot uses."""
-    launch = np.zeros((1, network.dimension))
     readings = np.zeros((1, 1, len(network.monitors), 2))
-    fine_tune(network, Measurement(launch, readings, network.monitors), epochs=1, progress=False)
-    network.track(launch, 1)
+    still = Measurement(np.zeros((1, 5)), readings, network.monitors)
+    fine_tune(network, still, epochs=1, progress=False)
+    network.track(still.states(network.dimension), 1)

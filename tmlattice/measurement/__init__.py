@@ -1,5 +1,35 @@
-"""What the monitors read: shots, turns, monitors, noise."""
+"""What the monitors read: trajectories, orbit responses, and the folder that holds them.
 
-from tmlattice.measurement.trajectory import Measurement
+>>> measurement = read_measurement("day_1", monitors=[m.name for m in ring.monitors])
+>>> fit, held_out = measurement.split(0.2, seed=1)
+>>> fit.compare(model).chi2_per_dof                   # model [shot, turn, monitor, 2], m
+>>> with measurement_writer("day_2", names, noise=(2e-5, 2e-5)) as writer:
+...     writer.add(0, launch, None, {}, readings)     # readings [turn, monitor, 2]
+"""
 
-__all__ = ["Measurement"]
+from tmlattice.measurement.folder import (
+    MeasurementWriter,
+    measurement_writer,
+    read_measurement,
+    write_measurement,
+)
+from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
+from tmlattice.measurement.tables import read_table, read_turn_by_turn
+from tmlattice.measurement.trajectory import Comparison, Measurement
+from tmlattice.measurement.truth import Truth, read_truth, write_truth
+
+__all__ = [
+    "Comparison",
+    "Measurement",
+    "MeasurementWriter",
+    "OrbitResponse",
+    "RfStep",
+    "Truth",
+    "measurement_writer",
+    "read_measurement",
+    "read_table",
+    "read_truth",
+    "read_turn_by_turn",
+    "write_measurement",
+    "write_truth",
+]

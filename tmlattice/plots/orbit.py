@@ -40,6 +40,8 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
         figure: an empty one; else a new one.
     """
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+    noise = "" if outcome.noise is None else f", noise {1e6 * outcome.noise:.1f} µm"
+    magnet = None if outcome.magnet is None else outcome.ring[outcome.magnet]
     grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
@@ -51,23 +53,28 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
         rms = []
         for model, colour in ((outcome.before, "C0"), (outcome.after, "C3")):
             left = measured - model[:, plane]
-            rms.append(f"{1e6 * np.sqrt(np.mean(left**2)):.1f}")
+            rms.append(
+                f"{1e6 * np.sqrt(np.nanmean(left**2)):.1f}" if np.isfinite(left).any() else "-"
+            )
             residual.plot(outcome.s, 1e3 * left, color=colour, linewidth=0.8)
         residual.set_ylabel(f"residual {name} [mm]")
         residual.annotate(
-            f"rms before {rms[0]} µm, after {rms[1]} µm, noise {1e6 * outcome.noise:.1f} µm",
+            f"rms before {rms[0]} µm, after {rms[1]} µm{noise}",
             (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
         )  # fmt: skip
         low, high = residual.get_ylim()
         residual.set_ylim(low, high + 0.25 * (high - low))  # room for the words
-        magnet = outcome.ring[outcome.magnet]
         for ax in (orbit, residual):
-            ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
+            if magnet is not None:
+                ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
             ax.grid(alpha=0.25)
     grid[0].legend(loc="upper right", ncols=3, fontsize="small", framealpha=0.9)
-    grid[0].set_title(
-        f"First turn with {outcome.magnet} changed by {100 * outcome.change:+g} % "
-        f"(dotted, s = {magnet.s:.1f} m)"
-    )
+    if magnet is None or outcome.change is None:
+        grid[0].set_title(f"First turn of {outcome.source or 'a measurement'}")
+    else:
+        grid[0].set_title(
+            f"First turn with {outcome.magnet} changed by {100 * outcome.change:+g} % "
+            f"(dotted, s = {magnet.s:.1f} m)"
+        )
     lattice_strip(outcome.ring, grid[4])
     return figure

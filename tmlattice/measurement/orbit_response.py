@@ -1,0 +1,179 @@
+"""The change of the stored beam's closed orbit for a step of one corrector at a time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement.monitors import Names, noise_table
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RfStep:
+    """A step of the RF frequency.
+
+    Attributes:
+        frequency: Hz.
+        harmonic: number of RF periods in a turn.
+        step: Hz.
+        orbit: the orbit change for the step, m, [monitor, 2], NaN where missing; None where it
+            was not measured.
+    """
+
+    frequency: float
+    harmonic: int
+    step: float
+    orbit: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitResponse:
+    """Measured orbit changes.
+
+    The RF frequency is constant while a corrector is stepped, so a horizontal step also shifts
+    the beam energy a little.
+
+    Attributes:
+        correctors: names, one a column.
+        planes: "x" or "y", the plane in which each kicks.
+        kicks: the steps, rad, [column].
+        monitors: names.
+        response: the orbit change for that kick, m (not m/rad), [column, monitor, 2], NaN where
+            missing.
+        noise: rms of a reading, m, [monitor, 2], NaN where not known; None: unknown. A pair
+            (x, y), or a mapping of pairs by monitor, is taken too.
+        rf: the RF's step, or None.
+        lattice, energy: what the data say of them (GeV); hints.
+
+    Raises:
+        MeasurementError: shapes that do not fit, or numbers that cannot be.
+    """
+
+    correctors: tuple[str, ...]
+    planes: tuple[str, ...]
+    kicks: Array
+    monitors: tuple[str, ...]
+    response: Array
+    noise: Array | None = None
+    rf: RfStep | None = None
+    lattice: str | None = None
+    energy: float | None = None
+
+    def __post_init__(self) -> None:
+        def keep(**values: Any) -> None:
+            for name, value in values.items():
+                object.__setattr__(self, name, value)
+
+        kicks, response = (np.asarray(a, dtype=float) for a in (self.kicks, self.response))
+        keep(
+            correctors=tuple(self.correctors),
+            planes=tuple(self.planes),
+            monitors=tuple(self.monitors),
+            kicks=kicks,
+            response=response,
+        )
+        Names("corrector", self.correctors)
+        Names("monitor", self.monitors)
+        columns, monitors = len(self.correctors), len(self.monitors)
+        if response.shape != (columns, monitors, 2):
+            raise MeasurementError(
+                f"the response has the shape {response.shape}; {columns} correctors and "
+                f"{monitors} monitors need [{columns}, {monitors}, 2]"
+            )
+        if len(self.planes) != columns or kicks.shape != (columns,):
+            raise MeasurementError(f"{columns} correctors need as many planes and kicks")
+        for name, plane, kick in zip(self.correctors, self.planes, kicks, strict=True):
+            if name.casefold() == "rf":
+                raise MeasurementError("no corrector is named 'rf': that name is the RF step's")
+            if plane not in ("x", "y"):
+                raise MeasurementError(f"corrector '{name}' kicks in '{plane}'; in x or y it can")
+            if kick == 0 or not np.isfinite(kick):
+                raise MeasurementError(
+                    f"corrector '{name}' has a step of {kick:g} rad; it is finite and not zero"
+                )
+        if self.rf is not None:
+            rf = self.rf
+            if not (0 < rf.frequency < np.inf and rf.harmonic > 0 and abs(rf.step) < np.inf):
+                raise MeasurementError(
+                    f"an RF of {rf.frequency:g} Hz, harmonic {rf.harmonic}, step {rf.step:g} Hz "
+                    "cannot be; frequency and harmonic are above zero, the step is finite"
+                )
+            if rf.orbit is not None:
+                orbit = np.asarray(rf.orbit, dtype=float)
+                if orbit.shape != (monitors, 2):
+                    raise MeasurementError(
+                        f"the RF step's orbit has the shape {orbit.shape}, not [{monitors}, 2]"
+                    )
+                keep(rf=replace(rf, orbit=orbit))
+        if self.energy is not None and not 0 < self.energy < np.inf:
+            raise MeasurementError(f"an energy of {self.energy:g} GeV cannot be; it is above zero")
+        everything = [response] if self.rf is None or self.rf.orbit is None else [
+            response, self.rf.orbit
+        ]  # fmt: skip
+        if any(np.isinf(a).any() for a in everything):
+            raise MeasurementError("an orbit change is infinite; a missing one is NaN")
+        if not any(np.isfinite(a).any() for a in everything):
+            raise MeasurementError("every orbit change is missing; nothing can be fitted")
+        keep(noise=noise_table(self.noise, self.monitors))
+
+    def in_order_of(self, monitors: Sequence[str]) -> "OrbitResponse":
+        """The same with other monitors, such as a ring's: NaN where one was not read.
+
+        Raises:
+            UnknownNameError: this measurement has a monitor that is not among them.
+        """
+        names = Names("monitor", monitors)
+        place = [names[name] for name in self.monitors]
+
+        def spread(values: Array | None) -> Array | None:
+            if values is None:
+                return None
+            full = np.full((*values.shape[:-2], len(names.names), 2), np.nan)
+            full[..., place, :] = values
+            return full
+
+        rf = None if self.rf is None else replace(self.rf, orbit=spread(self.rf.orbit))
+        response = spread(self.response)
+        assert response is not None
+        return replace(
+            self, response=response, monitors=names.names, noise=spread(self.noise), rf=rf
+        )
+
+    def select(
+        self, correctors: Sequence[str] | None = None, monitors: Sequence[str] | None = None
+    ) -> "OrbitResponse":
+        """A part of the columns and monitors, in the order asked for; None: all.
+
+        Raises:
+            UnknownNameError: one that is not there.
+        """
+        part = self
+        if correctors is not None:
+            names = Names("corrector", self.correctors)
+            column = [names[name] for name in correctors]
+            part = replace(
+                part,
+                correctors=tuple(self.correctors[i] for i in column),
+                planes=tuple(self.planes[i] for i in column),
+                kicks=self.kicks[column],
+                response=self.response[column],
+            )
+        if monitors is not None:
+            names = Names("monitor", self.monitors)
+            place = [names[name] for name in monitors]
+            rf = part.rf
+            if rf is not None and rf.orbit is not None:
+                rf = replace(rf, orbit=rf.orbit[place])
+            part = replace(
+                part,
+                monitors=tuple(self.monitors[i] for i in place),
+                response=part.response[:, place],
+                noise=None if self.noise is None else self.noise[place],
+                rf=rf,
+            )
+        return part

@@ -1,0 +1,144 @@
+"""Readings from elsewhere: plain CSV tables, and the turn-by-turn files of many laboratories."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement.documents import located
+from tmlattice.measurement.monitors import Names, merge_spellings
+from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read_rows
+from tmlattice.measurement.trajectory import Measurement
+
+Array = NDArray[np.float64]
+Unit = Literal["m", "mm", "um"]
+
+_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+
+COLUMNS = ("shot", "turn", "monitor", "x", "y")
+
+
+def read_table(
+    path: str | Path,
+    *,
+    launches: Any = None,
+    noise: Any = None,
+    launch_sigma: Any = None,
+    monitors: Sequence[str] | None = None,
+    unit: Unit = "m",
+) -> Measurement:
+    """Read a plain CSV table of readings: a row for each shot, turn and monitor.
+
+    The first line names the columns, in any order and case: `monitor`, `x` and `y`, and where
+    there is more than one, `shot` (a whole number, else 0) and `turn` (from 0, else 0). Other
+    columns are passed over. An empty field is a missing reading. UTF-8, separated by commas.
+
+    Args:
+        path: the file.
+        launches: nominal (x, px, y, py[, delta]) of the shots in the order of their numbers,
+            [shot, 4 or 5], m and rad; a table has none, and without them they are 0.
+        noise: rms of a reading, see `Measurement`.
+        launch_sigma: see `Measurement`.
+        monitors: the ring's names, checked where given; the names are then the ring's.
+        unit: of x and y.
+
+    Raises:
+        MeasurementError: one sentence with the file, the line and what would mend it.
+    """
+    rows = read_rows(Path(path), COLUMNS, optional=("shot", "turn"))
+    rows = replace(rows, xy=rows.xy * _scale(unit))
+    rows.check(*(k for k in COLUMNS if k in rows.whole), "monitor")
+    numbers = rows.whole.get("shot", np.zeros(len(rows), dtype=np.int64))
+    shots, place = np.unique(numbers, return_inverse=True)
+    names, monitor = match_names(rows, "monitor", monitors)
+    readings = dense(rows, place, len(shots), monitor, len(names))
+    with located(rows.path):
+        return Measurement(
+            launches=np.zeros((len(shots), 5)) if launches is None else launches,
+            readings=readings,
+            monitors=names,
+            noise=noise,
+            launch_sigma=launch_sigma,
+            shots=tuple(shots.tolist()),
+        )
+
+
+def read_turn_by_turn(
+    path: str | Path,
+    datatype: str = "lhc",
+    *,
+    launches: Any = None,
+    noise: Any = None,
+    monitors: Sequence[str] | None = None,
+    unit: Unit = "m",
+) -> Measurement:
+    """Read a turn-by-turn file through the package `turn_by_turn`; each bunch is a shot.
+
+    Args:
+        path: the file.
+        datatype: its kind: lhc, sps, psb, doros, iota, ptc, trackone, ascii, madng, superkekb
+            (SDDS, HDF5, TFS and text files of these machines and codes).
+        launches: nominal (x, px, y, py[, delta]) of the bunches, [shot, 4 or 5]; else 0.
+        noise: rms of a reading, see `Measurement`.
+        monitors: the ring's names, checked where given; the names and their order are then the
+            ring's.
+        unit: of the file: the package hands numbers on as they stand, and control systems often
+            write mm.
+
+    Raises:
+        MeasurementError: the file cannot be read as that kind, or its readings cannot be metres.
+    """
+    import turn_by_turn
+
+    path = Path(path)
+    scale = _scale(unit)
+    if not path.is_file():
+        raise MeasurementError(f"no turn-by-turn file '{path}'")
+    try:
+        data = turn_by_turn.read(path, datatype=datatype)
+        tables = [(bunch.X, bunch.Y) for bunch in data.matrices]
+    except Exception as error:  # whatever a reader meets in a file of another kind
+        raise MeasurementError(
+            f"{path}: cannot be read as '{datatype}' ({type(error).__name__}: {error}); name the "
+            "kind of the file (lhc, sps, psb, doros, iota, ptc, trackone, ascii, madng, superkekb)"
+        ) from error
+    spellings = list(dict.fromkeys(str(n) for x, y in tables for n in (*x.index, *y.index)))
+    found, places = merge_spellings(spellings)
+    place = dict(zip(spellings, places.tolist(), strict=True))
+    readings = np.full((len(tables), int(data.nturns), len(found), 2), np.nan)
+    for shot, planes in enumerate(tables):
+        for plane, frame in enumerate(planes):
+            values = frame.to_numpy(dtype=float)
+            index = [place[str(name)] for name in frame.index]
+            if len(set(index)) < len(index):
+                raise MeasurementError(f"{path}: a monitor stands twice; name each once")
+            readings[shot, : values.shape[1], index, plane] = scale * values
+    if (np.abs(readings) > LARGEST_READING).any():
+        raise MeasurementError(
+            f"{path}: readings up to {np.nanmax(np.abs(readings)):g} m are above "
+            f"{LARGEST_READING} m; say the unit of the file (unit='mm')"
+        )
+    with located(path):
+        if monitors is not None:
+            names = Names("monitor", monitors)
+            ring = np.array([names[name] for name in found])
+            order = np.argsort(ring)
+            readings = readings[:, :, order]
+            found = tuple(names.names[i] for i in ring[order])
+        return Measurement(
+            launches=np.zeros((len(tables), 5)) if launches is None else launches,
+            readings=readings,
+            monitors=found,
+            noise=noise,
+            shots=tuple(int(i) for i in data.bunch_ids),
+        )
+
+
+def _scale(unit: str) -> float:
+    if unit not in _METRES:
+        raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(_METRES)}")
+    return _METRES[unit]
