@@ -3,14 +3,14 @@
 import at
 import numpy as np
 import pytest
-from at_ring import at_lattice
 
 from tmlattice import TaylorNetwork, off_momentum, one_turn_optics, twiss
+from tmlattice.machine.at_engine import AtEngine
 
 
 @pytest.fixture(scope="module")
 def referee(petra3):
-    return at_lattice(petra3)
+    return AtEngine(petra3).lattice()
 
 
 @pytest.fixture(scope="module")

@@ -338,7 +338,8 @@ def _sorted(
         if effect == "family_gradient":
             members = families.get(cause.element.casefold())
             if members is None:
-                raise unknown_name("family of quadrupoles", cause.element, families)
+                known = dict.fromkeys(ring.elements[m[0]].family for m in families.values())
+                raise unknown_name("family of quadrupoles", cause.element, known)
             for i in members:
                 errors[i][effect] += amount
             continue
