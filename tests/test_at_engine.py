@@ -6,7 +6,7 @@ state (x, px, y, py), since a drift of AT is x += L px on energy.
 
 import numpy as np
 import pytest
-from ocelot.cpbd.elements import Solenoid
+from ocelot.cpbd.elements import Solenoid, Undulator
 
 from tmlattice import TaylorNetwork, load_ring, off_momentum
 from tmlattice.effects import Cause
@@ -252,6 +252,27 @@ def test_octupole_multipole_and_solenoid(tmp_path):
     engine = engine_of(tmp_path, "Solenoid(l=0.5, k=0.02, eid='it')")
     expected = Solenoid(l=0.5, k=0.02).R(6.0)[0][:4, :4] @ launch[:4]
     np.testing.assert_allclose(exit_state(engine, launch), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_undulator_vs_ocelot_matrix(tmp_path):
+    strengths = {"lperiod": 0.03, "nperiods": 100, "Kx": 40.0, "Ky": 20.0}
+    arguments = ", ".join(f"{key}={value}" for key, value in strengths.items())
+    engine = engine_of(tmp_path, f"Undulator({arguments}, eid='it')")
+    expected = Undulator(**strengths).R(6.0)[0][:4, :4] @ LAUNCH[:4]
+    np.testing.assert_allclose(
+        exit_state(engine), expected, rtol=1e-5
+    )  # its electron is 2e-7 lighter
+
+
+def test_own_cavity_is_a_drift_at_first_and_takes_energy_from_the_late(tmp_path):
+    engine = engine_of(tmp_path, "Cavity(l=0.5, v=0.003, freq=5e8, eid='it')")
+    launch = np.array([0, 1e-3, 0, 0, 0.1, 0])  # late by less than half a period
+    np.testing.assert_allclose(exit_state(engine, launch), [5e-4, 1e-3, 0, 0], atol=1e-15)
+    a, b = engine.track(launch[None], turns=2)[0, 0, :, 0]
+    frequency = 3 * 299792458 / 1.5  # the harmonic nearest to 500 MHz in a ring of 1.5 m
+    delta = -0.003 / 6 * np.sin(2 * np.pi * frequency * 0.1 / 299792458)
+    assert delta < 0
+    np.testing.assert_allclose(b - a, 1e-3 / (1 + delta), rtol=1e-8)
 
 
 @pytest.mark.parametrize("edges", ["", "gap=0.05, fint=0.5", "gap=0.05, fint=0.5, fintx=0.2"])

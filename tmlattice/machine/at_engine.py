@@ -147,7 +147,8 @@ class AtEngine:
     def _set_rf(self, harmonic: int | None, voltage: float | None) -> None:
         ring, elements = self.ring, self.ring.elements
         own = [i for i, e in enumerate(elements) if e.kind == "cavity"]
-        named = [i for i, e in enumerate(elements) if e.name.casefold() == "rf"]
+        free = ("marker", "drift")
+        named = [i for i, e in enumerate(elements) if e.name.casefold() == "rf" and e.kind in free]
         self._cavities = [self._places[i].start for i in own or named[:1]]
         self._cavities = self._cavities or [len(self._line) - 1]
         self._has_rf = bool(own)
@@ -174,8 +175,8 @@ class AtEngine:
         """The beam at every monitor.
 
         Over more than one turn the RF is on if the ring radiates, has cavities of its own, or
-        its frequency is set: in the ring's cavities, else at the element named `rf`, else at
-        the end. Its phase makes good the loss on the design orbit. On one turn cavities are
+        its frequency is set: in the ring's cavities, else at the marker or drift named `rf`, else
+        at the end. Its phase makes good the loss on the design orbit. On one turn cavities are
         drifts. Shots with equal settings are tracked together.
 
         Args:
@@ -216,8 +217,9 @@ class AtEngine:
     def lattice(self) -> Any:
         """The line as an AT lattice of its own, without RF, for AT's tools (`at.get_optics`).
 
-        Its energy is the ring's, times the third root of the scale of a loss in the bends other
-        than 1: so AT's loss comes out scaled.
+        Exact bends round x to the rounding of their radius, 3e-14 m: derivatives need steps of
+        3e-6 (`XYStep`) and 1e-3 (`DPStep`). The lattice's energy is the ring's, times the third
+        root of the scale of a loss in the bends other than 1: so AT's loss comes out scaled.
         """
         return at.Lattice(copy.deepcopy(self._line), energy=self._energy, periodicity=1)
 
@@ -550,6 +552,8 @@ class _Builder:
             raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
         roll = errors["dipole_roll"]
         horizontal = angle * errors["dipole_field"] - roll**2 * angle / 2  # what px loses
+        # The body is exact in a step; only its errors, losses and gradients are spread.
+        steps = self.steps if element.k1 or element.k2 else 4
         more: dict[str, Any] = {}
         if element.tilt:
             more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
@@ -561,7 +565,7 @@ class _Builder:
                 share * angle,
                 PolynomB=[horizontal / length, element.k1, element.k2 / 2, 0.0],
                 PolynomA=[-roll * angle / length, 0.0, 0.0, 0.0],
-                NumIntSteps=self.steps,
+                NumIntSteps=steps,
                 PassMethod=self.bend_pass,
                 **edges,
                 **more,
