@@ -421,9 +421,13 @@ def test_a_lost_particle_is_nan_from_there_on_and_alone(small_ring, turns):
 
 def test_blocks_of_turns_join(small_ring, monkeypatch):
     engine = AtEngine(small_ring, radiation_bends=1.0, voltage=2e6)
-    whole = engine.track(LAUNCH[None] / 10, 20)
-    monkeypatch.setattr("tmlattice.machine.at_engine.TURNS_AT_ONCE", 3 * len(small_ring.monitors))
-    np.testing.assert_array_equal(engine.track(LAUNCH[None] / 10, 20), whole)
+    launches = np.array([LAUNCH / 10, [0.03, 0, 0.04, 0, 0, 0]])  # one is lost
+    settings = [{"rf": {"frequency_relative": 1e-5}}] * 2  # its phase slips from turn to turn
+    whole = engine.track(launches, 20, settings)
+    monkeypatch.setattr("tmlattice.machine.at_engine.TURNS_AT_ONCE", 6 * len(small_ring.monitors))
+    np.testing.assert_array_equal(engine.track(launches, 20, settings), whole)
+    assert np.isnan(whole[1, -1]).all()
+    assert np.isfinite(whole[0]).all()
 
 
 def test_without_rf_the_energy_stays_and_with_it_the_loss_is_made_good(petra3, network6):

@@ -286,9 +286,8 @@ class AtEngine:
                 turn=turn,
             )
             readings[:, turn : turn + block] = np.moveaxis(seen[[0, 2]], [0, 2, 3], [3, 2, 1])
-        gone = ~np.all(np.abs(readings) <= self._builder.aperture, axis=3)
-        gone = np.logical_or.accumulate(gone.reshape(len(state), -1), axis=1)
-        readings[gone.reshape(readings.shape[:3])] = np.nan
+        # AT sets x alone of a lost particle to NaN, and that behind the wall it is lost on.
+        readings[~np.all(np.abs(readings) <= self._builder.aperture, axis=3)] = np.nan
         return readings
 
 
