@@ -8,7 +8,9 @@ from typing import NoReturn, TextIO
 import click
 
 from tmlattice import __version__
+from tmlattice.cli.effects import effects
 from tmlattice.cli.info import info
+from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
 from tmlattice.errors import TmlatticeError
@@ -30,6 +32,8 @@ def tmlattice() -> None:
 tmlattice.add_command(tune_fit)
 tmlattice.add_command(info)
 tmlattice.add_command(study)
+tmlattice.add_command(simulate)
+tmlattice.add_command(effects)
 
 
 def main() -> NoReturn:

@@ -1,4 +1,4 @@
-"""What was measured, as the diagnosis needs it: readings, their noise, what is known of launches."""
+"""What was measured, as the diagnosis needs it: readings, their noise, launches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -115,13 +115,6 @@ def joined(first: Data, second: Data) -> Data:
             f"the reference has {first.turns} turns and the measurement {second.turns}; "
             "give both the same number (Measurement.select)"
         )
-    arrays = (
-        np.concatenate([getattr(first, name), getattr(second, name)])
-        for name in ("readings", "valid", "sigma", "launches", "launch_sigma")
-    )
-    return Data(
-        *arrays,
-        first.settings + second.settings,
-        first.turns,
-        np.concatenate([first.active, second.active]),
-    )
+    names = ("readings", "valid", "sigma", "launches", "launch_sigma", "active")
+    arrays = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+    return Data(settings=first.settings + second.settings, turns=first.turns, **arrays)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.model import Hypothesis
 from tmlattice.diagnosis.refine import Fit, Problem, fit, free_evidence
 from tmlattice.diagnosis.scan import FreeScan, Scan, look_elsewhere, scan, scan_kicks, scan_monitors
-from tmlattice.diagnosis.model import Hypothesis
 from tmlattice.effects import Cause, find
 
 Array = NDArray[np.float64]
@@ -202,7 +202,7 @@ class _Search:
                 if amount == 0:
                     continue
             limit = 1.5 * effect.largest
-            cause = Cause(*hypothesis, float(np.clip(amount, -limit, limit)))
+            cause = Cause(hypothesis[0], hypothesis[1], float(np.clip(amount, -limit, limit)))
             tried = fit(
                 problem,
                 (*others.causes, cause),

@@ -117,8 +117,8 @@ class Model:
             for w, c in zip((maps.W0, maps.W1, maps.W2), maps.closing.coefficients, strict=True)
         ]
         self.groups = []
-        for shots, setting, active in self._alike(settings):
-            group = _Group(shots, setting, active)
+        for shots, setting, there in self._alike(settings):
+            group = _Group(shots, setting, there)
             group.W = [w.copy() for w in base]
             group.R = [r.copy() for r in (maps.R0, maps.R1, maps.R2)]
             self._patch(group, set_elements(self.ring, setting))

@@ -240,7 +240,7 @@ def _finished(problem: Problem, state: Fit, rows: Array, converged: bool) -> Fit
         return replace(state, covariance=covariance)
     own = state.projection.out(rows)
     gram = own @ own.T
-    for i, cause in enumerate(state.causes):
+    for cause in state.causes:
         log_evidence += problem.prior((cause.effect, cause.element)) + amount_prior(cause)
     if named:
         size = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))

@@ -249,11 +249,11 @@ def scan_monitors(
             inners.append((rows @ clean)[None])
         return _free_scan(np.arange(monitors), np.stack(grams), np.stack(inners))
     # the rows of a monitor in its shot, and what the launch's directions have there
-    rows = 2 * (reading[None, :, None] + np.arange(monitors)[:, None, None]) + np.arange(2)
-    rows = rows.reshape(monitors, -1)  # [monitor, turn * plane]
-    weight = whitening.weight.reshape(whitening.shots, -1)[shots][:, rows]  # [shot, monitor, p]
-    Q = projection.Q[shots][:, rows]  # [shot, monitor, p, direction]
-    gram = np.eye(rows.shape[1]) - np.einsum("smpd,smqd->smpq", Q, Q)
+    places = 2 * (reading[None, :, None] + np.arange(monitors)[:, None, None]) + np.arange(2)
+    places = places.reshape(monitors, -1)  # [monitor, turn * plane]
+    weight = whitening.weight.reshape(whitening.shots, -1)[shots][:, places]  # [shot, monitor, p]
+    Q = projection.Q[shots][:, places]  # [shot, monitor, p, direction]
+    gram = np.eye(places.shape[1]) - np.einsum("smpd,smqd->smpq", Q, Q)
     gram = weight[..., :, None] * gram * weight[..., None, :]
-    inner = weight * clean.reshape(whitening.shots, -1)[shots][:, rows]
+    inner = weight * clean.reshape(whitening.shots, -1)[shots][:, places]
     return _free_scan(np.arange(monitors), gram.swapaxes(0, 1), inner.swapaxes(0, 1))

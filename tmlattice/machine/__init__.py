@@ -1,12 +1,22 @@
 """The virtual machine: an engine tracks a ring with known causes, monitors read it.
 
->>> machine = Machine(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)], engine="at")
->>> shots = draw_shots(ring, 6, amplitude=1e-3, seed=1)
->>> for shot, readings in machine.measure(shots): ...          # [turn, monitor, 2], m
->>> measurement, truth = simulate(ring, [cause], background={"quadrupole_gradient": 1e-3})
+>>> simulation = simulate(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)], shots=6, seed=1)
+>>> measurement = simulation.measurement()
+>>> simulation.write("day_1")                                   # the measurement folder
+>>> Machine(ring, engine="ocelot").beam(launches)               # [shot, turn, monitor, 2], m
 """
 
-from tmlattice.machine.machine import Machine
+from tmlattice.machine.machine import ENGINES, Machine
 from tmlattice.machine.shots import Shots, background_rms, draw_background, draw_shots
+from tmlattice.machine.simulate import Simulation, simulate
 
-__all__ = ["Machine", "Shots", "background_rms", "draw_background", "draw_shots"]
+__all__ = [
+    "ENGINES",
+    "Machine",
+    "Shots",
+    "Simulation",
+    "background_rms",
+    "draw_background",
+    "draw_shots",
+    "simulate",
+]

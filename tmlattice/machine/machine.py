@@ -1,7 +1,11 @@
 """A machine that can be measured: a ring with causes, its monitors, their noise."""
 
+import pickle
+from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +16,33 @@ from tmlattice.lattice import Ring
 from tmlattice.machine.shots import Shots, stream
 
 Array = NDArray[np.float64]
-EngineName = Literal["at", "ocelot"]
+
+ENGINES = ("at", "ocelot")
 
 CHUNK = 64
 """Shots tracked at once: memory does not grow with their number."""
+
+
+class Engine(Protocol):
+    """Tracks a ring with causes in it."""
+
+    def track(
+        self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
+    ) -> Array:
+        """(x, y) at every monitor, [shot, turn, monitor, 2], from launches [shot, 6]."""
+
+
+def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> Engine:
+    scale = 1.0 if radiation else 0.0
+    if name == "at":
+        from tmlattice.machine.at_engine import AtEngine
+
+        return AtEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
+    if name == "ocelot":
+        from tmlattice.machine.ocelot_engine import OcelotEngine
+
+        return OcelotEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
+    raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(ENGINES)}")
 
 
 class Machine:
@@ -30,6 +57,7 @@ class Machine:
 
     Raises:
         EffectError, UnknownNameError: a cause that the ring cannot have.
+        TmlatticeError: another engine, or negative noise.
     """
 
     def __init__(
@@ -37,7 +65,7 @@ class Machine:
         ring: Ring,
         causes: Sequence[Cause] = (),
         *,
-        engine: EngineName = "at",
+        engine: str = "at",
         radiation: bool = False,
         noise: float | Sequence[float] = 2e-5,
     ) -> None:
@@ -49,14 +77,8 @@ class Machine:
         self.noise = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
         if not (np.isfinite(self.noise).all() and (self.noise >= 0).all()):
             raise TmlatticeError(f"the noise is {noise} m; it is an rms: zero or more")
-        scale = 1.0 if radiation else 0.0
-        if engine == "at":
-            from tmlattice.machine.at_engine import AtEngine as Engine
-        elif engine == "ocelot":
-            from tmlattice.machine.ocelot_engine import OcelotEngine as Engine
-        else:
-            raise TmlatticeError(f"no engine '{engine}'; there are at and ocelot")
-        self._engine = Engine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
+        self._made_of: dict[str, Any] = {"engine": engine, "radiation": radiation, "noise": noise}
+        self._engine = _engine(engine, ring, causes, radiation)
 
     def beam(
         self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
@@ -75,25 +97,73 @@ class Machine:
         positions = positions.reshape(len(weights), len(launches), *positions.shape[1:])
         return np.asarray(np.tensordot(weights, positions, 1))
 
-    def measure(self, shots: Shots, turns: int = 1, seed: int = 0) -> Iterator[tuple[int, Array]]:
+    def _read(self, shots: Shots, chunk: range, turns: int, seed: int) -> Array:
+        """Readings of some shots but for what frozen monitors make of them."""
+        part = slice(chunk.start, chunk.stop)
+        beam = self.beam(shots.launches[part], turns, shots.settings[part])
+        readings = self.monitors.read(beam)
+        for shot, reading in zip(chunk, readings, strict=True):
+            noise = stream(seed, "noise", shot).standard_normal(reading.shape)
+            reading += self.noise * noise  # noqa: PLW2901
+        return readings
+
+    def measure(
+        self, shots: Shots, turns: int = 1, seed: int = 0, jobs: int = 1
+    ) -> Iterator[tuple[int, Array]]:
         """The shots one after another: index and readings [turn, monitor, 2], m.
 
-        Each shot's noise has a stream of its own, so that it does not depend on how many there are.
+        Each shot's noise has a stream of its own: it depends neither on how many shots there are
+        nor on the number of processes.
+
+        Args:
+            shots: see `draw_shots`.
+            turns: of each shot.
+            seed: of the noise.
+            jobs: processes.
         """
         frozen = self.monitors.frozen
         first: Array | None = None
-        for start in range(0, len(shots), CHUNK):
-            chunk = range(start, min(start + CHUNK, len(shots)))
-            beam = self.beam(
-                shots.launches[chunk.start : chunk.stop],
-                turns,
-                shots.settings[chunk.start : chunk.stop],
-            )
-            readings = self.monitors.read(beam)
+        starts = range(0, len(shots), CHUNK)
+        chunks = [range(start, min(start + CHUNK, len(shots))) for start in starts]
+        for chunk, readings in zip(chunks, self._parts(shots, chunks, turns, seed, jobs)):  # noqa: B905
             for shot, reading in zip(chunk, readings, strict=True):
-                noise = stream(seed, "noise", shot).standard_normal(reading.shape)
-                reading += self.noise * noise  # noqa: PLW2901
                 if first is None:
                     first = reading[0, frozen].copy()
                 reading[:, frozen] = first
                 yield shot, reading
+
+    def _parts(
+        self, shots: Shots, chunks: Sequence[range], turns: int, seed: int, jobs: int
+    ) -> Iterator[Array]:
+        if jobs < 2 or len(chunks) < 2:
+            for chunk in chunks:
+                yield self._read(shots, chunk, turns, seed)
+            return
+        # as bytes: the process must silence OCELOT's greeting before it unpickles elements
+        setup = pickle.dumps((self.ring, self.causes, self._made_of, shots, turns, seed))
+        size = min(jobs, len(chunks))
+        with ProcessPoolExecutor(size, get_context("spawn"), _start, (setup,)) as pool:
+            waiting: deque[Future[Array]] = deque()
+            for chunk in chunks:  # no more in flight than the processes need
+                waiting.append(pool.submit(_work, chunk))
+                if len(waiting) > 2 * jobs:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+
+
+_worker: tuple[Machine, Shots, int, int] | None = None
+
+
+def _start(setup: bytes) -> None:
+    global _worker
+    import tmlattice.lattice.ocelot  # noqa: F401
+
+    ring, causes, made_of, shots, turns, seed = pickle.loads(setup)
+    _worker = (Machine(ring, causes, **made_of), shots, turns, seed)
+
+
+def _work(chunk: range) -> Array:
+    assert _worker is not None
+    machine, shots, turns, seed = _worker
+    return machine._read(shots, chunk, turns, seed)

@@ -140,9 +140,10 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
     if len(parts) > 1:
         middle = len(parts) // 2
         return _chain(parts[:middle]), _chain(parts[middle:])
-    root = np.real(np.array(sqrtm(parts[0].R), dtype=np.complex128))  # a bare matrix
+    root = np.array(np.real(sqrtm(parts[0].R)), dtype=np.float64)  # a bare matrix
+    back: Array = np.linalg.inv(root).astype(np.float64)
     first = Quadratic(np.zeros(n), root, None)
-    return first, parts[0].after(Quadratic(np.zeros(n), np.linalg.inv(root), None))
+    return first, parts[0].after(Quadratic(np.zeros(n), back, None))
 
 
 def _thin(

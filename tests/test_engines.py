@@ -1,0 +1,79 @@
+"""The two engines against each other: maps of OCELOT, thick symplectic tracking by AT."""
+
+import numpy as np
+import pytest
+
+from tmlattice.effects import CATALOGUE, Cause, ReadingEffect
+from tmlattice.machine import Machine, draw_shots
+
+# Where each effect is tried; ReadingEffects do not reach the engines.
+PLACES = {
+    "quadrupole_gradient": ["qd::12", "qa4::14"],
+    "gradient_absolute": ["qd::12", "s1::48", "wiggler::3", "a3"],
+    "skew_gradient": ["qd::12", "s1::48", "wiggler::3", "a3"],
+    "quadrupole_roll": ["qd::12", "qa2::13"],
+    "quadrupole_offset_x": ["qd::12", "qa3::2"],
+    "quadrupole_offset_y": ["qd::12", "qa3::2"],
+    "family_gradient": ["qd", "qe5"],
+    "dipole_field": ["b::28", "b_in::10", "bo_out::5"],
+    "dipole_roll": ["b::28", "b_in::10", "bo_out::5"],
+    "corrector_kick_x": ["hcor_sw_4", "vcor_a1_5"],
+    "corrector_kick_y": ["hcor_sw_4", "vcor_a1_5"],
+    "corrector_calibration": ["hcor_sw_4", "vcor_a1_5"],
+    "corrector_roll": ["hcor_sw_4", "vcor_a1_5"],
+    "sextupole_strength": ["s1::48", "s4::26"],
+    "sextupole_offset_x": ["s1::48", "s4::26"],
+    "sextupole_offset_y": ["s1::48", "s4::26"],
+    "insertion_device_focusing": ["wiggler::0", "wiggler::12"],
+    "energy_offset": [None],
+    "energy_spread": [None],
+    "radiation_loss_bends": [None],
+    "radiation_loss_wigglers": [None],
+}
+SETTINGS = {"hcor_sw_4": {"kick": 5e-5}, "vcor_a1_5": {"kick": -5e-5}}
+
+
+@pytest.fixture(scope="module")
+def shots(petra3):
+    return draw_shots(petra3, 3, 1e-3, seed=3, settings=[SETTINGS] * 3)
+
+
+@pytest.fixture(scope="module")
+def orbits(petra3, shots):
+    return {
+        engine: Machine(petra3, engine=engine).beam(shots.launches, 1, shots.settings)
+        for engine in ("at", "ocelot")
+    }
+
+
+def test_every_effect_on_the_beam_is_compared():
+    beam = {name for name, effect in CATALOGUE.items() if not isinstance(effect, ReadingEffect)}
+    assert set(PLACES) == beam
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_change_of_the_orbit_is_the_same_in_both_engines(petra3, shots, orbits, name):
+    effect = CATALOGUE[name]
+    amount = effect.background or effect.largest / 10
+    for place in PLACES[name]:
+        causes = [Cause(name, place, amount)]
+        at, ocelot = (
+            Machine(petra3, causes, engine=engine).beam(shots.launches, 1, shots.settings) - before
+            for engine, before in orbits.items()
+        )
+        size = np.sqrt((at**2).mean())
+        assert size > 1e-9
+        error = np.sqrt(((at - ocelot) ** 2).mean()) / size
+        # a spread is seen in the second order of the energy: its share of third-order terms
+        # (launch x energy^2) is not in second-order maps, 4 % of a change of half a micrometre
+        assert error < (0.06 if name == "energy_spread" else 0.02), place
+
+
+def test_radiating_turns_keep_their_beam_in_both_engines(petra3):
+    """300 turns with radiation and the RF that makes it good: the energy does not run away."""
+    shots = draw_shots(petra3, 1, 1e-4, sigma=(0,) * 5, seed=1)
+    for engine in ("at", "ocelot"):
+        beam = Machine(petra3, engine=engine, radiation=True).beam(shots.launches, 300)
+        late = beam[0, -50:]
+        assert np.isfinite(late).all()
+        assert np.sqrt((late**2).mean()) < 1.5e-3  # the sawtooth orbit and the launch's own

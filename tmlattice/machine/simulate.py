@@ -1,0 +1,149 @@
+"""A simulated measurement: in memory, or shot by shot into a folder."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from tmlattice.effects import Cause, Settings
+from tmlattice.lattice import Ring
+from tmlattice.machine.machine import Machine
+from tmlattice.machine.shots import (
+    LAUNCH_SIGMA,
+    Shots,
+    background_rms,
+    draw_background,
+    draw_shots,
+)
+from tmlattice.measurement import Measurement, measurement_writer
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A machine and the shots that it is going to be measured with.
+
+    Attributes:
+        machine: with causes and background in it.
+        shots: launches and settings.
+        causes: without the background.
+        background: rms by effect.
+        turns, seed: of the measurement; the seed is that of the noise.
+        radiation: whether bends and wigglers radiate.
+    """
+
+    machine: Machine
+    shots: Shots
+    causes: tuple[Cause, ...]
+    background: Mapping[str, float]
+    turns: int
+    seed: int
+    radiation: bool
+
+    def measurement(self) -> Measurement:
+        """All shots at once."""
+        readings = [
+            reading for _, reading in self.machine.measure(self.shots, self.turns, self.seed)
+        ]
+        noise = self.machine.noise
+        return Measurement(
+            launches=self.shots.nominal,
+            readings=np.stack(readings),
+            monitors=tuple(monitor.name for monitor in self.machine.ring.monitors),
+            noise=(float(noise[0]), float(noise[1])) if (noise > 0).all() else None,
+            launch_sigma=np.tile(self.shots.sigma, (len(self.shots), 1)),
+            settings=self.shots.settings,
+            lattice=self.machine.ring.name,
+            energy=self.machine.ring.energy,
+        )
+
+    def write(self, folder: Path, jobs: int = 1, progress: bool = True) -> None:
+        """Shot by shot into a measurement folder; it appears when all went well.
+
+        Args:
+            folder: see the measurement format.
+            jobs: processes.
+            progress: show a bar where there is a terminal.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        ring, noise = self.machine.ring, self.machine.noise
+        names = [monitor.name for monitor in ring.monitors]
+        known = (float(noise[0]), float(noise[1])) if (noise > 0).all() else None
+        shots = self.shots
+        with measurement_writer(folder, names, known, ring.name, ring.energy) as writer:
+            measured = self.machine.measure(shots, self.turns, self.seed, jobs)
+            for shot, readings in tqdm(
+                measured, total=len(shots), unit="shot", disable=None if progress else True
+            ):
+                writer.add(shot, shots.nominal[shot], shots.sigma, shots.settings[shot], readings)
+
+    def truth(self) -> dict[str, Any]:
+        """What was really there, for `write_truth`: effects, launches, background, seed."""
+        ring = self.machine.ring
+        positions = {element.name: element.s for element in ring.elements}
+        return {
+            "effects": [
+                {
+                    "effect": cause.effect,
+                    "element": cause.element,
+                    "s": positions.get(cause.element or ""),
+                    "amount": cause.amount,
+                }
+                for cause in self.causes
+            ],
+            "launches": self.shots.launches[:, [0, 1, 2, 3, 5]],
+            "background": {**self.background, "radiation": self.radiation},
+            "seed": self.seed,
+        }
+
+
+def simulate(
+    ring: Ring,
+    causes: Sequence[Cause] = (),
+    *,
+    background: Mapping[str, float | None] | None = None,
+    shots: int = 6,
+    turns: int = 1,
+    amplitude: float = 1e-3,
+    noise: float | Sequence[float] = 2e-5,
+    engine: str = "at",
+    radiation: bool = False,
+    launch_sigma: Sequence[float] = LAUNCH_SIGMA,
+    kicks: float = 0.0,
+    settings: Sequence[Settings] = (),
+    seed: int = 0,
+    machine_seed: int | None = None,
+) -> Simulation:
+    """A machine with known causes, and the shots that measure it.
+
+    Args:
+        ring: the design.
+        causes: what is wrong with it.
+        background: small random errors: effect -> rms (None: the catalogue's own), or "all".
+        shots: how many.
+        turns: of each shot.
+        amplitude: rms orbit over monitors and planes, m.
+        noise: rms of one reading, m, one number or (x, y).
+        engine: "at" or "ocelot".
+        radiation: bends and wigglers radiate as expected.
+        launch_sigma: rms of x, px, y, py, delta about the nominal launch.
+        kicks: rms of random settings of all correctors, rad.
+        settings: of each shot.
+        seed: of launches, settings and noise.
+        machine_seed: of the background; else `seed`. The same machine measured twice has the same
+            one.
+
+    Raises:
+        EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
+    """
+    rms = background_rms(background or {})
+    small = draw_background(ring, rms, seed if machine_seed is None else machine_seed)
+    machine = Machine(ring, [*small, *causes], engine=engine, radiation=radiation, noise=noise)
+    drawn = draw_shots(
+        ring, shots, amplitude, sigma=launch_sigma, kicks=kicks, settings=settings, seed=seed
+    )
+    return Simulation(machine, drawn, tuple(causes), rms, turns, seed, radiation)
