@@ -8,14 +8,22 @@ step every earlier choice is held against its rivals again, with all the others 
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.model import Hypothesis
-from tmlattice.diagnosis.refine import Fit, Problem, fit, free_evidence
-from tmlattice.diagnosis.scan import FreeScan, Scan, look_elsewhere, scan, scan_kicks, scan_monitors
+from tmlattice.diagnosis.refine import Fit, Problem, fit
+from tmlattice.diagnosis.scan import (
+    FreeScan,
+    Scan,
+    free_threshold,
+    look_elsewhere,
+    scan,
+    scan_kicks,
+    scan_monitors,
+)
 from tmlattice.effects import Cause, find
 
 Array = NDArray[np.float64]
@@ -29,6 +37,9 @@ SHARES = {"named": 0.6, "kick": 0.2, "monitor": 0.1, "reading": 0.1}
 
 RIVALS = 24
 """Hypotheses that are refitted through the nonlinear model at a step."""
+
+SPIKES = 40
+"""Single readings left out at most."""
 
 SPIKE = -16.0
 """Log probability of one reading being wrong for once."""
@@ -56,29 +67,35 @@ class Detection:
     p_value: float
 
 
-@dataclass
+@dataclass(frozen=True)
+class Named:
+    """A cause with a name: how it was seen, and what was held against it, itself the first."""
+
+    detection: Detection
+    rivals: list[Rival]
+
+
+@dataclass(frozen=True)
 class Explanation:
     """What was found.
 
     Attributes:
         fit: all named causes, free kicks and launches together.
-        rivals: for each named cause the hypotheses that were held against it, itself included,
-            by falling evidence.
-        detections: of each named cause, each free kick (by layer) and each monitor set aside.
-        monitors: those set aside, with the log evidence that it cost.
-        spikes: readings left out, (shot, reading, plane).
-        dropped: the same as flags, with the monitors', [shot, reading, 2].
         before: launches alone.
-        scan: the last one, of what is left.
-        full: whether the search ended because no more causes were allowed.
+        named: of each cause of the fit, in their order.
+        kicks: how each free kick was seen, by layer.
+        monitors: those set aside because no named cause explains them.
+        spikes: readings left out, (shot, reading, plane).
+        dropped: all readings left out, [shot, reading, 2].
+        scan, left: the last ones, of what is left.
+        full: whether the search ended because no more findings were allowed.
     """
 
     fit: Fit
     before: Fit
-    rivals: list[list[Rival]]
-    detections: list[Detection]
-    kick_detections: dict[int, Detection]
-    monitors: dict[int, tuple[float, Detection]]
+    named: list[Named]
+    kicks: dict[int, Detection]
+    monitors: dict[int, Detection]
     spikes: list[tuple[int, int, int]]
     dropped: NDArray[np.bool_]
     scan: Scan
@@ -106,7 +123,7 @@ class _Search:
         self.progress = progress
         self.effective: float | None = None
         self.dropped = np.zeros(problem.data.valid.shape, dtype=bool)
-        self.monitors: dict[int, tuple[float, Detection]] = {}
+        self.monitors: dict[int, Detection] = {}
         self.spikes: list[tuple[int, int, int]] = []
         self.layers = list(range(len(problem.model.maps.layers)))
 
@@ -217,154 +234,176 @@ class _Search:
 
     # --- the search -----------------------------------------------------------------------------
     def run(self, before: Fit) -> Explanation:
-        state = before
-        rivals: list[list[Rival]] = []
-        detections: list[Detection] = []
-        kicks: dict[int, Detection] = {}
+        state = _State(before, [], {})
         steps = 0
         while True:
-            found = self.scan(state)
-            kick_scan = self.scan_kicks(state)
-            full = len(state.causes) + len(state.kicks) + len(self.monitors) >= self.most
-            steps += 1
-            if full or steps > 4 * self.most + 40:
-                break
-            options = self._options(state, found, kick_scan)
+            found = self.scan(state.fit)
+            kicks = self.scan_kicks(state.fit)
+            full = len(state.fit.causes) + len(state.fit.kicks) + len(self.monitors) >= self.most
+            options = (
+                [] if full or len(self.spikes) > 40 else self._options(state.fit, found, kicks)
+            )
             if not options:
                 break
-            kind, gain, place, detection, list_of_rivals = max(options, key=lambda o: o[1])
-            log.info("step %d: %s %s, evidence +%.1f", steps, kind, place, gain)
-            self.progress(f"{kind} {place if isinstance(place, str) else ''}".strip())
-            if kind == "reading":
-                self.spikes.append(place)
-                self.dropped[place] = True
-                state = self._again(state)
-            elif kind == "monitor":
-                count = len(self.problem.model.at)
-                self.monitors[place] = (gain, detection)
-                self.dropped[:, place::count] = True
-                state = self._again(state)
-            elif kind == "kick":
-                best = self._with_kick(state, kick_scan, place)
-                state = best
-                kicks[place] = detection
-            else:
-                assert list_of_rivals is not None
-                state = list_of_rivals[0].fit
-                rivals.append(list_of_rivals)
-                detections.append(detection)
-            if len(state.causes) + len(state.kicks) > 1:
-                state, rivals, detections, kicks = self._revise(state, rivals, detections, kicks)
+            steps += 1
+            best = max(options, key=lambda option: option.gain)
+            log.info("step %d: %s, log evidence +%.1f", steps, best.name, best.gain)
+            self.progress(best.name)
+            state = self._take(state, best, kicks)
+            if len(state.fit.causes) + len(state.fit.kicks) > 1:
+                state = self._revised(state)
         return Explanation(
-            state,
-            before,
-            rivals,
-            detections,
-            kicks,
-            self.monitors,
-            self.spikes,
-            self.dropped,
-            found,
-            kick_scan,
-            full,
+            fit=state.fit,
+            before=before,
+            named=state.named,
+            kicks=state.kicks,
+            monitors=self.monitors,
+            spikes=self.spikes,
+            dropped=self.dropped,
+            scan=found,
+            left=kicks,
+            full=full,
         )
 
-    def _options(self, state: Fit, found: Scan, kick_scan: FreeScan) -> list:  # type: ignore[type-arg]
-        """What could be done next, each with the evidence that it gains."""
+    def _options(self, state: Fit, found: Scan, kicks: FreeScan) -> list["_Option"]:
+        """What could be done next."""
         problem = self.problem
         options = []
-        best = int(found.statistic.argmax())
-        detection = Detection(
-            float(found.statistic[best]),
-            found.threshold(self.rate * SHARES["named"]),
-            found.p_value(float(found.statistic[best])),
-        )
-        if detection.p_value < self.rate * SHARES["named"]:
+        statistic = float(found.statistic.max())
+        rate = self.rate * SHARES["named"]
+        detection = Detection(statistic, found.threshold(rate), found.p_value(statistic))
+        if detection.p_value < rate:
             rivals = self.rivals(state, found)
-            rivals = [r for r in rivals if np.isfinite(r.fit.log_evidence)]
             if rivals and rivals[0].fit.chi2 < state.chi2:
                 gain = rivals[0].fit.log_evidence - state.log_evidence
-                options.append(("named", gain, rivals[0].hypothesis[0], detection, rivals))
-        for kind, free, count in (
-            ("kick", kick_scan, len(self.layers)),
-            ("monitor", self.scan_monitors(state), len(problem.model.at)),
+                name = " ".join(str(word) for word in rivals[0].hypothesis if word)
+                options.append(_Option("named", name, gain, detection, rivals=rivals))
+        layers, monitors = problem.model.maps.layers, problem.model.maps.monitors
+        for kind, free, names, taken in (
+            ("kick", kicks, layers, state.kicks),
+            ("monitor", self.scan_monitors(state), monitors, self.monitors),
         ):
             place = int(free.gain.argmax())
+            where = int(free.places[place])
             freedom = max(int(free.freedom[place]), 1)
-            statistic = float(free.statistic[place])
-            p_value = look_elsewhere(statistic, freedom, count)
-            index = int(free.places[place])
-            taken = index in state.kicks if kind == "kick" else index in self.monitors
-            gain = float(free.gain[place]) + problem.unknown_prior(count)
-            if p_value < self.rate * SHARES[kind] and not taken:
-                options.append((kind, gain, index, Detection(statistic, np.nan, p_value), None))
-        value, where, gain = self.spike(state)
-        p_value = look_elsewhere(value, 1, float(problem.data.valid.sum()))
-        if p_value < self.rate * SHARES["reading"]:
-            options.append(("reading", gain, where, Detection(value, np.nan, p_value), None))
+            seen = Detection(
+                float(free.statistic[place]),
+                free_threshold(self.rate * SHARES[kind], freedom, len(names)),
+                look_elsewhere(float(free.statistic[place]), freedom, len(names)),
+            )
+            gain = float(free.gain[place]) + problem.unknown_prior(len(names))
+            if seen.p_value < self.rate * SHARES[kind] and where not in taken:
+                options.append(_Option(kind, f"{kind} at {names[where]}", gain, seen, where=where))
+        value, reading, gain = self.spike(state)
+        count = float(problem.data.valid.sum())
+        rate = self.rate * SHARES["reading"]
+        seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
+        if seen.p_value < rate:
+            options.append(_Option("reading", f"reading {reading}", gain, seen, reading=reading))
         return options
+
+    def _take(self, state: "_State", option: "_Option", kicks: FreeScan) -> "_State":
+        if option.kind == "reading":
+            self.spikes.append(option.reading)
+            self.dropped[option.reading] = True
+            return state.with_fit(self._again(state.fit))
+        if option.kind == "monitor":
+            self.monitors[option.where] = option.detection
+            self.dropped[:, option.where :: len(self.problem.model.at)] = True
+            return state.with_fit(self._again(state.fit))
+        if option.kind == "kick":
+            seen = {**state.kicks, option.where: option.detection}
+            return _State(self._with_kick(state.fit, kicks, option.where), state.named, seen)
+        named = [*state.named, Named(option.detection, option.rivals)]
+        return _State(option.rivals[0].fit, named, state.kicks)
 
     def _again(self, state: Fit) -> Fit:
         """The same causes on the readings that are left."""
         self.problem = self.remake(self.dropped)
         return fit(self.problem, state.causes, state.launches, state.kicks)
 
-    def _with_kick(self, state: Fit, kick_scan: FreeScan, layer: int) -> Fit:
-        place = int(np.flatnonzero(kick_scan.places == layer)[0])
+    def _with_kick(self, state: Fit, found: FreeScan, layer: int) -> Fit:
+        place = int(np.flatnonzero(found.places == layer)[0])
         shots = np.flatnonzero(self.problem.data.active)
         kick = np.zeros((self.problem.data.shots, 2))
-        kick[shots] = kick_scan.amounts[place].reshape(-1, 2)
+        kick[shots] = found.amounts[place].reshape(-1, 2)
         return fit(self.problem, state.causes, state.launches, {**state.kicks, layer: kick})
 
-    def _revise(self, state, rivals, detections, kicks):  # type: ignore[no-untyped-def]
-        """Hold every choice against its rivals, all the others in place, until none changes."""
+    def _revised(self, state: "_State") -> "_State":
+        """Every choice held against its rivals, all the others in place, until none changes."""
         for _ in range(3):
-            changed = False
-            for layer in list(state.kicks):
-                others = {k: v for k, v in state.kicks.items() if k != layer}
-                without = fit(self.problem, state.causes, state.launches, others)
-                found = self.scan(without)
-                options = self.rivals(without, found, 8)
-                if without.log_evidence > state.log_evidence:
-                    state = without
-                    kicks = {k: v for k, v in kicks.items() if k != layer}
-                    changed = True
-                elif options and options[0].fit.log_evidence > state.log_evidence:
-                    state = options[0].fit
-                    rivals = [*rivals, options]
-                    detections = [*detections, kicks[layer]]
-                    kicks = {k: v for k, v in kicks.items() if k != layer}
-                    changed = True
-            for k in range(len(state.causes)):
-                own = state.causes[k]
-                rest = (*state.causes[:k], *state.causes[k + 1 :])
-                without = fit(self.problem, rest, state.launches, state.kicks)
-                if without.log_evidence > state.log_evidence:  # the others explain it
-                    state = without
-                    rivals = [*rivals[:k], *rivals[k + 1 :]]
-                    detections = [*detections[:k], *detections[k + 1 :]]
-                    changed = True
-                    break
-                options = self.rivals(without, self.scan(without), 12)
-                if not options:
-                    continue
-                best = options[0]
-                state_was = state.log_evidence
-                if best.fit.log_evidence > state_was + 1e-3 or best.hypothesis == (
-                    own.effect,
-                    own.element,
-                ):
-                    state = best.fit
-                    rivals = [*rivals[:k], *rivals[k + 1 :], options]
-                    detections = [*detections[:k], *detections[k + 1 :], detections[k]]
-                    if best.hypothesis != (own.effect, own.element):
-                        changed = True
-                    break_needed = k + 1 < len(state.causes)
-                    if break_needed:
-                        continue
-            if not changed:
+            names = {(c.effect, c.element) for c in state.fit.causes}
+            layers = set(state.fit.kicks)
+            for layer in list(state.fit.kicks):
+                state = self._without_kick(state, layer)
+            for cause in state.fit.causes:
+                state = self._rechosen(state, (cause.effect, cause.element))
+            if names == {(c.effect, c.element) for c in state.fit.causes} and layers == set(
+                state.fit.kicks
+            ):
                 break
-        return state, rivals, detections, kicks
+        return state
+
+    def _without_kick(self, state: "_State", layer: int) -> "_State":
+        """A free kick gives way to a named cause, or to none, where that explains more."""
+        others = {k: v for k, v in state.fit.kicks.items() if k != layer}
+        seen = {k: v for k, v in state.kicks.items() if k != layer}
+        without = fit(self.problem, state.fit.causes, state.fit.launches, others)
+        if without.log_evidence > state.fit.log_evidence:
+            return _State(without, state.named, seen)
+        rivals = self.rivals(without, self.scan(without), 8)
+        if rivals and rivals[0].fit.log_evidence > state.fit.log_evidence:
+            named = [*state.named, Named(state.kicks[layer], rivals)]
+            return _State(rivals[0].fit, named, seen)
+        return state
+
+    def _rechosen(self, state: "_State", hypothesis: Hypothesis) -> "_State":
+        """A named cause gives way to a better one, or to none; its rivals are weighed anew."""
+        own = [i for i, c in enumerate(state.fit.causes) if (c.effect, c.element) == hypothesis]
+        if not own:
+            return state
+        k = own[0]
+        rest = (*state.fit.causes[:k], *state.fit.causes[k + 1 :])
+        named = [*state.named[:k], *state.named[k + 1 :]]
+        without = fit(self.problem, rest, state.fit.launches, state.fit.kicks)
+        if without.log_evidence > state.fit.log_evidence:
+            return _State(without, named, state.kicks)
+        rivals = self.rivals(without, self.scan(without), 12)
+        if hypothesis not in [rival.hypothesis for rival in rivals]:
+            kept = fit(
+                self.problem,
+                (*rest, state.fit.causes[k]),
+                state.fit.launches,
+                state.fit.kicks,
+            )
+            rivals = sorted(
+                [*rivals, Rival(hypothesis, kept)], key=lambda rival: -rival.fit.log_evidence
+            )
+        named.append(Named(state.named[k].detection, rivals))
+        return _State(rivals[0].fit, named, state.kicks)
+
+
+@dataclass(frozen=True)
+class _Option:
+    kind: str
+    name: str
+    gain: float
+    detection: Detection
+    where: int = -1
+    reading: tuple[int, int, int] = (-1, -1, -1)
+    rivals: list[Rival] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _State:
+    """A fit, and how its causes and kicks were found: `named` in the order of the fit's causes."""
+
+    fit: Fit
+    named: list[Named]
+    kicks: dict[int, Detection]
+
+    def with_fit(self, fit_: Fit) -> "_State":
+        return _State(fit_, self.named, self.kicks)
 
 
 def explain(
@@ -391,6 +430,3 @@ def explain(
         progress: told what was found.
     """
     return _Search(problem, hypotheses, most, rate, seed, remake, progress).run(before)
-
-
-replace, free_evidence  # noqa: B018

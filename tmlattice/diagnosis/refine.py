@@ -36,12 +36,14 @@ class Problem:
         data: readings.
         whitening: their noise.
         places: number of places of each effect, for the prior.
+        fixed: causes that are there and are not fitted.
     """
 
     model: Model
     data: Data
     whitening: Whitening
     places: Mapping[str, int]
+    fixed: tuple[Cause, ...] = ()
 
     def prior(self, hypothesis: Hypothesis) -> float:
         """Log probability of one effect at one place, before the data."""
@@ -144,7 +146,7 @@ def fit(
 
 
 def _evaluate(problem: Problem, causes: tuple[Cause, ...], kicks: Kicks, launches: Array) -> Fit:
-    paths = problem.model.paths(launches, causes, kicks)
+    paths = problem.model.paths(launches, (*problem.fixed, *causes), kicks)
     difference = np.where(problem.data.valid, problem.data.readings - paths.readings, 0.0)
     residual = problem.whitening.residual(difference, launches)
     finite = np.isfinite(residual).all()
@@ -179,7 +181,12 @@ def _slopes(problem: Problem, state: Fit) -> Array:
         ends = [
             model.readings(
                 state.launches,
-                [*state.causes[:i], replace(cause, amount=a), *state.causes[i + 1 :]],
+                [
+                    *problem.fixed,
+                    *state.causes[:i],
+                    replace(cause, amount=a),
+                    *state.causes[i + 1 :],
+                ],
                 state.kicks,
             )
             for a in amounts

@@ -52,13 +52,17 @@ class Scan:
 
     def threshold(self, rate: float) -> float:
         """The statistic that pure noise reaches in this share of data sets."""
-        single = -np.expm1(np.log1p(-rate) / self.effective)
-        return float(stats.chi2.isf(single, 1))
+        return free_threshold(rate, 1, self.effective)
 
 
 def look_elsewhere(statistic: float, freedom: int, effective: float) -> float:
     """Chance that the largest of `effective` chi-squares of so many degrees reaches this."""
     return float(-np.expm1(effective * np.log1p(-stats.chi2.sf(statistic, freedom))))
+
+
+def free_threshold(rate: float, freedom: int, effective: float) -> float:
+    """The chi-square of so many degrees that the largest of `effective` reaches at this rate."""
+    return float(stats.chi2.isf(-np.expm1(np.log1p(-rate) / effective), freedom))
 
 
 def effective_number(largest: Array, freedom: int) -> float:

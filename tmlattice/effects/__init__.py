@@ -41,6 +41,7 @@ from tmlattice.effects.effect import (
     register,
 )
 from tmlattice.effects.radiation import expected_loss
+from tmlattice.effects.sizes import background_rms
 
 __all__ = [
     "CATALOGUE",
@@ -53,6 +54,7 @@ __all__ = [
     "RingEffect",
     "Settings",
     "apply",
+    "background_rms",
     "beams",
     "changed_elements",
     "check",

@@ -7,7 +7,7 @@
 """
 
 from tmlattice.machine.machine import ENGINES, Machine
-from tmlattice.machine.shots import Shots, background_rms, draw_background, draw_shots
+from tmlattice.machine.shots import Shots, draw_background, draw_shots
 from tmlattice.machine.simulate import Simulation, simulate
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "Machine",
     "Shots",
     "Simulation",
-    "background_rms",
     "draw_background",
     "draw_shots",
     "simulate",

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects import CATALOGUE, Cause, Settings, find
-from tmlattice.errors import EffectError, TmlatticeError
+from tmlattice.effects import Cause, Settings, find
+from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.network import TaylorNetwork
 from tmlattice.optics import one_turn_optics
@@ -116,37 +116,6 @@ def _draw_settings(
             for name, kick in zip(correctors, row, strict=True):
                 setting.setdefault(name, {"kick": kick})
     return tuple(own)
-
-
-def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
-    """The rms of each background effect.
-
-    Args:
-        wanted: effect -> rms, or None for the catalogue's own; "all" -> a scale of the
-            catalogue's (None: 1) for every effect that has one. Named effects win over "all".
-
-    Raises:
-        EffectError: an effect that has no background, or a negative rms.
-    """
-    wanted = dict(wanted)
-    chosen: dict[str, float] = {}
-    if "all" in wanted:
-        scale = wanted.pop("all")
-        scale = 1.0 if scale is None else scale
-        chosen = {
-            name: scale * effect.background
-            for name, effect in CATALOGUE.items()
-            if effect.background is not None
-        }
-    for name, rms in wanted.items():
-        effect = find(name)
-        rms = effect.background if rms is None else rms  # noqa: PLW2901
-        if rms is None:
-            raise EffectError(f"{effect.name} has no usual size; say {effect.name}=RMS")
-        chosen[effect.name] = rms
-    if any(not 0 <= rms < np.inf for rms in chosen.values()):
-        raise EffectError("a background's rms is zero or more")
-    return {name: rms for name, rms in chosen.items() if rms}
 
 
 def draw_background(ring: Ring, rms: Mapping[str, float], seed: int = 0) -> list[Cause]:

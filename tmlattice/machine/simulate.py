@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
-from tmlattice.effects import Cause, Settings
+from tmlattice.effects import Cause, Settings, background_rms
 from tmlattice.lattice import Ring
 from tmlattice.machine.machine import Machine
 from tmlattice.machine.shots import (
     LAUNCH_SIGMA,
     Shots,
-    background_rms,
     draw_background,
     draw_shots,
 )
@@ -47,12 +46,15 @@ class Simulation:
         readings = [
             reading for _, reading in self.machine.measure(self.shots, self.turns, self.seed)
         ]
-        noise = self.machine.noise
+        names = tuple(monitor.name for monitor in self.machine.ring.monitors)
+        noise = np.tile(self.machine.noise, (len(names), 1))
         return Measurement(
             launches=self.shots.nominal,
             readings=np.stack(readings),
-            monitors=tuple(monitor.name for monitor in self.machine.ring.monitors),
-            noise=(float(noise[0]), float(noise[1])) if (noise > 0).all() else None,
+            monitors=names,
+            noise=np.tile(noise, (len(self.machine.ring.monitors), 1))
+            if (noise > 0).all()
+            else None,
             launch_sigma=np.tile(self.shots.sigma, (len(self.shots), 1)),
             settings=self.shots.settings,
             lattice=self.machine.ring.name,

@@ -1,0 +1,11 @@
+"""Where the gap between model and machine lies, which effect causes it, how far it shrinks.
+
+>>> diagnosis = diagnose(ring, read_measurement("day_1"))
+>>> diagnosis.verdict
+'named'
+>>> diagnosis.as_json()["findings"][0]["element"]
+"""
+
+from tmlattice.diagnosis.diagnose import Diagnosis, Finding, Member, diagnose
+
+__all__ = ["Diagnosis", "Finding", "Member", "diagnose"]

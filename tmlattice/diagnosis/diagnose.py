@@ -1,0 +1,678 @@
+"""The diagnosis of a measurement: where the gap lies, which effect causes it, how far it shrinks.
+
+>>> diagnosis = diagnose(load_ring("petra3"), read_measurement("day_1"))
+>>> diagnosis.verdict, diagnosis.findings[0].effect, diagnosis.findings[0].element
+>>> diagnosis.gap["closed"]                     # on shots that the fit never saw
+"""
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from tmlattice.diagnosis.data import Data, joined, of_measurement
+from tmlattice.diagnosis.explain import FALSE_ALARM, Detection, Explanation, Rival, explain
+from tmlattice.diagnosis.gap import Gap, Misfit, held_out_gap, misfit
+from tmlattice.diagnosis.model import Hypothesis, Model
+from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
+from tmlattice.diagnosis.noise import estimate, local_misfit
+from tmlattice.diagnosis.refine import Fit, Problem, fit
+from tmlattice.diagnosis.scan import look_elsewhere
+from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
+from tmlattice.errors import MeasurementError, TmlatticeError, UnstableRingError
+from tmlattice.lattice import Element, Ring
+from tmlattice.maps.magnets import ring_matrix
+from tmlattice.measurement import Measurement
+from tmlattice.optics import matrix_tunes
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+MASS = 0.95
+"""Probability that a credible set is to hold."""
+
+VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
+
+SILENT_SHARE = 0.2
+"""Where more monitors than this have no signal, they are not there: no finding each."""
+
+ALIEN = 0.35
+"""A local misfit above this share of the orbit: the data are of another ring."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """One explanation in a credible set."""
+
+    effect: str
+    element: str | None
+    s: float | None
+    probability: float
+    amount: float
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong.
+
+    Attributes:
+        effect, element: None where something is there and the catalogue does not explain it, and
+            (the element) for the beam and for effects of all elements of a kind.
+        s: middle of the element, m from the start of the sequence.
+        amount, amount_sigma: in the effect's unit.
+        unit: of the amount.
+        probability: of this effect at this element, given that one of the catalogue is there.
+        detection: how clearly it was seen.
+        where: from the last monitor before to the first one behind all members of the set, m.
+        near: the names of those monitors.
+        credible_set: explanations that the data do not exclude, the first is this finding.
+        mass: the sum of their probabilities.
+    """
+
+    effect: str | None
+    element: str | None
+    s: float | None
+    amount: float | None
+    amount_sigma: float | None
+    unit: str | None
+    probability: float
+    detection: Detection
+    where: tuple[float, float] | None
+    near: tuple[str, ...]
+    credible_set: tuple[Member, ...]
+    mass: float
+
+    @property
+    def verdict(self) -> str:
+        """Of this finding alone."""
+        if self.effect is None:
+            return "located"
+        return "named" if len(self.credible_set) == 1 else "equivalent"
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        found = self.detection
+        where = None
+        if self.where is not None:
+            where = {"s_from": self.where[0], "s_to": self.where[1]}
+        return {
+            "effect": self.effect,
+            "element": self.element,
+            "s": self.s,
+            "amount": self.amount,
+            "amount_sigma": self.amount_sigma,
+            "unit": self.unit,
+            "probability": self.probability,
+            "detection": {
+                "statistic": found.statistic,
+                "threshold": found.threshold,
+                "p_value": found.p_value,
+            },
+            "where": where,
+            "near": list(self.near),
+            "credible_set": [member.as_json() for member in self.credible_set],
+            "mass": self.mass,
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a measurement says of a ring. See `as_json` for the file format.
+
+    Attributes:
+        verdict: the least certain of the findings', see `VERDICTS`.
+        findings: by falling statistic.
+        fit_before, fit_after: misfit of the shots of the fit.
+        heldout: of the held-out shots, before, each finding added, after; or None.
+        heldout_shots: their ids.
+        unexplained: p-value of what is left, and where it sits.
+        tunes: fractions of Qx, Qy of the design and of the ring with the causes; None: unstable.
+        next: the shot that would tell the likeliest rivals apart, or None.
+        sensitivity: by effect, the amount that would be seen at half of its places.
+        warnings: what a reader should know.
+        noise: rms of a reading, m, (x, y).
+        noise_estimated: whether it comes from the data.
+        provenance: package, lattice, options, seed, seconds.
+        ring: the design.
+        repaired: the ring with the named causes in it.
+        explanation, data, model: the search, for plots.
+    """
+
+    verdict: str
+    findings: tuple[Finding, ...]
+    fit_before: Misfit
+    fit_after: Misfit
+    heldout: Gap | None
+    heldout_shots: tuple[int, ...]
+    unexplained: dict[str, Any]
+    tunes: dict[str, list[float] | None]
+    next: NextMeasurement | None
+    sensitivity: dict[str, float]
+    warnings: tuple[str, ...]
+    noise: tuple[float, float]
+    noise_estimated: bool
+    provenance: dict[str, Any]
+    ring: Ring = field(repr=False)
+    repaired: Ring = field(repr=False)
+    causes: tuple[Cause, ...]
+    explanation: Explanation = field(repr=False)
+    data: Data = field(repr=False)
+    model: Model = field(repr=False)
+
+    @property
+    def gap(self) -> dict[str, Any]:
+        """Before and after on the fit's shots and on the held-out ones."""
+
+        def both(before: Misfit, after: Misfit) -> dict[str, Any]:
+            return {"before": dict(vars(before)), "after": dict(vars(after))}
+
+        gap = self.heldout
+        heldout = None
+        if gap is not None:
+            heldout = {
+                **both(gap.misfits[0], gap.misfits[-1]),
+                "shots": list(self.heldout_shots),
+                "monitors": "odd",
+                "steps": [dict(vars(m)) for m in gap.misfits],
+            }
+        interval = None if gap is None or gap.interval is None else list(gap.interval)
+        return {
+            "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
+            "fit": both(self.fit_before, self.fit_after),
+            "heldout": heldout,
+            "closed": None if gap is None else gap.closed,
+            "closed_interval": interval,
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """The result in the format `tmlattice-diagnosis`, version 1 (see `schemas/`)."""
+        from tmlattice import __version__
+
+        return {
+            "format": "tmlattice-diagnosis",
+            "version": 1,
+            "package": __version__,
+            "verdict": self.verdict,
+            "findings": [finding.as_json() for finding in self.findings],
+            "gap": self.gap,
+            "unexplained": self.unexplained,
+            "tunes": self.tunes,
+            "next_measurement": None if self.next is None else self.next.as_json(),
+            "sensitivity": self.sensitivity,
+            "warnings": list(self.warnings),
+            "provenance": self.provenance,
+        }
+
+
+def diagnose(
+    ring: Ring,
+    measurement: Measurement,
+    *,
+    reference: Measurement | None = None,
+    background: Mapping[str, float | None] | None = None,
+    holdout: float = 0.33,
+    heldout: Measurement | None = None,
+    effects: Sequence[str] | None = None,
+    max_effects: int = 8,
+    radiation: bool = False,
+    false_alarm: float = FALSE_ALARM,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Where the gap between a ring and its measurement lies, what causes it, how far it shrinks.
+
+    Args:
+        ring: the design.
+        measurement: first turns, or a few turns, of one or more shots.
+        reference: of the same machine before the fault: static errors cancel.
+        background: small errors that the machine has everywhere, rms by effect (None: the
+            catalogue's own; "all": every usual one). With a reference and no background given,
+            every usual one.
+        holdout: share of the shots that the fit does not see, for the gap.
+        heldout: those shots themselves, instead of a share.
+        effects: names of those that may be the cause; else the whole catalogue.
+        max_effects: findings at most.
+        radiation: the model radiates as expected.
+        false_alarm: share of faultless data sets in which something may be found.
+        seed: of the split, the threshold's simulation and the bootstrap.
+        progress: told what is being done.
+
+    Raises:
+        MeasurementError: data that cannot be used, or that are of another lattice.
+        UnknownNameError: a monitor or an effect that does not exist.
+    """
+    begun = time.perf_counter()
+    options = {
+        "reference": reference is not None,
+        "background": dict(background or {}),
+        "holdout": holdout,
+        "effects": None if effects is None else list(effects),
+        "max_effects": max_effects,
+        "radiation": radiation,
+        "false_alarm": false_alarm,
+    }
+    chosen = [name for name in names(effects) if name != "monitor_dead"]
+    warnings: list[str] = []
+    if heldout is None:
+        measurement, heldout = measurement.split(holdout, seed)
+        if heldout is None and holdout > 0:
+            warnings.append("one shot: none is held out, so nobody judges the gap")
+    known = [Cause(f"radiation_loss_{k}", None, 1.0) for k in ("bends", "wigglers") if radiation]
+    known = [cause for cause in known if find(cause.effect).places(ring)]
+
+    data = of_measurement(ring, measurement)
+    if reference is not None:
+        before_fault = of_measurement(ring, reference, reference=True)
+        data = joined(before_fault, data)
+        background = {"all": None} if background is None else background
+    progress("model")
+    model = Model(ring, data.settings, data.turns, known, active=data.active)
+    listed = {name.casefold() for name in measurement.monitors}
+    dead, data = _dead_monitors(model, data, listed, warnings)
+    rough = data.with_sigma(np.array([1e-4, 1e-4]))
+    places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
+    start = fit(Problem(model, rough, Whitening(rough), places), (), data.launches)
+    data, noise, estimated = _with_noise(data, start, warnings)
+    _check_lattice(ring, data, start)
+
+    rms = background_rms(background or {})
+    spread = None
+
+    def problem_without(dropped: NDArray[np.bool_]) -> Problem:
+        kept = data.without(dropped)
+        return Problem(model, kept, Whitening(kept, spread), places)
+
+    nobody = np.zeros(data.valid.shape, dtype=bool)
+    before = fit(problem_without(nobody), (), start.launches)
+    if rms:
+        progress("background")
+        spread = _background_signatures(model, before, rms)
+        before = fit(problem_without(nobody), (), before.launches)
+    progress("scan")
+    hypotheses = model.hypotheses(chosen)
+    if (data.launch_sigma[:, 4] > 0).any():  # the energy of every shot is free
+        hypotheses = [h for h in hypotheses if h[0] != "energy_offset"]
+    explanation = explain(
+        problem_without(nobody),
+        hypotheses,
+        before,
+        problem_without,
+        most=max_effects,
+        rate=false_alarm,
+        seed=seed,
+        progress=progress,
+    )
+    progress("report")
+    result = explanation.fit
+    causes = result.causes
+    findings = _findings(ring, model, explanation, dead)
+    kept = data.without(explanation.dropped)
+    freedom = _freedom(kept, result)
+    p_value = float(stats.chi2.sf(result.chi2, freedom))
+    verdict, findings = _verdict(explanation, findings, p_value, estimated, warnings)
+    if verdict == "distributed":
+        causes = ()
+    gap = None
+    if heldout is not None:
+        other = of_measurement(ring, heldout).with_sigma(np.array(noise))
+        other = _same_monitors(other, data, explanation)
+        held = Model(ring, other.settings, other.turns, known)
+        steps = [causes[:i] for i in range(len(causes) + 1)]
+        gap = held_out_gap(held, other, steps, seed)
+    repaired = apply(ring, causes)
+    shown = result if causes == result.causes else before
+    active = data.active[:, None, None]
+    residuals = [
+        np.where(kept.valid & active, kept.readings - f.paths.readings, np.nan)
+        for f in (before, shown)
+    ]
+    _say_about_shots(data, findings, warnings)
+    return Diagnosis(
+        verdict=verdict,
+        findings=findings,
+        fit_before=misfit(residuals[0], kept.sigma),
+        fit_after=misfit(residuals[1], kept.sigma),
+        heldout=gap,
+        heldout_shots=() if heldout is None else heldout.shots,
+        unexplained=_unexplained(model, explanation, p_value),
+        tunes={"before": _tunes(ring), "after": _tunes(repaired)},
+        next=_next(ring, data, explanation, known, seed),
+        sensitivity=_sensitivity(explanation),
+        warnings=tuple(dict.fromkeys(warnings)),
+        noise=noise,
+        noise_estimated=estimated,
+        provenance={
+            "package": _version(),
+            "lattice": ring.name,
+            "measurement": measurement.lattice,
+            "options": options,
+            "seed": seed,
+            "seconds": time.perf_counter() - begun,
+        },
+        ring=ring,
+        repaired=repaired,
+        causes=causes,
+        explanation=explanation,
+        data=data,
+        model=model,
+    )
+
+
+def _version() -> str:
+    from tmlattice import __version__
+
+    return __version__
+
+
+# --- before the search ------------------------------------------------------------------------------
+def _dead_monitors(
+    model: Model, data: Data, listed: set[str], warnings: list[str]
+) -> tuple[list[tuple[int, float]], Data]:
+    """Monitors without a signal (1) or with a frozen one (2), and the data without the latter."""
+    count = len(model.at)
+    readings = data.readings.reshape(-1, count, 2)
+    valid = data.valid.reshape(-1, count, 2)
+    silent, frozen, half = [], [], []
+    for m, name in enumerate(model.maps.monitors):
+        there = valid[:, m]
+        if not there.any():
+            if name.casefold() in listed:
+                silent.append(m)
+        elif not there.any(axis=0).all():
+            half.append(name)
+        elif there.sum() >= 4:
+            values = [readings[there[:, plane], m, plane] for plane in (0, 1)]
+            if all(len(v) > 1 and np.ptp(v) == 0 for v in values):
+                frozen.append(m)
+    absent = sum(1 for name in model.maps.monitors if name.casefold() not in listed)
+    if absent:
+        warnings.append(f"{absent} of the ring's {count} monitors are not in the measurement")
+    if half:
+        some = ", ".join(half[:3]) + (", ..." if len(half) > 3 else "")
+        warnings.append(f"{len(half)} monitors read one plane only: {some}")
+    if len(silent) > SILENT_SHARE * count:
+        warnings.append(f"{len(silent)} monitors have no signal; they count as not there")
+        silent = []
+    dropped = np.zeros(data.valid.shape, dtype=bool)
+    for m in frozen:
+        dropped[:, m::count] = True
+    return [(m, 1.0) for m in silent] + [(m, 2.0) for m in frozen], data.without(dropped)
+
+
+def _with_noise(
+    data: Data, start: Fit, warnings: list[str]
+) -> tuple[Data, tuple[float, float], bool]:
+    missing = ~np.isfinite(data.sigma) & data.valid
+    if (data.sigma[data.valid & ~missing] <= 0).any():
+        raise MeasurementError("a monitor's noise is zero or negative; leave it out if unknown")
+    estimated = bool(missing.any())
+    if estimated:
+        found = estimate(data, start.paths)
+        if not np.isfinite(found).any():
+            raise MeasurementError(
+                "the noise is not given and the readings are too few to estimate it; give the "
+                "noise of a reading"
+            )
+        found = np.where(np.isfinite(found), found, np.nanmean(found))
+        warnings.append(
+            f"the noise was estimated from the data: {1e6 * found[0]:.1f} µm in x, "
+            f"{1e6 * found[1]:.1f} µm in y"
+        )
+        data = data.with_sigma(found)
+    data = data.with_sigma(np.ones(2))  # where nothing was read
+    planes = [
+        float(np.sqrt(np.mean(data.sigma[..., p][data.valid[..., p]] ** 2)))
+        if data.valid[..., p].any()
+        else float("nan")
+        for p in (0, 1)
+    ]
+    return data, (planes[0], planes[1]), estimated
+
+
+def _check_lattice(ring: Ring, data: Data, start: Fit) -> None:
+    """A few errors leave most monitors in agreement with their neighbours."""
+    local = local_misfit(data, start.paths)
+    if not np.isfinite(local).sum() > 50:
+        return
+    size = float(np.median(np.abs(local[np.isfinite(local)])))
+    orbit = float(np.median(np.abs(data.readings[data.valid])))
+    noise = float(np.median(data.sigma[data.valid]))
+    if size > max(ALIEN * orbit, 5 * noise):
+        raise MeasurementError(
+            f"the readings do not follow from '{ring.name}': even between neighbouring monitors "
+            f"the model errs by {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} µm; name "
+            "the lattice of this machine, and check units and the names of the monitors"
+        )
+
+
+def _background_signatures(model: Model, before: Fit, rms: Mapping[str, float]) -> Array:
+    """tau_h s_h of every background error, also in a reference: it is the same machine."""
+    parts = []
+    for name, size in rms.items():
+        hypotheses = model.hypotheses([name])
+        if hypotheses:
+            rows = model.signatures(before.paths, hypotheses, before.launches)
+            parts.append(size * np.nan_to_num(rows))
+    return np.concatenate(parts) if parts else np.zeros((0, *before.paths.readings.shape))
+
+
+# --- after the search -------------------------------------------------------------------------------
+def _freedom(data: Data, result: Fit) -> int:
+    """Degrees of freedom: readings and priors, less what was fitted."""
+    free = data.launch_sigma > 0
+    priors = int((free & np.isfinite(data.launch_sigma)).sum())
+    amounts = sum(not find(cause.effect).discrete for cause in result.causes)
+    kicks = 2 * int(data.active.sum()) * len(result.kicks)
+    return max(int(data.valid.sum()) + priors - int(free.sum()) - amounts - kicks, 1)
+
+
+def _credible(rivals: Sequence[Rival]) -> tuple[list[Rival], Array]:
+    """The likeliest rivals that hold the mass, and the probabilities of all."""
+    evidence = np.array([rival.fit.log_evidence for rival in rivals])
+    probability = np.exp(evidence - evidence.max())
+    probability /= probability.sum()
+    size = int(np.searchsorted(np.cumsum(probability), MASS)) + 1
+    return list(rivals[:size]), probability
+
+
+def _middle(ring: Ring, name: str | None) -> float | None:
+    return next((e.s for e in ring.elements if e.name == name), None)
+
+
+def _family_span(ring: Ring, hypothesis: Hypothesis) -> list[float]:
+    """Positions of all elements that a hypothesis touches, m."""
+    place = _middle(ring, hypothesis[1])
+    if place is not None:
+        return [place]
+    return [e.s for e in ring.elements if hypothesis[1] is not None and e.family == hypothesis[1]]
+
+
+def _between(ring: Ring, positions: Sequence[float]) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """From the last monitor before to the first one behind, m, and their names."""
+    s = np.array([monitor.s for monitor in ring.monitors])
+    low, high = min(positions), max(positions)
+    before = int(np.searchsorted(s, low, side="left")) - 1
+    behind = int(np.searchsorted(s, high, side="right"))
+    start = float(s[before]) if before >= 0 else 0.0
+    end = float(s[behind]) if behind < len(s) else ring.length
+    near = [ring.monitors[i].name for i in (before, behind) if 0 <= i < len(s)]
+    return (start, end), tuple(near)
+
+
+def _findings(
+    ring: Ring, model: Model, explanation: Explanation, dead: Sequence[tuple[int, float]]
+) -> list[Finding]:
+    result = explanation.fit
+    findings = []
+    for k, (cause, named) in enumerate(zip(result.causes, explanation.named, strict=True)):
+        members, probability = _credible(named.rivals)
+        positions = [s for m in members for s in _family_span(ring, m.hypothesis)]
+        where, near = _between(ring, positions) if positions else (None, ())
+        findings.append(
+            Finding(
+                effect=cause.effect,
+                element=cause.element,
+                s=_middle(ring, cause.element),
+                amount=cause.amount,
+                amount_sigma=float(np.sqrt(max(result.covariance[k, k], 0.0))),
+                unit=find(cause.effect).unit,
+                probability=float(probability[0]),
+                detection=named.detection,
+                where=where,
+                near=near,
+                credible_set=tuple(
+                    Member(*m.hypothesis, _middle(ring, m.hypothesis[1]), float(p), m.cause.amount)
+                    for m, p in zip(members, probability, strict=False)
+                ),
+                mass=float(probability[: len(members)].sum()),
+            )
+        )
+    for layer, detection in explanation.kicks.items():
+        magnet = ring.magnets[layer]
+        findings.append(_located(ring, magnet, detection))
+    for m, detection in explanation.monitors.items():
+        findings.append(_located(ring, ring.monitors[m], detection))
+    for m, amount in dead:
+        monitor = ring.monitors[m]
+        where, near = _between(ring, [monitor.s])
+        member = Member("monitor_dead", monitor.name, monitor.s, 1.0, amount)
+        findings.append(
+            Finding(
+                "monitor_dead",
+                monitor.name,
+                monitor.s,
+                amount,
+                0.0,
+                "discrete",
+                1.0,
+                Detection(float("inf"), float("nan"), 0.0),
+                where,
+                near,
+                (member,),
+                1.0,
+            )  # fmt: skip
+        )
+    findings.sort(key=lambda f: -f.detection.statistic)
+    return findings
+
+
+def _located(ring: Ring, element: Element, detection: Detection) -> Finding:
+    where, near = _between(ring, [element.s])
+    return Finding(
+        effect=None,
+        element=None,
+        s=element.s,
+        amount=None,
+        amount_sigma=None,
+        unit=None,
+        probability=1.0,
+        detection=detection,
+        where=where,
+        near=tuple(dict.fromkeys((*near[:1], element.name, *near[1:]))),
+        credible_set=(),
+        mass=0.0,
+    )
+
+
+def _verdict(
+    explanation: Explanation,
+    findings: Sequence[Finding],
+    p_value: float,
+    estimated: bool,
+    warnings: list[str],
+) -> tuple[str, tuple[Finding, ...]]:
+    """The least certain of the findings', and the findings that stand."""
+    found = explanation.scan
+    left = float(found.statistic.max()) if len(found.statistic) else 0.0
+    significant = found.p_value(left) < FALSE_ALARM
+    if explanation.full and significant:
+        warnings.append(
+            f"{len(findings)} findings do not explain the data: small errors everywhere; say "
+            "background=, or give a reference from before the fault"
+        )
+        return "distributed", ()
+    if not findings:
+        if p_value < 1e-6 and not estimated:
+            return "distributed", ()
+        return "nothing", ()
+    worst = max(findings, key=lambda f: VERDICTS.index(f.verdict)).verdict
+    if p_value < 1e-4 and not estimated:
+        warnings.append("what is left is more than the noise: see 'unexplained'")
+    return worst, tuple(findings)
+
+
+def _same_monitors(other: Data, data: Data, explanation: Explanation) -> Data:
+    """Held-out readings of the monitors that the fit kept."""
+    never = explanation.dropped[data.active].all(axis=0) | ~data.valid[data.active].any(axis=0)
+    readings = min(len(never), other.valid.shape[1])
+    dropped = np.zeros(other.valid.shape, dtype=bool)
+    dropped[:, :readings] = never[None, :readings]
+    return other.without(dropped)
+
+
+def _unexplained(model: Model, explanation: Explanation, p_value: float) -> dict[str, Any]:
+    """Whether what is left is noise, and where it sits if not."""
+    left = explanation.left
+    places = []
+    s = [model.ring.magnets[int(k)].s for k in left.places]
+    taken: list[float] = []
+    for i in np.argsort(-left.gain)[:200]:
+        statistic, freedom = float(left.statistic[i]), max(int(left.freedom[i]), 1)
+        if len(places) == 3 or look_elsewhere(statistic, freedom, len(s)) > FALSE_ALARM:
+            break
+        (start, end), _ = _between(model.ring, [s[i]])
+        if start not in taken:
+            taken.append(start)
+            places.append({"s_from": start, "s_to": end, "statistic": statistic})
+    return {"p_value": p_value, "places": places}
+
+
+def _tunes(ring: Ring) -> list[float] | None:
+    try:
+        return [float(q) for q in matrix_tunes(ring_matrix(ring))]
+    except (UnstableRingError, np.linalg.LinAlgError):
+        return None
+
+
+def _next(
+    ring: Ring, data: Data, explanation: Explanation, known: Sequence[Cause], seed: int
+) -> NextMeasurement | None:
+    for named in explanation.named:
+        members, _ = _credible(named.rivals)
+        if len(members) > 1:
+            try:
+                return next_measurement(ring, data, members[0], members[1], known, seed)
+            except TmlatticeError:
+                log.warning("no next measurement could be found", exc_info=True)
+    return None
+
+
+def _sensitivity(explanation: Explanation) -> dict[str, float]:
+    """By effect, the amount that reaches the threshold at half of the places where it is seen."""
+    found = explanation.scan
+    threshold = found.threshold(FALSE_ALARM)
+    amounts: dict[str, list[float]] = {}
+    for (name, _), information in zip(found.hypotheses, found.information, strict=True):
+        if information > 0 and not CATALOGUE[name].discrete:
+            least = np.sqrt(threshold / information) ** (1 / CATALOGUE[name].power)
+            amounts.setdefault(name, []).append(float(least))
+    return {name: float(np.median(values)) for name, values in amounts.items()}
+
+
+def _say_about_shots(data: Data, findings: Sequence[Finding], warnings: list[str]) -> None:
+    shots = int(data.active.sum())
+    if shots == 1 and findings:
+        warnings.append(
+            "one trajectory gives one kick at each place: it locates, but any single multipole "
+            "explains it; two or more launches name the effect"
+        )

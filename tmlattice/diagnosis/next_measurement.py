@@ -1,0 +1,176 @@
+"""The measurement that would best tell two explanations apart.
+
+Candidates are launches of other phases and amplitudes, another energy, and a change of the setting
+of a magnet that is under suspicion. For each the readings are predicted under both explanations;
+what of their difference neither the launch nor the amount can absorb is the separation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.data import Data
+from tmlattice.diagnosis.explain import Rival
+from tmlattice.diagnosis.model import LAUNCH, Model
+from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.effects import Cause, Settings, find
+from tmlattice.errors import UnstableRingError
+from tmlattice.lattice import Ring
+from tmlattice.network import TaylorNetwork
+from tmlattice.optics import one_turn_optics
+
+Array = NDArray[np.float64]
+
+PHASES = 12
+CHANGES = {
+    "quadrupole": {"k1_relative": 0.02},
+    "sextupole": {"k2_relative": -1.0},
+    "hcorrector": {"kick": 5e-5},
+    "vcorrector": {"kick": 5e-5},
+}
+"""What is changed of a magnet under suspicion."""
+
+
+@dataclass(frozen=True)
+class NextMeasurement:
+    """One more shot, and what it would bring.
+
+    Attributes:
+        launch: x, px, y, py, delta.
+        settings: of the shot.
+        parts: the two hypotheses, as texts.
+        separation: between them, in standard deviations.
+    """
+
+    launch: dict[str, float]
+    settings: Settings
+    parts: tuple[str, str]
+    separation: float
+
+    def as_json(self) -> dict[str, object]:
+        """As it stands in the diagnosis."""
+        return {
+            "launch": self.launch,
+            "settings": {name: dict(value) for name, value in self.settings.items()},
+            "between": list(self.parts),
+            "separation_sigma": self.separation,
+        }
+
+
+def next_measurement(
+    ring: Ring,
+    data: Data,
+    first: Rival,
+    second: Rival,
+    known: Sequence[Cause] = (),
+    seed: int = 0,
+) -> NextMeasurement | None:
+    """The most telling shot between two rivals; None where no candidate parts them at all.
+
+    Args:
+        ring: the design.
+        data: what was measured: its amplitudes, noise and knowledge of launches.
+        first, second: refitted with everything else in place.
+        known: causes that the model holds anyway.
+        seed: of the candidates' phases.
+    """
+    launches, settings = _candidates(ring, data, (first, second), seed)
+    model = Model(ring, settings, data.turns, known)
+    count = len(launches)
+    sigma = np.nanmedian(data.sigma.reshape(-1, 2), axis=0)
+    prior = data.launch_sigma[data.active][:1]
+    shots = Data(
+        readings=np.zeros((count, data.turns * len(model.at), 2)),
+        valid=np.broadcast_to(
+            data.valid[data.active].any(axis=0), (count, *data.valid.shape[1:])
+        ).copy(),
+        sigma=np.broadcast_to(sigma, (count, data.turns * len(model.at), 2)).copy(),
+        launches=launches,
+        launch_sigma=np.repeat(prior, count, axis=0),
+        settings=tuple(settings),
+        turns=data.turns,
+        active=np.ones(count, dtype=bool),
+    )
+    whitening = Whitening(shots)
+    base = model.paths(launches, first.fit.causes)
+    other = model.readings(launches, second.fit.causes)
+    difference = whitening.signature(np.nan_to_num(other - base.readings)).reshape(count, -1)
+    projection = Projection(whitening.launch(base.launch))
+    clean = projection.out(difference.reshape(-1)).reshape(count, -1)
+    separation = np.einsum("sr,sr->s", clean, clean)
+    for rival in (first, second):
+        separation -= _absorbed(model, whitening, projection, launches, rival, clean)
+    separation = np.maximum(separation, 0.0)
+    best = int(separation.argmax())
+    if separation[best] <= 0:
+        return None
+    names = [" ".join(w for w in rival.hypothesis if w) for rival in (first, second)]
+    return NextMeasurement(
+        dict(zip(LAUNCH, map(float, launches[best]), strict=True)),
+        settings[best],
+        (names[0], names[1]),
+        float(np.sqrt(separation[best])),
+    )
+
+
+def _absorbed(
+    model: Model,
+    whitening: Whitening,
+    projection: Projection,
+    launches: Array,
+    rival: Rival,
+    clean: Array,
+) -> Array:
+    """What of the difference another amount would explain, given how well it is known, [shot]."""
+    cause = rival.cause
+    effect = find(cause.effect)
+    if effect.discrete:
+        return np.zeros(len(clean))
+    h = 1e-3 * effect.largest
+    others = rival.fit.causes[:-1]
+    ends = [
+        model.readings(launches, [*others, Cause(cause.effect, cause.element, cause.amount + a)])
+        for a in (h, -h)
+    ]
+    rows = whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
+    rows = projection.out(rows).reshape(len(clean), -1)
+    known = 1.0 / max(float(rival.fit.covariance[-1, -1]), 1e-300)
+    information = np.einsum("sr,sr->s", rows, rows) + known
+    return np.asarray(np.einsum("sr,sr->s", rows, clean) ** 2 / information / 2)
+
+
+def _candidates(
+    ring: Ring, data: Data, rivals: Sequence[Rival], seed: int
+) -> tuple[Array, list[Settings]]:
+    measured = data.launches[data.active]
+    launches = list(measured[:2])
+    try:
+        modes = one_turn_optics(TaylorNetwork.from_ring(ring)).modes
+        random = np.random.default_rng([seed, 3])
+        size = np.linalg.norm(measured[:, :4] / np.abs(modes).max(axis=1), axis=1).mean()
+        for scale in (1.0, 2.0):
+            for _ in range(PHASES):
+                turn = np.exp(2j * np.pi * random.uniform(size=2))
+                row = np.zeros(5)
+                row[:4] = scale * size / 2 * np.real(modes @ turn)
+                launches.append(row)
+    except UnstableRingError:
+        pass
+    for delta in (1e-3, -1e-3):
+        row = launches[0].copy()
+        row[4] += delta
+        launches.append(row)
+    settings: list[Settings] = [{} for _ in launches]
+    for rival in rivals:
+        name = rival.hypothesis[1]
+        elements = {element.name: element for element in ring.elements}
+        if name in elements and elements[name].kind in CHANGES:
+            element = elements[name]
+            if element.kind == "quadrupole" and element.k1 == 0:
+                continue
+            for row in launches[:1]:
+                launches.append(row.copy())
+                settings.append({element.name: CHANGES[element.kind]})
+    return np.array(launches), settings

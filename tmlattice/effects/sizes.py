@@ -1,0 +1,40 @@
+"""How large the small errors of a machine in good order are."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from tmlattice.effects.effect import CATALOGUE, find
+from tmlattice.errors import EffectError
+
+
+def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
+    """The rms of each background effect.
+
+    Args:
+        wanted: effect -> rms, or None for the catalogue's own; "all" -> a scale of the
+            catalogue's (None: 1) for every effect that has one. Named effects win over "all".
+
+    Raises:
+        EffectError: an effect that has no usual size, or a negative rms.
+        UnknownNameError: no such effect.
+    """
+    wanted = dict(wanted)
+    chosen: dict[str, float] = {}
+    if "all" in wanted:
+        scale = wanted.pop("all")
+        scale = 1.0 if scale is None else scale
+        chosen = {
+            name: scale * effect.background
+            for name, effect in CATALOGUE.items()
+            if effect.background is not None
+        }
+    for name, size in wanted.items():
+        effect = find(name)
+        rms = effect.background if size is None else size
+        if rms is None or effect.discrete:
+            raise EffectError(f"{effect.name} has no usual size; say {effect.name}=RMS")
+        chosen[effect.name] = rms
+    if any(not 0 <= rms < np.inf for rms in chosen.values()):
+        raise EffectError("a background's rms is zero or more")
+    return {name: rms for name, rms in chosen.items() if rms}
