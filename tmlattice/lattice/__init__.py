@@ -11,4 +11,12 @@ from tmlattice.lattice.json_file import save_ring
 from tmlattice.lattice.load import builtin_lattices, load_ring
 from tmlattice.lattice.ring import Element, Kind, Ring
 
-__all__ = ["Element", "Kind", "Ring", "builtin_lattices", "load_ring", "middle_of_first_arc", "save_ring"]
+__all__ = [
+    "Element",
+    "Kind",
+    "Ring",
+    "builtin_lattices",
+    "load_ring",
+    "middle_of_first_arc",
+    "save_ring",
+]

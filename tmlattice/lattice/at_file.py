@@ -119,8 +119,10 @@ def _strengths(element: Any) -> NDArray[np.complex128]:
     total = np.zeros(orders, dtype=complex)
     total[: len(B)] += B
     total[: len(A)] += 1j * A
-    total[int(getattr(element, "MaxOrder", orders - 1)) + 1 :] = 0.0
-    return total * float(getattr(element, "FieldScaling", 1.0))
+    highest = int(getattr(element, "MaxOrder", orders - 1))
+    total[highest + 1 :] = 0.0
+    total *= float(getattr(element, "FieldScaling", 1.0))
+    return total
 
 
 def _normal(strength: complex, order: int) -> tuple[float, float]:
@@ -134,7 +136,7 @@ def _normal(strength: complex, order: int) -> tuple[float, float]:
 def _roll(element: Any, left_out: Counter[str]) -> float:
     """Tilt from R1, rad; anything else that moves the element is counted as left out."""
     for key in ("T1", "T2"):
-        if np.any(np.asarray(getattr(element, key, 0.0), dtype=float)):
+        if np.any(np.asarray(getattr(element, key, (0.0,)), dtype=float)):
             left_out["misalignments T1, T2"] += 1
             break
     R1 = np.asarray(getattr(element, "R1", np.eye(6)), dtype=float)
@@ -149,9 +151,7 @@ def _roll(element: Any, left_out: Counter[str]) -> float:
     return roll
 
 
-def _convert(
-    element: Any, family: str, energy: float, left_out: Counter[str]
-) -> tuple[Kind, Any]:
+def _convert(element: Any, family: str, energy: float, left_out: Counter[str]) -> tuple[Kind, Any]:
     """Kind and OCELOT element of one AT element."""
     import at
 
@@ -187,9 +187,9 @@ def _convert(
     matrix = at.find_elem_m66(element, energy=energy * 1e9, particle=at.Particle("relativistic"))
     kind, source = _matrix(np.asarray(matrix), family, length, energy)
     left_out[f"what {type(element).__name__} has beyond its first-order matrix"] += 1
-    if isinstance(element, at.Wiggler | at.InsertionDeviceKickMap):
+    if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"
-    return ("solenoid" if isinstance(element, at.Solenoid) else kind), source
+    return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source
 
 
 def _corrector(element: Any, family: str, length: float, mad: str) -> tuple[Kind, Any]:
@@ -251,7 +251,7 @@ def _bend(
     from tmlattice.lattice.ocelot import elements as ocelot
 
     strengths = (*_strengths(element), 0.0, 0.0, 0.0)
-    if strengths[0] != 0 or np.any(np.asarray(getattr(element, "KickAngle", 0.0))):
+    if strengths[0] != 0 or np.any(np.asarray(getattr(element, "KickAngle", (0.0, 0.0)))):
         left_out["field errors of bends"] += 1
     if any(complex(k).imag for k in strengths) or any(strengths[3:]):
         left_out["skew fields and octupoles of bends"] += 1
@@ -282,7 +282,7 @@ def _straight(
     from tmlattice.lattice.ocelot import elements as ocelot
 
     strengths = _strengths(element)
-    if strengths[0] != 0 or np.any(np.asarray(getattr(element, "KickAngle", 0.0))):
+    if strengths[0] != 0 or np.any(np.asarray(getattr(element, "KickAngle", (0.0, 0.0)))):
         left_out["dipole kicks of multipoles"] += 1
     orders = [n for n in range(1, len(strengths)) if strengths[n] != 0]
     if orders:
@@ -306,9 +306,7 @@ def _straight(
     if rest:
         left_out["higher orders of multipoles"] += 1
     if order == 1:
-        return "quadrupole", ocelot.Quadrupole(
-            l=length, k1=k, k2=k2, tilt=tilt + roll, eid=family
-        )
+        return "quadrupole", ocelot.Quadrupole(l=length, k1=k, k2=k2, tilt=tilt + roll, eid=family)
     if order == 2:
         return "sextupole", ocelot.Sextupole(l=length, k2=k, tilt=tilt + roll, eid=family)
     if order == 3:

@@ -237,7 +237,8 @@ def _value(path: Path, key: str, name: str, value: Any, default: Any) -> Any:
     for index, entry in value.items():
         if len(index) != flat.ndim:
             raise LatticeError(
-                f"'{path}': '{name}' of '{key}' has the entry '{index}'; it takes {flat.ndim} digits"
+                f"'{path}': '{name}' of '{key}' has the entry '{index}'; "
+                f"an entry has {flat.ndim} digits"
             )
         flat[tuple(int(digit) - 1 for digit in index)] = entry
     return array
