@@ -80,9 +80,12 @@ def test_at_round_trip_keeps_counts_length_and_tunes(tmp_path, petra3, suffix):
 
 
 ELEMENTS = {
-    "bend with edges, gap and gradients": at.Dipole(
+    "bend with edges, gap and gradient": at.Dipole(
         "b", 1.2, 0.2, 0.3, EntranceAngle=0.1, ExitAngle=0.07, FullGap=0.05,
-        FringeInt1=0.5, FringeInt2=0.6, PolynomB=[0, 0.3, 2.0], NumIntSteps=400,
+        FringeInt1=0.5, FringeInt2=0.6, NumIntSteps=400,
+    ),
+    "weak bend with a sextupole": at.Dipole(
+        "b", 1.0, 1e-5, 0.0, PolynomB=[0, 0, 12.0], NumIntSteps=400,
     ),
     "quadrupole": at.Quadrupole("q", 0.5, -0.8, NumIntSteps=400),
     "skew quadrupole": at.Quadrupole("q", 0.5, 0.0, PolynomA=[0, 0.7], NumIntSteps=400),
@@ -111,22 +114,26 @@ ELEMENTS["rolled quadrupole"].R1, ELEMENTS["rolled quadrupole"].R2 = turn, turn.
 @pytest.mark.filterwarnings("ignore:.*beyond its first-order matrix")
 @pytest.mark.parametrize("what", ELEMENTS)
 def test_element_moves_a_particle_as_in_at(what):
-    """Offsets of 10 micrometres and 10 microradians; what is left is of third order, 1e-11."""
+    """Offsets of 0.1 mm and 0.1 mrad; what is left is of third order.
+
+    A strong bend is compared to first order: AT leaves out second-order terms of its edges and of
+    curvature times gradient, which OCELOT has.
+    """
     from tmlattice import element_map
 
     lattice = at.Lattice([ELEMENTS[what].deepcopy()], energy=ENERGY * 1e9, periodicity=1)
     ring = ring_from_at(lattice, what)
     map_ = element_map(ring.elements[0], ENERGY)
-    big = 1e-4
+    big, tolerance = (1e-7, 1e-13) if what.startswith("bend") else (1e-4, 5e-10)
     starts = np.array([[big, 0, 0, 0], [0, big, 0, 0], [0, 0, big, 0], [0, 0, 0, big],
                        [big, -big, big, big], [0, 0, 0, 0]])  # fmt: skip
     six = np.zeros((6, len(starts)))
     six[:4] = starts.T
     tracked = lattice.track(np.asfortranarray(six), refpts=[1])[0][:4, :, 0, 0].T
     mapped = np.array([map_(start) for start in starts])
-    np.testing.assert_allclose(mapped, tracked, rtol=0, atol=5e-10)
+    np.testing.assert_allclose(mapped, tracked, rtol=0, atol=tolerance)
     kick = np.abs(tracked - starts).max()
-    assert kick > 1e-6  # it does something
+    assert kick > big / 100  # it does something
 
 
 def test_matrix_element_keeps_dispersion_in_ocelots_coordinates():

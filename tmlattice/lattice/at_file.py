@@ -5,7 +5,8 @@ Each AT element becomes an OCELOT element of the same first- and second-order ph
 - `PolynomB[n]` is k_n / n! and a complex strength B + i A = |k| exp(-i (n + 1) tilt), so a skew
   quadrupole (A) is one tilted by -pi / 4. A multipole is known by its strengths, then by MADType.
 - A bend keeps its edges (angles, gap, fringe integrals, pole curvature), k1 and k2. The nonlinear
-  fringes of quadrupoles and bends are of third order or left out by both codes' linear maps.
+  fringes of quadrupoles are of third order and left out. To second order OCELOT's bend is the
+  fuller one: AT's has no product of curvature and gradient, and edges of first order.
 - Wigglers made of thin bends of alternating sign become one matrix each (`_merge_wigglers`).
 - A corrector's plane is its MADType (HKICKER, VKICKER), else its kick, else its name.
 - A cavity is a drift: the maps carry no acceleration.
@@ -176,7 +177,7 @@ def _convert(element: Any, family: str, energy: float, left_out: Counter[str]) -
         return _matrix(np.asarray(element.M66, dtype=float), family, length, energy)
     if isinstance(element, at.ThinMultipole) and not isinstance(element, at.Multipole):
         return _thin(element, family, roll, left_out)
-    if isinstance(element, at.Dipole) or getattr(element, "BendingAngle", 0.0):
+    if isinstance(element, at.Dipole) or getattr(element, "BendingAngle", False):
         return _bend(element, family, length, roll, left_out)
     if isinstance(element, at.Multipole):
         return _straight(element, family, length, mad, roll, left_out)

@@ -9,7 +9,7 @@ from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.lattice.ring import Ring
 
-_BEAM = re.compile(r"^\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.IGNORECASE | re.MULTILINE)
+_BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
 
 
 def read_madx(
@@ -44,7 +44,9 @@ def read_madx(
         raise LatticeError(
             f"'{path}' has the sequences {', '.join(found)}; name one with sequence="
         )
-    if energy is None and not _BEAM.search(path.read_text(encoding="utf-8", errors="replace")):
+    beams = [dict(v) for k, v in parser.items() if str(k).startswith("beam%")]
+    stated = _BEAM.search(path.read_text(encoding="utf-8", errors="replace"))
+    if energy is None and not stated and beams == [dict(at.MadxParser()["beam%"])]:
         raise LatticeError(f"'{path}' has no BEAM with an energy; say energy= (GeV)")
     try:
         with redirect_stdout(StringIO()):
