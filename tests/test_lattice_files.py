@@ -85,7 +85,7 @@ ELEMENTS = {
         FringeInt1=0.5, FringeInt2=0.6, NumIntSteps=400,
     ),
     "weak bend with a sextupole": at.Dipole(
-        "b", 1.0, 1e-5, 0.0, PolynomB=[0, 0, 12.0], NumIntSteps=400,
+        "b", 1.0, 5e-3, 0.0, PolynomB=[0, 0, 12.0], NumIntSteps=400,
     ),
     "quadrupole": at.Quadrupole("q", 0.5, -0.8, NumIntSteps=400),
     "skew quadrupole": at.Quadrupole("q", 0.5, 0.0, PolynomA=[0, 0.7], NumIntSteps=400),
