@@ -163,7 +163,7 @@ def test_unknown_names_offer_the_nearest(small_ring, tmp_path):
         load_ring("petra")
     with pytest.raises(LatticeError, match="no lattice file"):
         load_ring(tmp_path / "none.py")
-    with pytest.raises(LatticeError, match="not a Python file"):
+    with pytest.raises(LatticeError, match="no lattice file that can be read"):
         load_ring(write(tmp_path, "x", "ring.txt"))
 
 

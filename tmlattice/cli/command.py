@@ -24,8 +24,9 @@ STOPPED = 130  # as the shell has it for Ctrl-C
 def tmlattice() -> None:
     """The gap between the model of a storage ring and the ring itself.
 
-    A LATTICE is a built-in name (petra3) or a path to an OCELOT lattice file. Such a file is
-    Python code and is run: load only files that you trust.
+    A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
+    .repr), MAD-X (.seq, .madx) or the package's own JSON. OCELOT's files are Python code and are
+    run, and AT's .m and .repr are evaluated: load only files that you trust.
     """
 
 

@@ -7,7 +7,16 @@
 """
 
 from tmlattice.lattice.default_magnet import middle_of_first_arc
-from tmlattice.lattice.ocelot_file import builtin_lattices, load_ring
+from tmlattice.lattice.json_file import save_ring
+from tmlattice.lattice.load import builtin_lattices, load_ring
 from tmlattice.lattice.ring import Element, Kind, Ring
 
-__all__ = ["Element", "Kind", "Ring", "builtin_lattices", "load_ring", "middle_of_first_arc"]
+__all__ = [
+    "Element",
+    "Kind",
+    "Ring",
+    "builtin_lattices",
+    "load_ring",
+    "middle_of_first_arc",
+    "save_ring",
+]

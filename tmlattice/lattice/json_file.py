@@ -1,0 +1,257 @@
+"""The package's own lattice file: data only, small, and the same maps bit for bit.
+
+`definitions` holds each different element once: its kind, OCELOT class and those of its numbers
+that are not the class's own defaults. `sequence` names them in beam order. Names are numbered on
+reading, as everywhere. A matrix is stored by its nonzero entries (`"12"` is row 1, column 2).
+"""
+
+import json
+from dataclasses import asdict, replace
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.errors import LatticeError
+from tmlattice.files import output_file, write_json
+from tmlattice.lattice import ring as ring_module
+from tmlattice.lattice.places import place_elements
+from tmlattice.lattice.ring import Element, Ring, number_names
+
+FORMAT, VERSION = "tmlattice-lattice", 1
+
+CLASSES = (
+    "Aperture", "Bend", "Cavity", "Drift", "Hcor", "Marker", "Matrix", "Monitor", "Multipole",
+    "Octupole", "Quadrupole", "RBend", "SBend", "Sextupole", "Solenoid", "TDCavity", "TWCavity",
+    "Undulator", "UnknownElement", "Vcor", "XYQuadrupole",
+)  # fmt: skip
+"""OCELOT's element classes that a file may name."""
+
+_NOT_PHYSICS = ("id", "has_edge", "color", "width", "height", "params", "n")
+
+
+def save_ring(ring: Ring, path: str | Path) -> None:
+    """Write a ring as the package's JSON (schema: `tmlattice/schemas/lattice.schema.json`).
+
+    Args:
+        ring: from any reader, with its changes.
+        path: a `.json` file; written whole or not at all.
+
+    Raises:
+        LatticeError: an element that numbers do not describe (a field map), or names that are
+            not the families numbered in beam order.
+        OutputError: the file cannot be written.
+    """
+    from tmlattice import __version__
+
+    if Path(path).suffix.lower() != ".json":
+        raise LatticeError(f"'{path}' does not end in .json; name a .json file")
+    families = [element.family for element in ring.elements]
+    if number_names(families) != [element.name for element in ring.elements]:
+        raise LatticeError(
+            f"names of '{ring.name}' are not its families numbered in beam order; rename them"
+        )
+    definitions: dict[str, dict[str, Any]] = {}
+    keys: dict[str, str] = {}  # what an element is, as text -> its key
+    sequence = []
+    for element in ring.elements:
+        content = _described(element)
+        text = json.dumps([element.family, content], sort_keys=True)
+        if text not in keys:
+            key, k = element.family, 1
+            while key in definitions:
+                k += 1
+                key = f"{element.family}#{k}"
+            if key != element.family:
+                content = {"family": element.family, **content}
+            keys[text], definitions[key] = key, content
+        sequence.append(keys[text])
+    with output_file(Path(path)) as temporary:
+        write_json(
+            temporary,
+            {
+                "format": FORMAT,
+                "version": VERSION,
+                "package": __version__,
+                "name": ring.name,
+                "energy_gev": ring.energy,
+                "changes": {name: dict(change) for name, change in ring.changes.items()},
+                "definitions": definitions,
+                "sequence": sequence,
+            },
+        )
+
+
+def is_own(path: Path) -> bool:
+    """Whether a JSON file is the package's own (AT's has no such `format`).
+
+    Raises:
+        LatticeError: it is no JSON.
+    """
+    content = _content(path)
+    if not isinstance(content, dict):
+        raise LatticeError(f"'{path}' holds no lattice; give the package's own JSON or AT's")
+    return "format" in content or "atjson" not in content
+
+
+def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
+    """The ring of a file that `save_ring` wrote.
+
+    Args:
+        path: of the file.
+        name: of the ring.
+        energy: GeV; else the file's.
+
+    Raises:
+        LatticeError: another format or version, or what the schema does not allow.
+    """
+    content = _content(path)
+    if content.get("format") != FORMAT:
+        raise LatticeError(
+            f"'{path}' has the format {content.get('format')!r}, which is no lattice; give a file "
+            f"of save_ring ('{FORMAT}') or an AT lattice (.json)"
+        )
+    if content.get("version") != VERSION:
+        raise LatticeError(
+            f"'{path}' has version {content.get('version')!r} of '{FORMAT}', and this package "
+            f"reads version {VERSION}; save it again with save_ring"
+        )
+    _validate(path, content)
+    definitions = content["definitions"]
+    sources = {key: _source(path, key, value) for key, value in definitions.items()}
+    for place, key in enumerate(content["sequence"]):
+        if key not in definitions:
+            raise LatticeError(
+                f"'{path}': place {place} of the sequence is '{key}', which has no definition"
+            )
+    keys = content["sequence"]
+    elements = place_elements(
+        [definitions[key].get("family", key) for key in keys],
+        [sources[key] for key in keys],
+        [definitions[key]["kind"] for key in keys],
+    )
+    elements = tuple(
+        _with_errors(path, e, definitions[key].get("errors"))
+        for e, key in zip(elements, keys, strict=True)
+    )
+    energy = float(content["energy_gev"]) if energy is None else energy
+    return Ring(name, elements, energy, content.get("changes", {}))
+
+
+def _content(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise LatticeError(f"'{path}' is no JSON ({error}); mend it or save it again") from error
+
+
+@cache
+def _validator() -> Any:
+    from jsonschema import Draft202012Validator
+
+    schema = files("tmlattice") / "schemas" / "lattice.schema.json"
+    return Draft202012Validator(json.loads(schema.read_text(encoding="utf-8")))
+
+
+def _validate(path: Path, content: Any) -> None:
+    from jsonschema.exceptions import best_match
+
+    fault = best_match(_validator().iter_errors(content))
+    if fault is not None:
+        where = "/".join(map(str, fault.absolute_path)) or "the top"
+        said = fault.message if len(fault.message) < 200 else f"{fault.message[:200]}..."
+        raise LatticeError(f"'{path}', at {where}: {said}; mend it there or save the ring again")
+
+
+@cache
+def _blank(cls: str) -> dict[str, Any]:
+    """The numbers of a fresh element of an OCELOT class: what may be stored, and its defaults."""
+    from tmlattice.lattice.ocelot import elements
+
+    values = vars(getattr(elements, cls)(eid="blank").element)
+    return {k: v for k, v in values.items() if k not in _NOT_PHYSICS}
+
+
+def _described(element: Element) -> dict[str, Any]:
+    source = element.source
+    cls = type(source).__name__
+    if cls not in CLASSES:
+        raise LatticeError(f"'{element.name}' is of the class {cls}, which a file cannot hold")
+    parameters: dict[str, Any] = {}
+    values = vars(source.element)
+    for key, default in _blank(cls).items():
+        value = values.get(key, default)
+        if isinstance(value, np.ndarray):
+            if not np.array_equal(value, default):
+                parameters[key] = _entries(value) if cls == "Matrix" else value.tolist()
+        elif isinstance(value, bool | int | float | np.number):
+            if value != default:
+                parameters[key] = value.item() if isinstance(value, np.number) else value
+        elif callable(value) or (value is not None and type(value) is not type(default)):
+            raise LatticeError(
+                f"'{element.name}' has a {key} that is no number; a lattice file holds numbers"
+            )
+    described: dict[str, Any] = {"kind": element.kind, "class": cls, "parameters": parameters}
+    errors = getattr(element, "errors", None)
+    if errors is not None:
+        nonzero = {k: v for k, v in asdict(errors).items() if v}
+        if nonzero:
+            described["errors"] = nonzero
+    return described
+
+
+def _entries(array: Any) -> dict[str, float]:
+    squeezed = array[:, 0] if array.shape == (6, 1) else array
+    return {
+        "".join(str(i + 1) for i in index): float(squeezed[tuple(index)])
+        for index in np.argwhere(squeezed)
+    }
+
+
+def _source(path: Path, key: str, definition: dict[str, Any]) -> Any:
+    from tmlattice.lattice.ocelot import elements
+
+    blank = _blank(definition["class"])
+    source = getattr(elements, definition["class"])(eid=definition.get("family", key))
+    for name, value in definition["parameters"].items():
+        if name not in blank:
+            raise LatticeError(
+                f"'{path}': '{key}' has the parameter '{name}', which OCELOT's "
+                f"{definition['class']} lacks; known are {', '.join(blank)}"
+            )
+        setattr(source, name, _value(path, key, name, value, blank[name]))
+    return source
+
+
+def _value(path: Path, key: str, name: str, value: Any, default: Any) -> Any:
+    if isinstance(value, list):
+        return np.array(value, dtype=float)
+    if not isinstance(value, dict):
+        if isinstance(default, np.ndarray):
+            raise LatticeError(f"'{path}': '{name}' of '{key}' should be a list or a table")
+        return value
+    array = np.zeros_like(default)
+    flat = array[:, 0] if array.shape == (6, 1) else array  # a view: filled in place
+    for index, entry in value.items():
+        if len(index) != flat.ndim:
+            raise LatticeError(
+                f"'{path}': '{name}' of '{key}' has the entry '{index}'; "
+                f"an entry has {flat.ndim} digits"
+            )
+        flat[tuple(int(digit) - 1 for digit in index)] = entry
+    return array
+
+
+def _with_errors(path: Path, element: Element, errors: dict[str, float] | None) -> Element:
+    if not errors:
+        return element
+    cls: Any = getattr(ring_module, "Errors", None)
+    try:
+        return replace(element, **{"errors": cls(**errors)})
+    except TypeError as error:
+        raise LatticeError(
+            f"'{path}': errors of '{element.name}' are not known here ({error}); "
+            "save the ring again"
+        ) from error

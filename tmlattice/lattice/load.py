@@ -1,0 +1,79 @@
+"""One door to all lattice files: the suffix says which reader it is."""
+
+from importlib.resources import files
+from pathlib import Path
+
+from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.lattice.ring import Ring
+
+AT_SUFFIXES = (".mat", ".m", ".repr")
+MADX_SUFFIXES = (".seq", ".madx")
+
+
+def _builtin_folder() -> Path:
+    return Path(str(files("tmlattice"))) / "lattices"
+
+
+def builtin_lattices() -> list[str]:
+    """Names of the lattices that come with the package."""
+    return sorted(
+        path.stem for path in _builtin_folder().glob("*.py") if not path.stem.startswith("match_")
+    )
+
+
+def load_ring(
+    name_or_path: str | Path, sequence: str | None = None, energy: float | None = None
+) -> Ring:
+    """The ring of a built-in lattice or of a lattice file.
+
+    Names that stand more than once are numbered in beam order. What the maps cannot model is
+    warned of (an octupole is a drift at second order). Each reader says what it takes over:
+    `read_ocelot`, `read_at`, `read_madx`, `read_json`.
+
+    Args:
+        name_or_path: "petra3", or a path: OCELOT (`.py`; it is code, and is run), AT (`.mat`,
+            `.m`, `.repr`, `.json`), MAD-X (`.seq`, `.madx`) or the package's own JSON.
+        sequence: which one the file's variables, keys or sequences is the ring.
+        energy: GeV; else what the file states.
+
+    Raises:
+        LatticeError: no such file, it cannot be read, or it holds no ring.
+    """
+    path = _find(str(name_or_path))
+    name = str(name_or_path)
+    suffix = path.suffix.lower()
+    if suffix == ".py":
+        from tmlattice.lattice.ocelot_file import read_ocelot
+
+        return read_ocelot(path, name, sequence, energy)
+    if suffix == ".json":
+        from tmlattice.lattice.json_file import is_own, read_json
+
+        if is_own(path):
+            return read_json(path, name, energy)
+    if suffix in MADX_SUFFIXES:
+        from tmlattice.lattice.madx_file import read_madx
+
+        return read_madx(path, name, sequence, energy)
+    from tmlattice.lattice.at_file import read_at
+
+    return read_at(path, name, sequence, energy)
+
+
+def _find(name: str) -> Path:
+    builtin = builtin_lattices()
+    if name.casefold() in builtin:
+        return _builtin_folder() / f"{name.casefold()}.py"
+    path = Path(name)
+    known = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES)
+    if path.suffix.lower() in known and path.is_file():
+        return path
+    if path.is_file():
+        raise LatticeError(
+            f"'{name}' is no lattice file that can be read; give OCELOT code (.py), AT (.mat, .m, "
+            f".repr, .json), MAD-X (.seq, .madx), the package's own JSON or a built-in name "
+            f"({', '.join(builtin)})"
+        )
+    if path.suffix:
+        raise LatticeError(f"no lattice file '{name}'; check the path")
+    raise unknown_name("lattice", name, builtin)

@@ -1,0 +1,100 @@
+"""From OCELOT objects in beam order to named elements: what all lattice readers share."""
+
+import logging
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from tmlattice.errors import LatticeError
+from tmlattice.lattice.ring import Element, Kind, number_names
+
+log = logging.getLogger(__name__)
+
+
+def source_kind(source: Any) -> Kind:
+    """What an OCELOT element is; a matrix element with "wig" in its id is a wiggler."""
+    from tmlattice.lattice.ocelot import elements as e
+
+    kinds: list[tuple[Any, Kind]] = [
+        (e.Drift, "drift"),
+        (e.Quadrupole, "quadrupole"),
+        (e.XYQuadrupole, "quadrupole"),
+        ((e.Bend, e.SBend, e.RBend), "bend"),
+        (e.Hcor, "hcorrector"),
+        (e.Vcor, "vcorrector"),
+        (e.Sextupole, "sextupole"),
+        (e.Octupole, "octupole"),
+        (e.Multipole, "multipole"),
+        (e.Solenoid, "solenoid"),
+        (e.Undulator, "wiggler"),
+        (e.Monitor, "monitor"),
+        ((e.Cavity, e.TDCavity, e.TWCavity), "cavity"),
+    ]
+    for classes, kind in kinds:
+        if isinstance(source, classes):
+            return kind
+    if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
+        return "wiggler" if "wig" in str(source.id).casefold() else "matrix"
+    return "drift" if source.l else "marker"
+
+
+def place_elements(
+    families: Sequence[str], sources: Sequence[Any], kinds: Sequence[Kind] | None = None
+) -> tuple[Element, ...]:
+    """Elements in beam order: numbered names, positions, and the strengths of their sources.
+
+    What the maps cannot model is warned of: an octupole is a drift at second order.
+
+    Args:
+        families: names without numbers.
+        sources: OCELOT elements; one object may stand in many places.
+        kinds: else what `source_kind` says.
+
+    Raises:
+        LatticeError: a length that is not finite.
+    """
+    known = {id(source): source for source in sources}
+    for source in known.values():
+        _check(source)
+    if kinds is None:
+        by_source = {key: source_kind(source) for key, source in known.items()}
+        kinds = [by_source[id(source)] for source in sources]
+    placed = []
+    start = 0.0
+    for name, family, kind, source in zip(
+        number_names(families), families, kinds, sources, strict=True
+    ):
+        length = float(source.l)
+        placed.append(
+            Element(
+                name=name,
+                family=family,
+                kind=kind,
+                s=start + length / 2,
+                length=length,
+                k1=float(getattr(source, "k1", 0.0)),
+                k2=float(getattr(source, "k2", 0.0)),
+                angle=float(getattr(source, "angle", 0.0)),
+                tilt=float(getattr(source, "tilt", 0.0)),
+                source=source,
+            )
+        )
+        start += length
+    return tuple(placed)
+
+
+def _check(source: Any) -> None:
+    from tmlattice.lattice.ocelot import elements
+
+    length = float(source.l)
+    if not math.isfinite(length):
+        raise LatticeError(f"'{source.id}' has the length {length}; mend it in the lattice file")
+    if isinstance(source, elements.Octupole) and source.k3 != 0:
+        warnings.warn(
+            f"octupole '{source.id}' is a drift in second-order maps: its field is not modelled",
+            stacklevel=4,
+        )
+    if length < 0:
+        level = logging.DEBUG if length > -1e-6 else logging.WARNING
+        log.log(level, "element '%s' has the negative length %.3g m", source.id, length)
