@@ -319,7 +319,7 @@ def diagnose(
     kept = data.without(explanation.dropped)
     freedom = _freedom(kept, result)
     p_value = float(stats.chi2.sf(result.chi2, freedom))
-    verdict, findings = _verdict(explanation, findings, p_value, estimated, warnings)
+    verdict, standing = _verdict(explanation, findings, p_value, estimated, warnings)
     if verdict == "distributed":
         causes = ()
     gap = None
@@ -336,10 +336,10 @@ def diagnose(
         np.where(kept.valid & active, kept.readings - f.paths.readings, np.nan)
         for f in (before, shown)
     ]
-    _say_about_shots(data, findings, warnings)
+    _say_about_shots(data, standing, warnings)
     return Diagnosis(
         verdict=verdict,
-        findings=findings,
+        findings=standing,
         fit_before=misfit(residuals[0], kept.sigma),
         fit_after=misfit(residuals[1], kept.sigma),
         heldout=gap,
@@ -374,7 +374,7 @@ def _version() -> str:
     return __version__
 
 
-# --- before the search ------------------------------------------------------------------------------
+# --- before the search ----
 def _dead_monitors(
     model: Model, data: Data, listed: set[str], warnings: list[str]
 ) -> tuple[list[tuple[int, float]], Data]:
@@ -466,7 +466,7 @@ def _background_signatures(model: Model, before: Fit, rms: Mapping[str, float]) 
     return np.concatenate(parts) if parts else np.zeros((0, *before.paths.readings.shape))
 
 
-# --- after the search -------------------------------------------------------------------------------
+# --- after the search ----
 def _freedom(data: Data, result: Fit) -> int:
     """Degrees of freedom: readings and priors, less what was fitted."""
     free = data.launch_sigma > 0
@@ -560,7 +560,7 @@ def _findings(
                 near,
                 (member,),
                 1.0,
-            )  # fmt: skip
+            )
         )
     findings.sort(key=lambda f: -f.detection.statistic)
     return findings
@@ -613,7 +613,8 @@ def _verdict(
 
 def _same_monitors(other: Data, data: Data, explanation: Explanation) -> Data:
     """Held-out readings of the monitors that the fit kept."""
-    never = explanation.dropped[data.active].all(axis=0) | ~data.valid[data.active].any(axis=0)
+    lost = explanation.dropped[data.active].all(axis=0)
+    never: NDArray[np.bool_] = np.logical_or(lost, ~data.valid[data.active].any(axis=0))
     readings = min(len(never), other.valid.shape[1])
     dropped = np.zeros(other.valid.shape, dtype=bool)
     dropped[:, :readings] = never[None, :readings]
@@ -623,7 +624,7 @@ def _same_monitors(other: Data, data: Data, explanation: Explanation) -> Data:
 def _unexplained(model: Model, explanation: Explanation, p_value: float) -> dict[str, Any]:
     """Whether what is left is noise, and where it sits if not."""
     left = explanation.left
-    places = []
+    places: list[dict[str, float]] = []
     s = [model.ring.magnets[int(k)].s for k in left.places]
     taken: list[float] = []
     for i in np.argsort(-left.gain)[:200]:

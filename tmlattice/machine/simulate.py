@@ -52,9 +52,7 @@ class Simulation:
             launches=self.shots.nominal,
             readings=np.stack(readings),
             monitors=names,
-            noise=np.tile(noise, (len(self.machine.ring.monitors), 1))
-            if (noise > 0).all()
-            else None,
+            noise=noise if (noise > 0).all() else None,
             launch_sigma=np.tile(self.shots.sigma, (len(self.shots), 1)),
             settings=self.shots.settings,
             lattice=self.machine.ring.name,
