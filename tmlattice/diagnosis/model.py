@@ -30,7 +30,7 @@ from tmlattice.effects import (
 )
 from tmlattice.effects.settings import groups
 from tmlattice.lattice import Element, Ring
-from tmlattice.maps import LayerMaps, ring_maps
+from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 from tmlattice.network.autograd import curved
 from tmlattice.network.monitors import positions
 from tmlattice.network.threads import share
@@ -70,6 +70,27 @@ class Paths:
     monitors: Array
 
 
+@dataclass(frozen=True)
+class _Base:
+    """What every model of a ring shares; kept with the ring."""
+
+    ring: Ring
+    layers: LayerMaps
+    maps: RingMaps
+    directions: dict[tuple[Hypothesis, ...], Directions]
+
+
+def _base(ring: Ring, known: tuple[Cause, ...], dimension: int) -> _Base:
+    key = ("model", known, dimension)
+    if key not in ring.memory:
+        with_known = apply(ring, known) if known else ring
+        layers = LayerMaps(with_known, dimension)
+        maps = ring_maps(with_known, dimension, layers)
+        ring.memory[key] = _Base(with_known, layers, maps, {})
+    base: _Base = ring.memory[key]
+    return base
+
+
 class _Group:
     """Shots with equal settings, and the stacked weights of their ring."""
 
@@ -104,12 +125,11 @@ class Model:
     ) -> None:
         self.design = ring
         self.active = np.ones(len(settings), dtype=bool) if active is None else active
-        self.ring = apply(ring, known)
         self.turns = turns
         self.shots = len(settings)
         self.dimension = dimension
-        self.layers = LayerMaps(self.ring, dimension)
-        maps = ring_maps(self.ring, dimension, self.layers)
+        self._base = _base(ring, tuple(known), dimension)
+        self.ring, self.layers, maps = self._base.ring, self._base.layers, self._base.maps
         self.maps = maps
         self.at = maps.at
         base = [
@@ -123,7 +143,6 @@ class Model:
             group.R = [r.copy() for r in (maps.R0, maps.R1, maps.R2)]
             self._patch(group, set_elements(self.ring, setting))
             self.groups.append(group)
-        self._base_directions: dict[tuple[Hypothesis, ...], Directions] = {}
 
     def _alike(
         self, settings: Sequence[Settings]
@@ -343,6 +362,49 @@ class Model:
         turned = _through(paths.monitors, by_turn)
         return np.asarray(turned.reshape(len(kick), 2, *paths.readings.shape))
 
+    def single_kicks(
+        self, paths: Paths, hypotheses: Sequence[Hypothesis]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """Hypotheses that are one kick on one turn, as changes of the launch.
+
+        Such a signature is the launch's own, cut off before a reading: `scan` needs no more.
+
+        Returns:
+            Which of the hypotheses these are, [kick]; the first reading behind each; and the
+            change of the launch, [shot, kick, n].
+        """
+        empty = np.zeros(0, dtype=np.int64)
+        ring = [i for i, h in enumerate(hypotheses) if isinstance(find(h[0]), RingEffect)]
+        if self.turns > 1 or not ring:
+            return empty, empty, np.zeros((self.shots, 0, self.dimension))
+        some = [hypotheses[i] for i in ring]
+        base = self._directions(some, self.groups[0])
+        rows = np.bincount(base.owner, minlength=len(some))
+        rows[base.read_owner] = 0
+        one = np.isin(base.owner, np.flatnonzero(rows == 1))
+        order = np.argsort(base.owner[one])
+        owner, exits = base.owner[one][order], base.layer[one][order] + 1
+        pulled = np.zeros((self.shots, len(owner), self.dimension))
+        inverse = np.linalg.inv(paths.tangents)
+        for group in self.groups:
+            if not group.active:
+                continue
+            d = self._directions(some, group)
+            own = np.isin(d.owner, owner)  # fewer where a setting takes its effect away
+            kicks = np.empty((len(group.shots), 1, len(d.owner), self.dimension))
+            states = np.ascontiguousarray(paths.states[group.shots])
+            kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, 0, kicks)
+            back = inverse[group.shots][:, d.layer[own] + 1]
+            change = np.einsum("skij,skj->ski", back, kicks[:, 0][:, own], optimize=True)
+            pulled[np.ix_(group.shots, np.searchsorted(owner, d.owner[own]))] = change
+        return np.array(ring)[owner], np.searchsorted(self._where(), exits), pulled
+
+    def slopes(self, paths: Paths) -> Array:
+        """d readings / d launch in all coordinates of the model, [shot, reading, 2, n]."""
+        by_turn = paths.beam_launch.reshape(self.shots, self.turns, -1, 2, self.dimension)
+        turned = np.einsum("smij,stmjk->stmik", paths.monitors, by_turn)
+        return np.asarray(turned.reshape(paths.beam_launch.shape))
+
     def _ring_signatures(
         self, paths: Paths, hypotheses: list[Hypothesis], index: NDArray[np.int64], out: Array
     ) -> None:
@@ -374,9 +436,9 @@ class Model:
 
     def _directions(self, hypotheses: list[Hypothesis], group: _Group) -> Directions:
         key = tuple(hypotheses)
-        if key not in self._base_directions:
-            self._base_directions[key] = directions(self.layers, hypotheses)
-        base = self._base_directions[key]
+        if key not in self._base.directions:
+            self._base.directions[key] = directions(self.layers, hypotheses)
+        base = self._base.directions[key]
         replaced = set_elements(self.ring, group.settings)
         if not replaced:
             return base

@@ -6,15 +6,17 @@ The threshold is for the whole scan: the largest statistic of pure noise is simu
 is that of a number of independent hypotheses, which is fitted.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import logsumexp
 
 from tmlattice.diagnosis.model import Hypothesis, Model, Paths
 from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.effects import ReadingEffect, find
 
 Array = NDArray[np.float64]
 
@@ -24,8 +26,11 @@ CHUNK = 512
 DRAWS = 64
 """Of pure noise, for the threshold."""
 
-BLIND = 1e-6
-"""A signature of which launches leave less than this share cannot be seen."""
+BLIND = 1e-9
+"""A signature of which launches leave less than this share (of its square) cannot be seen."""
+
+FAR = 100.0
+"""What would not be seen at this many times its largest fault is not there to be seen."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +79,6 @@ def effective_number(largest: Array, freedom: int) -> float:
     return float(max(len(largest) / -np.log1p(-tail).sum(), 1.0))
 
 
-def _chunks(hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[slice, Sequence[Hypothesis]]]:
-    for start in range(0, len(hypotheses), CHUNK):
-        part = slice(start, min(start + CHUNK, len(hypotheses)))
-        yield part, hypotheses[part]
-
-
 def scan(
     model: Model,
     paths: Paths,
@@ -104,33 +103,128 @@ def scan(
         effective: number of independent hypotheses where it is known already; else simulated.
         seed: of the simulation.
     """
-    size = len(hypotheses)
-    statistic, amount, information = np.zeros(size), np.zeros(size), np.zeros(size)
-    largest = np.zeros(DRAWS)
-    noise = None
+    draws = np.zeros((0, len(residual)))
     if effective is None:
-        draws = np.random.default_rng([seed, 1]).standard_normal((DRAWS, len(residual)))
-        noise = projection.out(draws).T
-    clean = projection.out(residual)
-    for part, some in _chunks(hypotheses):
-        rows = whitening.signature(
-            np.nan_to_num(model.signatures(paths, some, launches)) * active[:, None, None]
+        random = np.random.default_rng([seed, 1])
+        draws = projection.out(random.standard_normal((DRAWS, len(residual))))
+    data = np.concatenate([projection.out(residual)[None], draws])
+    sums = _Sums(len(hypotheses), len(data))
+    rest = np.ones(len(hypotheses), dtype=bool)
+    if not whitening.dense:
+        for add in (_kicks, _readings):
+            done = add(model, paths, hypotheses, whitening, projection, data, active, sums)
+            rest[done] = False
+    left = np.flatnonzero(rest)
+    for start in range(0, len(left), CHUNK):
+        part = left[start : start + CHUNK]
+        some = [hypotheses[i] for i in part]
+        signatures = np.nan_to_num(model.signatures(paths, some, launches))
+        rows = whitening.signature(signatures * active[:, None, None])
+        sums.add(part, np.einsum("hr,hr->h", rows, rows), projection.inside(rows), rows @ data.T)
+    norm = sums.whole - sums.inside
+    reach = np.array([FAR * find(name).largest ** find(name).power for name, _ in hypotheses])
+    seen = (norm > BLIND * sums.whole) & (norm * reach**2 > 1.0)
+    safe = np.where(seen, norm, 1.0)
+    squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
+    if effective is None:
+        effective = effective_number(squares[:, 1:].max(axis=0), 1)
+    return Scan(
+        tuple(hypotheses),
+        statistic=squares[:, 0],
+        amount=np.where(seen, sums.inner[:, 0] / safe, 0.0),
+        information=np.where(seen, norm, 0.0),
+        effective=effective,
+    )
+
+
+class _Sums:
+    """Signatures squared, their part along the launches' directions squared, and their products
+    with data rows, [hypothesis], [hypothesis], [hypothesis, data]."""
+
+    def __init__(self, hypotheses: int, data: int) -> None:
+        self.whole = np.zeros(hypotheses)
+        self.inside = np.zeros(hypotheses)
+        self.inner = np.zeros((hypotheses, data))
+
+    def add(self, at: NDArray[np.intp], whole: Array, inside: Array, inner: Array) -> None:
+        self.whole[at] = whole
+        self.inside[at] = inside
+        self.inner[at] = inner
+
+
+def _behind(sums: Array) -> Array:
+    """Sums over all readings from each one on, [shot, reading + 1, ...]."""
+    zero = np.zeros_like(sums[:, :1])
+    return np.concatenate([np.cumsum(sums[:, ::-1], axis=1)[:, ::-1], zero], axis=1)
+
+
+def _kicks(
+    model: Model,
+    paths: Paths,
+    hypotheses: Sequence[Hypothesis],
+    whitening: Whitening,
+    projection: Projection,
+    data: Array,
+    active: NDArray[np.bool_],
+    sums: _Sums,
+) -> NDArray[np.intp]:
+    """Single kicks: a signature is the launch's own from a reading on, so that sums over the
+    readings behind each, taken once, give every product."""
+    which, start, pulled = model.single_kicks(paths, hypotheses)
+    if not len(which):
+        return which
+    pulled = pulled * active[:, None, None]
+    slopes = whitening.weight[..., None] * model.slopes(paths)  # [shot, reading, 2, n]
+    shots, readings = slopes.shape[:2]
+    Q = projection.Q[:, :-5].reshape(shots, readings, 2, -1)
+    gram = _behind(np.einsum("smpi,smpj->smij", slopes, slopes, optimize=True))
+    along = _behind(np.einsum("smpi,smpq->smiq", slopes, Q, optimize=True))
+    whole = np.einsum("ski,skij,skj->k", pulled, gram[:, start], pulled, optimize=True)
+    inside = np.einsum("ski,skiq->skq", pulled, along[:, start], optimize=True)
+    rows = data.reshape(len(data), shots, -1)[:, :, :-5].reshape(len(data), shots, readings, 2)
+    inner = np.empty((len(which), len(data)))
+    for d, row in enumerate(rows):
+        behind = _behind(np.einsum("smpi,smp->smi", slopes, row))
+        inner[:, d] = np.einsum("ski,ski->k", pulled, behind[:, start])
+    sums.add(which, whole, np.einsum("skq,skq->k", inside, inside), inner)
+    return which
+
+
+def _readings(
+    model: Model,
+    paths: Paths,
+    hypotheses: Sequence[Hypothesis],
+    whitening: Whitening,
+    projection: Projection,
+    data: Array,
+    active: NDArray[np.bool_],
+    sums: _Sums,
+) -> NDArray[np.intp]:
+    """Effects on readings: a signature lives in the readings of one monitor."""
+    monitor = {name: m for m, name in enumerate(model.maps.monitors)}
+    of_effect: dict[str, list[int]] = {}
+    for i, (name, _) in enumerate(hypotheses):
+        if isinstance(find(name), ReadingEffect):
+            of_effect.setdefault(name, []).append(i)
+    shots = len(paths.beam)
+    shape = (shots, model.turns, len(monitor), 2)
+    Q = projection.Q[:, :-5].reshape(*shape, -1)
+    rows = data.reshape(len(data), shots, -1)[:, :, :-5].reshape(len(data), *shape)
+    for name, members in of_effect.items():
+        effect = find(name)
+        assert isinstance(effect, ReadingEffect)
+        h = 1.0 if effect.discrete else 1e-6
+        change = whitening.weight * np.nan_to_num(effect.change(paths.beam, h) / h)
+        change = (change * active[:, None, None]).reshape(shape)
+        at = [monitor[place] for _, place in (hypotheses[i] for i in members) if place is not None]
+        along = np.einsum("stmp,stmpq->smq", change, Q, optimize=True)
+        sums.add(
+            np.array(members),
+            np.einsum("stmp,stmp->m", change, change)[at],
+            np.einsum("smq,smq->m", along, along)[at],
+            np.einsum("stmp,dstmp->md", change, rows, optimize=True)[at],
         )
-        whole = np.einsum("hr,hr->h", rows, rows)
-        rows = projection.out(rows)
-        norm = np.einsum("hr,hr->h", rows, rows)
-        seen = norm > BLIND**2 * whole
-        seen &= norm > 0
-        safe = np.where(seen, norm, 1.0)
-        inner = rows @ clean
-        statistic[part] = np.where(seen, inner**2 / safe, 0.0)
-        amount[part] = np.where(seen, inner / safe, 0.0)
-        information[part] = np.where(seen, norm, 0.0)
-        if noise is not None and seen.any():
-            largest = np.maximum(largest, ((rows @ noise)[seen] ** 2 / norm[seen, None]).max(0))
-    if effective is None:
-        effective = effective_number(largest, 1)
-    return Scan(tuple(hypotheses), statistic, amount, information, effective)
+    return np.array([i for members in of_effect.values() for i in members], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -153,21 +247,21 @@ class FreeScan:
 
 
 _RATIOS = np.logspace(-1, 8, 46)
+"""Prior variance of a free amount over that of its best measured direction: even in its log."""
 
 
 def evidence_of_scale(values: Array, information: Array) -> Array:
-    """Largest log evidence of independent amounts with one common unknown rms, [place].
+    """Log evidence of independent amounts with one common unknown rms, [place].
 
     Args:
         values: best amounts in units of their own error, [place, parameter].
         information: 1 / variance of each amount, relative to the largest, [place, parameter].
     """
-    best = np.zeros(len(values))
+    gains = []
     for ratio in _RATIOS:
         shrink = ratio * information
-        gain = 0.5 * (values**2 * shrink / (1 + shrink) - np.log1p(shrink)).sum(axis=1)
-        best = np.maximum(best, gain)
-    return best
+        gains.append(0.5 * (values**2 * shrink / (1 + shrink) - np.log1p(shrink)).sum(axis=1))
+    return np.asarray(logsumexp(gains, axis=0) - np.log(len(_RATIOS)))
 
 
 def _free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan:

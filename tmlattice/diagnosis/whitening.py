@@ -115,6 +115,15 @@ class Projection:
             kept[:, b] = part - (part @ Q) @ Q.T
         return kept.reshape(rows.shape)
 
+    def inside(self, rows: Array) -> Array:
+        """The square of what launches explain of rows [..., row], [...]."""
+        blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
+        total = np.zeros(len(blocks))
+        for b, Q in enumerate(self.Q):
+            along = blocks[:, b] @ Q
+            total += np.einsum("hq,hq->h", along, along)
+        return total.reshape(rows.shape[:-1])
+
     def coordinates(self, rows: Array) -> Array:
         """The launch coordinates that explain rows [row] best: changes, one after another."""
         blocks = rows.reshape(len(self.Q), -1)

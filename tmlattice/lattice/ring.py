@@ -144,6 +144,15 @@ class Ring:
     changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @cached_property
+    def memory(self) -> dict[Any, Any]:
+        """What was worked out for this ring and is worth keeping as long as it lives: its maps."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Only the fields travel: what is worked out from them can be worked out again."""
+        return {name: self.__dict__[name] for name in ("name", "elements", "energy", "changes")}
+
+    @cached_property
     def length(self) -> float:
         """Circumference, m."""
         return sum(element.length for element in self.elements)

@@ -6,6 +6,7 @@ each x -> B + R x + x^T T x. The parts are composed to second order; what lies b
 way from the exit of magnet k - 1 to the exit of magnet k, and the chain of layers is the ring.
 """
 
+import functools
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,13 @@ from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
 from tmlattice.maps.taylor import TaylorMap
 
 Array = NDArray[np.float64]
+
+
+@functools.cache
+def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Rows and columns of the pairs i <= j of n coordinates, and how often each stands in T."""
+    i, j = np.triu_indices(n)
+    return i, j, np.where(i == j, 1.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -44,11 +52,10 @@ class Quadratic:
 
     def reduced(self) -> tuple[Array, Array, Array]:
         """W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
-        n = self.R.shape[1]
-        i, j = np.triu_indices(n)
+        i, j, _ = _pairs(self.R.shape[1])
         if self.T is None:
             return self.B, self.R, np.zeros((len(self.B), len(i)))
-        return self.B, self.R, np.where(i == j, 1.0, 2.0) * self.T[:, i, j]
+        return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
 
 
 def _identity(n: int) -> Quadratic:
@@ -401,7 +408,7 @@ def ring_matrix(ring: Ring) -> Array:
     total = np.eye(4)
     for element in ring.elements:
         if element.errors != NO_ERRORS:
-            total = _quadratic(element, ring.energy, 4).R @ total
+            total = _quadratic(element, ring.energy, 6).R[:4, :4] @ total
             continue
         for matrix in element.source.R(ring.energy):
             total = matrix[:4, :4] @ total
