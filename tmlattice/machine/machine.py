@@ -74,9 +74,13 @@ class Machine:
         self.ring = ring
         self.causes = tuple(causes)
         self.monitors = monitors_with(ring, causes)
-        self.noise = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
-        if not (np.isfinite(self.noise).all() and (self.noise >= 0).all()):
-            raise TmlatticeError(f"the noise is {noise} m; it is an rms: zero or more")
+        rms = np.asarray(noise, dtype=float)
+        if rms.shape not in ((), (2,)) or not ((rms >= 0) & (rms < np.inf)).all():
+            raise TmlatticeError(
+                f"the noise is {noise} m; it is an rms, or two (x, y): zero or more"
+            )
+        self.noise = np.broadcast_to(rms, (2,))
+        self.engine = engine
         self._made_of: dict[str, Any] = {"engine": engine, "radiation": radiation, "noise": noise}
         self._engine = _engine(engine, ring, causes, radiation)
 
