@@ -84,7 +84,7 @@ def draw_shots(
     spread = np.asarray(sigma, dtype=float)
     if spread.shape != (5,) or not ((spread >= 0) & (spread < np.inf)).all():
         raise TmlatticeError(
-            f"the launches' rms {sigma} should be five numbers for x, px, y, py, delta, none negative"
+            f"the launches' rms {sigma} should be five numbers (x, px, y, py, delta), none negative"
         )
     network = TaylorNetwork.from_ring(ring)
     modes = one_turn_optics(network).modes
@@ -99,7 +99,7 @@ def draw_shots(
             launch *= (amplitude / _rms(network, launch))[:, None]
     except BeamLostError as error:
         raise BeamLostError(
-            f"an orbit of {amplitude:g} m rms is lost on its first turn; ask for a smaller amplitude"
+            f"an orbit of {amplitude:g} m rms is lost in the design; ask for a smaller amplitude"
         ) from error
     nominal = np.concatenate([launch, np.zeros((shots, 1))], axis=1)
     jitter = stream(seed, "jitter").standard_normal(nominal.shape)
