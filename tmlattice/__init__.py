@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tmlattice.lattice import Ring as Ring
     from tmlattice.lattice import load_ring as load_ring
     from tmlattice.machine import Machine as Machine
-    from tmlattice.machine import simulate as simulate
+    from tmlattice.machine.simulate import simulate as simulate
     from tmlattice.maps import TaylorMap as TaylorMap
     from tmlattice.maps import element_map as element_map
     from tmlattice.maps import ring_maps as ring_maps

@@ -54,7 +54,9 @@ class Simulation:
             launches=self.shots.nominal,
             readings=np.stack(readings),
             monitors=tuple(monitor.name for monitor in self.machine.ring.monitors),
-            noise=(float(noise[0]), float(noise[1])) if (noise > 0).all() else None,
+            noise=np.tile(noise, (len(self.machine.monitors.roll), 1))
+            if (noise > 0).all()
+            else None,
             launch_sigma=np.tile(self.shots.sigma, (len(self.shots), 1)),
             settings=self.shots.settings,
             lattice=self.machine.ring.name,
