@@ -9,6 +9,8 @@ per magnet, fine-tuned on one perturbed first-turn orbit, tracked for its tunes.
 >>> readings = network([[1e-3, 0, 1e-3, 0]])              # [1, 246, 2], m
 >>> states = network.track([[1e-5, 0, 1e-5, 0]], turns=500)
 >>> tmlattice.tunes(states, tmlattice.one_turn_optics(network)).fraction
+>>> weak = [tmlattice.Cause("quadrupole_gradient", "qd::12", -0.2)]
+>>> measurement = tmlattice.simulate(ring, weak, shots=6, seed=1).measurement()
 
 Names are imported when they are first used: `import tmlattice` itself loads neither torch nor
 OCELOT, which take seconds.
@@ -20,6 +22,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from tmlattice.effects import CATALOGUE as CATALOGUE
+    from tmlattice.effects import Cause as Cause
     from tmlattice.errors import TmlatticeError as TmlatticeError
     from tmlattice.fitting import FitResult as FitResult
     from tmlattice.fitting import TuneFit as TuneFit
@@ -30,6 +34,8 @@ if TYPE_CHECKING:
     from tmlattice.lattice import Element as Element
     from tmlattice.lattice import Ring as Ring
     from tmlattice.lattice import load_ring as load_ring
+    from tmlattice.machine import Machine as Machine
+    from tmlattice.machine.simulate import simulate as simulate
     from tmlattice.maps import TaylorMap as TaylorMap
     from tmlattice.maps import element_map as element_map
     from tmlattice.maps import ring_maps as ring_maps
@@ -45,10 +51,12 @@ if TYPE_CHECKING:
     from tmlattice.optics import twiss as twiss
 
 _HOME = {
+    "effects": ["CATALOGUE", "Cause"],
     "errors": ["TmlatticeError"],
     "harmonics": ["Tunes", "tunes"],
     "fitting": ["FitResult", "TuneFit", "fine_tune", "tune_fit"],
     "lattice": ["Element", "Ring", "load_ring"],
+    "machine": ["Machine", "simulate"],
     "maps": ["TaylorMap", "element_map", "ring_maps"],
     "measurement": ["Measurement", "OrbitResponse", "read_measurement", "write_measurement"],
     "network": ["TaylorNetwork", "symplectic_penalty"],

@@ -1,6 +1,7 @@
 """`tmlattice simulate`: a measurement whose cause is known."""
 
 import json
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -178,13 +179,13 @@ def simulate(
     betatron phases; monitors read with noise. The folder holds no truth.
     """
     from tmlattice.effects import Cause, find
-    from tmlattice.errors import MeasurementError
+    from tmlattice.files import output_file
     from tmlattice.lattice import load_ring
     from tmlattice.machine import simulate as run
     from tmlattice.measurement import write_truth
 
-    if truth is not None and truth.absolute().parent == out.absolute():
-        raise MeasurementError(f"the truth '{truth}' may not lie in the folder '{out}'")
+    if truth is not None:
+        _check_apart(truth, out)
     ring = load_ring(lattice, sequence, energy)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
@@ -195,9 +196,10 @@ def simulate(
         settings=_settings(settings_file),
         **options,
     )
-    simulation.write(out, jobs, progress=not quiet)
-    if truth is not None:
-        write_truth(truth, **simulation.truth())
+    with ExitStack() as both:  # the folder and the truth, or neither
+        if truth is not None:
+            write_truth(both.enter_context(output_file(truth)), **simulation.truth())
+        simulation.write(out, jobs, progress=not quiet)
     if quiet:
         return
     screen = console()
@@ -221,6 +223,16 @@ def simulate(
     screen.print(
         f"written: {out}/: measurement.json, readings.csv" + (f"; {truth}" if truth else "")
     )
+
+
+def _check_apart(truth: Path, out: Path) -> None:
+    from tmlattice.errors import MeasurementError
+
+    folders = truth.resolve().parents
+    if out.resolve() in folders or any((f / "measurement.json").exists() for f in folders):
+        raise MeasurementError(
+            f"the truth '{truth}' may not lie in a measurement's folder; name another place"
+        )
 
 
 def _named(ring: Any, cause: Any) -> Any:

@@ -362,6 +362,19 @@ class Model:
         turned = _through(paths.monitors, by_turn)
         return np.asarray(turned.reshape(len(kick), 2, *paths.readings.shape))
 
+    def free_kicks(
+        self, paths: Paths, layers: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], Array]:
+        """A kick (px, py) in the middle of layers' magnets on one turn, as a change of the launch.
+
+        Returns:
+            The first reading behind each, [layer], and [layer, 2, shot, n].
+        """
+        kick = np.stack([self._kick(k) for k in layers])
+        inverse = np.linalg.inv(paths.tangents[:, layers + 1])  # [shot, layer, n, n]
+        pulled = np.einsum("slij,lpj->lpsi", inverse, kick, optimize=True)
+        return np.searchsorted(self._where(), layers + 1), pulled
+
     def single_kicks(
         self, paths: Paths, hypotheses: Sequence[Hypothesis]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:

@@ -8,6 +8,7 @@ is that of a number of independent hypotheses, which is fitted.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +111,11 @@ def scan(
     data = np.concatenate([projection.out(residual)[None], draws])
     sums = _Sums(len(hypotheses), len(data))
     rest = np.ones(len(hypotheses), dtype=bool)
-    if not whitening.dense:
+    if whitening.dense and model.turns == 1:
+        metric = DenseMetric(model, paths, whitening, projection, active)
+        for done in (metric.kicks(hypotheses, data, sums), metric.readings(hypotheses, data, sums)):
+            rest[done] = False
+    elif not whitening.dense:
         for add in (_kicks, _readings):
             done = add(model, paths, hypotheses, whitening, projection, data, active, sums)
             rest[done] = False
@@ -227,6 +232,110 @@ def _readings(
     return np.array([i for members in of_effect.values() for i in members], dtype=np.intp)
 
 
+class DenseMetric:
+    """Products of signatures where a background correlates all readings of all shots.
+
+    Readings stand monitor by monitor. The launches' signatures behind each monitor have a Gram
+    matrix that grows by that monitor's rows: all of them cost one product of the precision with
+    the slopes.
+
+    Args:
+        model, paths: the base.
+        whitening, projection: the noise with its background, and the launches.
+        active: shots in which a cause would be there.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        paths: Paths,
+        whitening: Whitening,
+        projection: Projection,
+        active: NDArray[np.bool_],
+    ) -> None:
+        self.model, self.paths, self.whitening = model, paths, whitening
+        self.weight = whitening.weight * active[:, None, None]
+        shots, monitors = self.weight.shape[:2]
+        self.order = (
+            np.arange(self.weight.size).reshape(shots, monitors, 2).transpose(1, 0, 2).ravel()
+        )
+        precision = whitening.projected_precision(projection)
+        self.precision = precision[np.ix_(self.order, self.order)]
+
+    def data(self, rows: Array) -> Array:
+        """Precision times data, for products with signatures: [data, shot, reading, 2]."""
+        parts = rows.reshape(len(rows), self.weight.shape[0], -1)[:, :, :-5]
+        return self.whitening.back(parts) * (self.weight > 0)
+
+    @cached_property
+    def slopes(self) -> Array:
+        """Weighted d readings / d launch, [shot, reading, 2, n]."""
+        return np.asarray(self.weight[..., None] * self.model.slopes(self.paths))
+
+    @cached_property
+    def grams(self) -> Array:
+        """Of the launches' signatures from each reading on, [reading + 1, shot n, shot n]."""
+        shots, monitors, _, n = self.slopes.shape
+        spread = np.zeros((monitors, shots, 2, shots, n))
+        for shot in range(shots):
+            spread[:, shot, :, shot] = self.slopes[shot]
+        H = spread.reshape(monitors, 2 * shots, shots * n)
+        rows = H.reshape(-1, shots * n)
+        grams = np.zeros((monitors + 1, shots * n, shots * n))
+        for m in range(monitors - 1, -1, -1):
+            own = slice(2 * shots * m, 2 * shots * (m + 1))
+            behind = slice(2 * shots * (m + 1), None)
+            cross = H[m].T @ (self.precision[own, behind] @ rows[behind])
+            self_ = H[m].T @ self.precision[own, own] @ H[m]
+            grams[m] = grams[m + 1] + cross + cross.T + self_
+        return grams
+
+    def kicks(self, hypotheses: Sequence[Hypothesis], rows: Array, sums: _Sums) -> NDArray[np.intp]:
+        """Add the single kicks among the hypotheses; returns which these are."""
+        which, start, pulled = self.model.single_kicks(self.paths, hypotheses)
+        if not len(which):
+            return which
+        stacked = np.moveaxis(pulled, 0, 1).reshape(len(which), -1)  # [kick, shot n]
+        whole = np.empty(len(which))
+        for m in np.unique(start):
+            at = start == m
+            whole[at] = np.einsum("ki,ij,kj->k", stacked[at], self.grams[m], stacked[at])
+        inner = np.empty((len(which), len(rows)))
+        model_slopes = self.model.slopes(self.paths)
+        for d, row in enumerate(self.data(rows)):
+            behind = _behind(np.einsum("smpi,smp->smi", model_slopes, row))
+            inner[:, d] = np.einsum("ski,ski->k", pulled, behind[:, start])
+        sums.add(which, whole, np.zeros(len(which)), inner)
+        return which
+
+    def block(self, m: int) -> Array:
+        """Precision of one monitor's readings, in units of their noise, [shot 2, shot 2]."""
+        shots = len(self.weight)
+        own = slice(2 * shots * m, 2 * shots * (m + 1))
+        return np.asarray(self.precision[own, own])
+
+    def readings(
+        self, hypotheses: Sequence[Hypothesis], rows: Array, sums: _Sums
+    ) -> NDArray[np.intp]:
+        """Add the effects on readings; returns which these are."""
+        monitor = {name: m for m, name in enumerate(self.model.maps.monitors)}
+        data = self.data(rows)
+        done = []
+        for i, (name, place) in enumerate(hypotheses):
+            effect = find(name)
+            if not isinstance(effect, ReadingEffect) or place is None:
+                continue
+            m = monitor[place]
+            h = 1.0 if effect.discrete else 1e-6
+            change = np.nan_to_num(effect.change(self.paths.beam[:, m], h) / h)
+            weighted = (self.weight[:, m] * change).ravel()
+            whole = weighted @ self.block(m) @ weighted
+            inner = np.einsum("sp,dsp->d", change, data[:, :, m])
+            sums.add(np.array([i]), whole, np.zeros(1), inner)
+            done.append(i)
+        return np.array(done, dtype=np.intp)
+
+
 @dataclass(frozen=True)
 class FreeScan:
     """The same for what has no name: free kicks at places, or free readings of monitors.
@@ -301,6 +410,23 @@ def scan_kicks(
     """A free kick (px, py) in every active shot, in the middle of each of these layers' magnets."""
     clean = projection.out(residual)
     shots = np.flatnonzero(active)
+    if whitening.dense and model.turns == 1:
+        metric = DenseMetric(model, paths, whitening, projection, active)
+        first, pulled = model.free_kicks(paths, np.asarray(layers))  # [layer, 2, shot, n]
+        behind = _behind(
+            np.einsum("smpi,smp->smi", model.slopes(paths), metric.data(clean[None])[0])
+        )
+        n = pulled.shape[3]
+        gram = np.empty((len(layers), 1, 2 * len(shots), 2 * len(shots)))
+        inner = np.empty((len(layers), 1, 2 * len(shots)))
+        for k, m in enumerate(first):
+            V = np.zeros((len(shots), 2, model.shots, n))
+            for i, shot in enumerate(shots):
+                V[i, :, shot] = pulled[k, :, shot]
+            flat = V.reshape(2 * len(shots), -1)
+            gram[k, 0] = flat @ metric.grams[m] @ flat.T
+            inner[k, 0] = flat @ behind[:, m].ravel()
+        return _free_scan(np.asarray(layers), gram, inner)
     grams, inners = [], []
     for start in range(0, len(layers), 128):
         kicked = model.kick_signatures(paths, np.asarray(layers[start : start + 128]))
@@ -334,17 +460,15 @@ def scan_monitors(
     turns = shape[1] // monitors
     reading = np.arange(turns) * monitors
     if whitening.dense:
+        blocks = whitening.projected_precision(projection)
+        data = whitening.back(clean.reshape(whitening.shots, -1)[:, :-5])
+        flat = np.arange(np.prod(shape)).reshape(shape)
         grams, inners = [], []
         for m in range(monitors):
-            alone = np.zeros((len(shots), turns, 2, *shape))
-            for i, shot in enumerate(shots):
-                for turn in range(turns):
-                    for plane in range(2):
-                        alone[i, turn, plane, shot, turn * monitors + m, plane] = 1.0
-            rows = whitening.signature(alone).reshape(-1, len(clean))
-            rows = projection.out(rows)
-            grams.append((rows @ rows.T)[None])
-            inners.append((rows @ clean)[None])
+            own = flat[shots][:, reading + m].ravel()
+            scale = whitening.weight.ravel()[own]
+            grams.append((scale[:, None] * blocks[np.ix_(own, own)] * scale)[None])
+            inners.append(data.ravel()[own][None])
         return _free_scan(np.arange(monitors), np.stack(grams), np.stack(inners))
     # the rows of a monitor in its shot, and what the launch's directions have there
     places = 2 * (reading[None, :, None] + np.arange(monitors)[:, None, None]) + np.arange(2)

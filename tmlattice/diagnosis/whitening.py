@@ -6,9 +6,12 @@ parameters: their directions are projected out of data and signatures alike. Wha
 launch stands in further rows: rows are [shot, 2 readings + 5 coordinates], flattened.
 """
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cholesky
+from scipy.linalg.lapack import dtrtri
 
 from tmlattice.diagnosis.data import Data
 
@@ -39,25 +42,47 @@ class Whitening:
         self._prior[:, (data.launch_sigma == 0).all(axis=0)] = 0.0
         self._nominal = data.launches
         self.rows = self.shots * (self.weight[0].size + 5)
-        self._factor: Array | None = None
+        self._inverse: Array | None = None  # of the Cholesky factor: products beat solutions
         if background is not None and len(background):
             B = (self.weight * background).reshape(len(background), -1)
             covariance = B.T @ B
             covariance[np.diag_indices(len(covariance))] += 1.0
-            self._factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
+            factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
+            self._inverse, failed = dtrtri(factor, lower=1, overwrite_c=1)
+            assert failed == 0
 
     @property
     def dense(self) -> bool:
         """Whether readings of different shots are correlated."""
-        return self._factor is not None
+        return self._inverse is not None
+
+    @cached_property
+    def precision(self) -> Array:
+        """Inverse covariance of readings in units of their own noise, all shots, [row, row]."""
+        assert self._inverse is not None
+        return np.asarray(self._inverse.T @ self._inverse)
+
+    def projected_precision(self, projection: "Projection") -> Array:
+        """The precision less what launches explain, in units of the readings' noise, [row, row]."""
+        assert self._inverse is not None
+        Q = projection.Q[0].reshape(self.shots, -1, projection.Q.shape[2])[:, :-5]
+        along = self._inverse.T @ Q.reshape(len(self._inverse), -1)
+        return np.asarray(self.precision - along @ along.T)
+
+    def back(self, rows: Array) -> Array:
+        """Whitened rows [..., shot, reading * 2], such that a product with them is one with the
+        whitened signature: [..., shot, reading, 2], 1 / m."""
+        flat = rows.reshape(*rows.shape[:-2], -1)
+        if self._inverse is not None:
+            flat = flat @ self._inverse
+        return np.asarray(self.weight * flat.reshape(*rows.shape[:-2], *self.weight.shape))
 
     def _flat(self, x: Array) -> Array:
         rows = (self.weight * x).reshape(*x.shape[:-3], -1)
-        if self._factor is None:
+        if self._inverse is None:
             return np.asarray(rows)
         flat = rows.reshape(-1, rows.shape[-1])
-        solved = solve_triangular(self._factor, flat.T, lower=True, check_finite=False)
-        return np.ascontiguousarray(solved.T).reshape(rows.shape)
+        return np.asarray(flat @ self._inverse.T).reshape(rows.shape)
 
     def signature(self, x: Array) -> Array:
         """x [..., shot, reading, 2] in m as rows [..., row]; zero in the launch's rows."""

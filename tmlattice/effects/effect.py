@@ -58,6 +58,8 @@ class Effect(ABC):
         places = self.places(ring)
         if not np.isfinite(cause.amount):
             raise EffectError(f"{self.name}: the amount is {cause.amount}; give a number")
+        if self.discrete and cause.amount not in range(int(self.largest) + 1):
+            raise EffectError(f"{self.name} is there or not: {self.sign}; not {cause.amount:g}")
         if places == [None]:
             if cause.element is not None:
                 raise EffectError(f"{self.name} has no element; leave '{cause.element}' out")

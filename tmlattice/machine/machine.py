@@ -1,5 +1,6 @@
 """A machine that can be measured: a ring with causes, its monitors, their noise."""
 
+import logging
 import pickle
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,8 @@ from tmlattice.lattice import Ring
 from tmlattice.machine.shots import Shots, stream
 
 Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
 
 ENGINES = ("at", "ocelot")
 
@@ -74,9 +77,13 @@ class Machine:
         self.ring = ring
         self.causes = tuple(causes)
         self.monitors = monitors_with(ring, causes)
-        self.noise = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
-        if not (np.isfinite(self.noise).all() and (self.noise >= 0).all()):
-            raise TmlatticeError(f"the noise is {noise} m; it is an rms: zero or more")
+        rms = np.asarray(noise, dtype=float)
+        if rms.shape not in ((), (2,)) or not ((rms >= 0) & (rms < np.inf)).all():
+            raise TmlatticeError(
+                f"the noise is {noise} m; it is an rms, or two (x, y): zero or more"
+            )
+        self.noise = np.broadcast_to(rms, (2,))
+        self.engine = engine
         self._made_of: dict[str, Any] = {"engine": engine, "radiation": radiation, "noise": noise}
         self._engine = _engine(engine, ring, causes, radiation)
 
@@ -125,11 +132,14 @@ class Machine:
         first: Array | None = None
         starts = range(0, len(shots), CHUNK)
         chunks = [range(start, min(start + CHUNK, len(shots))) for start in starts]
+        dead = self.monitors.silent.sum() * turns * 2
         for chunk, readings in zip(chunks, self._parts(shots, chunks, turns, seed, jobs)):  # noqa: B905
             for shot, reading in zip(chunk, readings, strict=True):
                 if first is None:
                     first = reading[0, frozen].copy()
                 reading[:, frozen] = first
+                if np.isnan(reading).sum() > dead:
+                    log.warning("shot %d: the beam is lost; what follows is missing", shot)
                 yield shot, reading
 
     def _parts(

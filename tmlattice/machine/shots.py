@@ -1,7 +1,8 @@
 """What the operator asks for: the launch and the settings of every shot, drawn from a seed.
 
-Launches, settings, noise and background errors have one random stream each: the same seed gives the
-same launches with either engine, with or without a fault.
+Launches, their jitter, settings, noise and background errors have one random stream each: the same
+seed gives the same launches with either engine, with or without a fault, and the first shots of a
+longer measurement.
 """
 
 import zlib
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, Settings, find
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.network import TaylorNetwork
 from tmlattice.optics import one_turn_optics
@@ -72,27 +73,37 @@ def draw_shots(
         seed: of launches and kicks.
 
     Raises:
-        TmlatticeError: no shot, or an amplitude that is not positive.
+        TmlatticeError: no shot, an amplitude that is not positive, or a sigma that is no rms.
+        BeamLostError: an amplitude that the design does not carry.
         UnstableRingError: a design without betatron phases.
     """
     if shots < 1 or not 0 < amplitude < np.inf:
         raise TmlatticeError(
             f"{shots} shots of {amplitude:g} m cannot be made; ask for one at least, above 0 m"
         )
+    spread = np.asarray(sigma, dtype=float)
+    if spread.shape != (5,) or not ((spread >= 0) & (spread < np.inf)).all():
+        raise TmlatticeError(
+            f"the launches' rms {sigma} should be five numbers (x, px, y, py, delta), none negative"
+        )
     network = TaylorNetwork.from_ring(ring)
     modes = one_turn_optics(network).modes
-    random = stream(seed, "launches")
-    phases = random.uniform(0, 2 * np.pi, (shots, 2))
+    phases = stream(seed, "launches").uniform(0, 2 * np.pi, (shots, 2))
     turned = np.exp(1j * phases)[:, :, None] * modes.T  # [shot, plane, 4]
     planes = 1e-6 * np.real(turned)
     for plane in (0, 1):  # each alone to the same rms, then both together
         planes[:, plane] /= _rms(network, planes[:, plane])[:, None]
     launch = 1e-6 * planes.sum(axis=1)
-    for _ in range(3):
-        launch *= (amplitude / _rms(network, launch))[:, None]
+    try:
+        for _ in range(3):
+            launch *= (amplitude / _rms(network, launch))[:, None]
+    except BeamLostError as error:
+        raise BeamLostError(
+            f"an orbit of {amplitude:g} m rms is lost in the design; ask for a smaller amplitude"
+        ) from error
     nominal = np.concatenate([launch, np.zeros((shots, 1))], axis=1)
-    spread = np.asarray(sigma, dtype=float)
-    actual = nominal + spread * random.standard_normal(nominal.shape)
+    jitter = stream(seed, "jitter").standard_normal(nominal.shape)
+    actual = nominal + spread * jitter
     launches = np.zeros((shots, 6))
     launches[:, :4], launches[:, 5] = actual[:, :4], actual[:, 4]
     return Shots(nominal, launches, spread, _draw_settings(ring, shots, kicks, settings, seed))

@@ -30,6 +30,7 @@ class Simulation:
         causes: without the background.
         background: rms by effect.
         turns, seed: of the measurement; the seed is that of the noise.
+        machine_seed: of the background.
         radiation: whether bends and wigglers radiate.
     """
 
@@ -39,6 +40,7 @@ class Simulation:
     background: Mapping[str, float]
     turns: int
     seed: int
+    machine_seed: int
     radiation: bool
 
     def measurement(self) -> Measurement:
@@ -82,7 +84,7 @@ class Simulation:
                 writer.add(shot, shots.nominal[shot], shots.sigma, shots.settings[shot], readings)
 
     def truth(self) -> dict[str, Any]:
-        """What was really there, for `write_truth`: effects, launches, background, seed."""
+        """What was really there, for `write_truth`: effects, launches, background, seeds."""
         ring = self.machine.ring
         positions = {element.name: element.s for element in ring.elements}
         return {
@@ -96,7 +98,12 @@ class Simulation:
                 for cause in self.causes
             ],
             "launches": self.shots.launches[:, [0, 1, 2, 3, 5]],
-            "background": {**self.background, "radiation": self.radiation},
+            "background": {
+                **self.background,
+                "radiation": self.radiation,
+                "engine": self.machine.engine,
+                "machine_seed": self.machine_seed,
+            },
             "seed": self.seed,
         }
 
@@ -141,9 +148,10 @@ def simulate(
         EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
     """
     rms = background_rms(background or {})
-    small = draw_background(ring, rms, seed if machine_seed is None else machine_seed)
+    machine_seed = seed if machine_seed is None else machine_seed
+    small = draw_background(ring, rms, machine_seed)
     machine = Machine(ring, [*small, *causes], engine=engine, radiation=radiation, noise=noise)
     drawn = draw_shots(
         ring, shots, amplitude, sigma=launch_sigma, kicks=kicks, settings=settings, seed=seed
     )
-    return Simulation(machine, drawn, tuple(causes), rms, turns, seed, radiation)
+    return Simulation(machine, drawn, tuple(causes), rms, turns, seed, machine_seed, radiation)

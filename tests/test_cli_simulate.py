@@ -1,0 +1,177 @@
+"""`tmlattice simulate` and `tmlattice effects` as a user runs them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from tmlattice.cli.command import tmlattice as command
+from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.errors import TmlatticeError
+from tmlattice.machine import simulate
+from tmlattice.measurement import read_measurement, read_truth
+
+SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
+QUICK = ("simulate", SMALL, "--engine", "ocelot", "--amplitude", "1e-4")
+
+
+def run(*arguments):
+    """In this process: the exit code as `main` would have it, and all that was printed or said."""
+    done = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
+    if done.exception is None:
+        return 0, done.output
+    if isinstance(done.exception, TmlatticeError):
+        return 2, str(done.exception)
+    if hasattr(done.exception, "format_message"):
+        return 2, done.exception.format_message()
+    raise done.exception
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def left(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_simulate_writes_the_folder_and_the_truth(folder, small_ring):
+    code, text = run(
+        *QUICK, "--effect", "quadrupole_gradient qd::5 -0.02", "--effect", "energy_offset 1e-4",
+        "--background", "monitor_roll", "--background", "quadrupole_gradient=2e-3",
+        "--shots", 3, "--turns", 2, "--seed", 5, "--machine-seed", 1,
+        "--out", "day", "--truth", "truth.json",
+    )  # fmt: skip
+    assert code == 0, text
+    assert left(folder) == ["day", "day/measurement.json", "day/readings.csv", "truth.json"]
+    for words in ("3 shots of 2 turn(s)", "noise 20 µm", "engine ocelot, seed 5",
+                  "quadrupole_gradient", "QD::5", "background monitor_roll: rms 0.005 rad",
+                  "background quadrupole_gradient: rms 0.002", "written: day/"):  # fmt: skip
+        assert words in text
+    causes = [Cause("quadrupole_gradient", "QD::5", -0.02), Cause("energy_offset", None, 1e-4)]
+    same = simulate(
+        small_ring, causes, background={"monitor_roll": None, "quadrupole_gradient": 2e-3},
+        engine="ocelot", amplitude=1e-4, shots=3, turns=2, seed=5, machine_seed=1,
+    )  # fmt: skip
+    np.testing.assert_array_equal(read_measurement("day").readings, same.measurement().readings)
+    truth = read_truth("truth.json")
+    assert [(e["effect"], e["element"], e["amount"]) for e in truth.effects] == [
+        (c.effect, c.element, c.amount) for c in causes
+    ]
+    assert (truth.seed, truth.background["machine_seed"]) == (5, 1)
+
+
+def test_simulate_measures_with_given_settings(folder):
+    settings = [{"v3": {"kick": 1e-5}}, {}]
+    Path("settings.json").write_text(json.dumps(settings))
+    code, text = run(*QUICK, "--shots", 2, "--settings", "settings.json", "--out", "day", "-q")
+    assert (code, text) == (0, "")
+    assert read_measurement("day").settings == tuple(settings)
+
+
+def test_simulate_as_a_process_is_silent_when_asked_and_ends_with_2(tmp_path):
+    def process(*arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "tmlattice", *arguments],
+            cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300,
+        )  # fmt: skip
+
+    done = process("simulate", SMALL, "--amplitude", "1e-4", "--out", "day", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    done = process(*QUICK, "--effect", "quadrupole_gradiant qd::5 -0.2", "--out", "other")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("tmlattice: no effect 'quadrupole_gradiant'; did you mean 'quad")
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--effect", "quadrupole_gradiant qd::5 -0.2"], "did you mean 'quadrupole_gradient'"),
+        (["--effect", "quadrupole_gradient qd::55 -0.2"], "no element 'qd::55'; did you mean"),
+        (["--effect", "quadrupole_gradient bend::1 -0.2"], "a bend; it sits on: quadrupoles"),
+        (["--effect", "quadrupole_gradient -0.2"], "needs an element: quadrupoles"),
+        (["--effect", "quadrupole_gradient qd::5"], "give NAME [ELEMENT] AMOUNT in quotes"),
+        (["--effect", "quadrupole_gradient qd::5 much"], "give NAME [ELEMENT] AMOUNT in quotes"),
+        (["--effect", ""], "give NAME [ELEMENT] AMOUNT in quotes"),
+        (["--effect", "quadrupole_gradient qd::5 nan"], "the amount is nan"),
+        (["--effect", "energy_offset qd::5 1e-3"], "leave 'qd::5' out"),
+        (["--background", "monitor_rol"], "did you mean 'monitor_roll'"),
+        (["--background", "energy_offset"], "say energy_offset=RMS"),
+        (["--background", "monitor_roll=much"], "'much' is no rms"),
+        (["--background", "all=-1"], "zero or more"),
+        (["--shots", "0"], "--shots"),
+        (["--turns", "0"], "--turns"),
+        (["--noise", "-1"], "--noise"),
+        (["--amplitude", "0"], "--amplitude"),
+        (["--amplitude", "1"], "smaller amplitude"),
+        (["--engine", "madx"], "--engine"),
+        (["--launch-sigma", "1e-4,1e-4"], "five rms values"),
+        (["--launch-sigma", "1e-4,x,0,0,0"], "five rms values"),
+        (["--settings", "wrong.json"], "a list with one object for each shot"),
+        (["--settings", "broken.json"], "is no JSON"),
+        (["--settings", "three.json"], "3 settings do not fit 6 shots"),
+        (["--settings", "kick.json", "--shots", "1"], "kick"),
+        (["--settings", "unknown.json", "--shots", "1"], "no element 'v33'; did you mean"),
+        (["--truth", "day/truth.json"], "may not lie in a measurement's folder"),
+        (["--truth", "./x/../day/deeper/truth.json"], "may not lie in a measurement's folder"),
+        (["--truth", "other/truth.json"], "may not lie in a measurement's folder"),
+        (["--truth", "nowhere/truth.json"], "cannot write"),
+        (["--truth", "taken"], "is a folder"),
+        (["--out", "/dev/null/day"], "cannot write"),
+        (["--out", "wrong.json", "--truth", "truth.json"], "is a file"),
+    ],
+)  # fmt: skip
+def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(folder, arguments, words):
+    (folder / "other").mkdir()
+    (folder / "other" / "measurement.json").write_text("{}")
+    (folder / "taken").mkdir()
+    for name, text in (("wrong", '{"v3": 1}'), ("broken", "[{"), ("three", "[{}, {}, {}]"),
+                       ("kick", '[{"qd::5": {"kick": 1e-5}}]'),
+                       ("unknown", '[{"v33": {"kick": 1e-5}}]')):  # fmt: skip
+        (folder / f"{name}.json").write_text(text)
+    before = left(folder)
+    code, text = run(*QUICK, "--out", "day", *arguments)
+    assert code == 2, text
+    assert words in text
+    assert "\n" not in text.strip()
+    assert left(folder) == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
+def test_folder_without_leave_to_write(folder):
+    (folder / "closed").mkdir(mode=0o500)
+    code, text = run(*QUICK, "--out", "closed/day")
+    assert (code, "cannot write" in text) == (2, True)
+
+
+def test_effects_lists_the_catalogue():
+    code, text = run("effects")
+    assert code == 0
+    flat = " ".join(text.split())
+    for name, effect in CATALOGUE.items():
+        assert f" {name} {effect.unit} " in flat, name
+
+
+def test_effects_as_json(folder):
+    code, text = run("effects", "--json", "effects.json")
+    assert (code, text) == (0, "")
+    document = json.loads(Path("effects.json").read_text())
+    assert (document["format"], document["version"]) == ("tmlattice-effects", 1)
+    rows = {row["effect"]: row for row in document["effects"]}
+    assert list(rows) == list(CATALOGUE)
+    for name, effect in CATALOGUE.items():
+        assert rows[name] == {
+            "effect": name, "sits_on": effect.sits_on_text, "unit": effect.unit,
+            "sign": effect.sign, "background_rms": effect.background,
+            "largest_fault": effect.largest,
+        }  # fmt: skip
+    code, text = run("effects", "--json", "nowhere/effects.json")
+    assert (code, "cannot write" in text) == (2, True)
