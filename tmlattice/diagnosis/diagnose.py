@@ -23,6 +23,7 @@ from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measureme
 from tmlattice.diagnosis.noise import estimate, local_misfit
 from tmlattice.diagnosis.refine import Fit, Problem, fit
 from tmlattice.diagnosis.scan import look_elsewhere
+from tmlattice.diagnosis.small_errors import SmallErrors, small_errors
 from tmlattice.diagnosis.whitening import Whitening
 from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
 from tmlattice.errors import MeasurementError, TmlatticeError, UnstableRingError
@@ -286,17 +287,21 @@ def diagnose(
     _check_lattice(ring, data, start)
 
     rms = background_rms(background or {})
-    spread = None
-
-    def problem_without(dropped: NDArray[np.bool_]) -> Problem:
-        kept = data.without(dropped)
-        return Problem(model, kept, Whitening(kept, spread), places)
-
     nobody = np.zeros(data.valid.shape, dtype=bool)
-    before = fit(problem_without(nobody), (), start.launches)
+    before = fit(Problem(model, data, Whitening(data), places), (), start.launches)
+    small: SmallErrors | None = None
+    fitted = data
     if rms:
         progress("background")
-        spread = _background_signatures(model, before, rms)
+        small = small_errors(ring, data, known, rms, before.launches)
+        model, fitted, before = small.model, small.data, small.before
+
+    def problem_without(dropped: NDArray[np.bool_]) -> Problem:
+        kept = fitted.without(dropped)
+        spread = None if small is None else small.spread
+        return Problem(model, kept, Whitening(kept, spread), places)
+
+    if small is None:
         before = fit(problem_without(nobody), (), before.launches)
     progress("scan")
     hypotheses = model.hypotheses(chosen)
@@ -316,7 +321,7 @@ def diagnose(
     result = explanation.fit
     causes = result.causes
     findings = _findings(ring, model, explanation, dead)
-    kept = data.without(explanation.dropped)
+    kept = fitted.without(explanation.dropped)
     freedom = _freedom(kept, result)
     p_value = float(stats.chi2.sf(result.chi2, freedom))
     verdict, standing = _verdict(explanation, findings, p_value, estimated, warnings)
@@ -326,9 +331,14 @@ def diagnose(
     if heldout is not None:
         other = of_measurement(ring, heldout).with_sigma(np.array(noise))
         other = _same_monitors(other, data, explanation)
-        held = Model(ring, other.settings, other.turns, known)
         steps = [causes[:i] for i in range(len(causes) + 1)]
-        gap = held_out_gap(held, other, steps, seed)
+        there = [known] * len(steps)
+        if small is not None:  # the small errors, as each explanation leaves them
+            steps = [(), causes] if causes else [()]
+            fits = [before, result][: len(steps)]
+            there = [[*known, *small.estimate(f)] for f in fits]
+        models = [Model(ring, other.settings, other.turns, k) for k in there]
+        gap = held_out_gap(models, other, steps, seed)
     repaired = apply(ring, causes)
     shown = result if causes == result.causes else before
     active = data.active[:, None, None]
@@ -453,17 +463,6 @@ def _check_lattice(ring: Ring, data: Data, start: Fit) -> None:
             f"the model errs by {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} µm; name "
             "the lattice of this machine, and check units and the names of the monitors"
         )
-
-
-def _background_signatures(model: Model, before: Fit, rms: Mapping[str, float]) -> Array:
-    """tau_h s_h of every background error, also in a reference: it is the same machine."""
-    parts = []
-    for name, size in rms.items():
-        hypotheses = model.hypotheses([name])
-        if hypotheses:
-            rows = model.signatures(before.paths, hypotheses, before.launches)
-            parts.append(size * np.nan_to_num(rows))
-    return np.concatenate(parts) if parts else np.zeros((0, *before.paths.readings.shape))
 
 
 # --- after the search ----

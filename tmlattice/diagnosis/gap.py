@@ -48,7 +48,7 @@ class Gap:
 
 
 def held_out_gap(
-    model: Model,
+    models: Sequence[Model],
     data: Data,
     steps: Sequence[Sequence[Cause]],
     seed: int = 0,
@@ -56,18 +56,18 @@ def held_out_gap(
     """The gap of a series of models on shots that no fit saw.
 
     Args:
-        model: of these shots.
+        models: of these shots, one for each step: they differ in what is known beside the causes.
         data: their readings.
         steps: the causes of each model; the first is the design's, mostly ().
         seed: of the bootstrap.
     """
-    count = len(model.at)
+    count = len(models[0].at)
     odd = np.tile(np.arange(count) % 2 == 1, data.turns)
     fitted = data.without(np.broadcast_to(odd[None, :, None], data.valid.shape))
     whitening = Whitening(fitted)
     scored = data.valid & odd[None, :, None]
     residuals = []
-    for causes in steps:
+    for model, causes in zip(models, steps, strict=True):
         launches = fit(Problem(model, fitted, whitening, {}, tuple(causes)), (), data.launches)
         difference = data.readings - launches.paths.readings
         residuals.append(np.where(scored, difference, np.nan))

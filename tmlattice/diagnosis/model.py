@@ -17,6 +17,7 @@ from tmlattice.effects import (
     Cause,
     Directions,
     LaunchEffect,
+    Monitors,
     ReadingEffect,
     RingEffect,
     Settings,
@@ -40,6 +41,9 @@ Hypothesis = tuple[str, str | None]
 """An effect and the place where it might sit."""
 
 Patch = tuple[list[Array], int, list[Array]]
+FEW = 10
+"""Known causes of which a model is worth keeping."""
+
 Kicks = Mapping[int, Array]
 """By layer: (px, py) of every shot in the middle of its magnet, rad, [shot, 2]."""
 
@@ -81,14 +85,18 @@ class _Base:
 
 
 def _base(ring: Ring, known: tuple[Cause, ...], dimension: int) -> _Base:
-    key = ("model", known, dimension)
-    if key not in ring.memory:
-        with_known = apply(ring, known) if known else ring
-        layers = LayerMaps(with_known, dimension)
-        maps = ring_maps(with_known, dimension, layers)
+    key = ("model", known if len(known) < FEW else None, dimension)
+    if key in ring.memory and len(known) < FEW:
+        kept: _Base = ring.memory[key]
+        return kept
+    with_known = apply(ring, known) if known else ring
+    layers = LayerMaps(with_known, dimension)
+    maps = ring_maps(with_known, dimension, layers)
+    if len(known) < FEW:
         ring.memory[key] = _Base(with_known, layers, maps, {})
-    base: _Base = ring.memory[key]
-    return base
+        return _base(ring, known, dimension)
+    # small errors everywhere turn a hypothesis's direction by as little as they are large
+    return _Base(with_known, layers, maps, _base(ring, (), dimension).directions)
 
 
 class _Group:
@@ -130,8 +138,10 @@ class Model:
         self.dimension = dimension
         self._base = _base(ring, tuple(known), dimension)
         self.ring, self.layers, maps = self._base.ring, self._base.layers, self._base.maps
+        self._known_monitors = monitors_with(ring, known)
         self.maps = maps
         self.at = maps.at
+        self._monitor = {name: m for m, name in enumerate(maps.monitors)}
         base = [
             np.concatenate([w, c[None]])
             for w, c in zip((maps.W0, maps.W1, maps.W2), maps.closing.coefficients, strict=True)
@@ -244,12 +254,20 @@ class Model:
         return self._read(self.beam(launches, causes, kicks), causes)
 
     def _read(self, beam: Array, causes: Sequence[Cause]) -> Array:
-        monitors = monitors_with(self.ring, causes)
         by_turn = beam.reshape(self.shots, self.turns, -1, 2)
-        readings = monitors.read(by_turn)
+        readings = self._monitors(causes).read(by_turn)
         if not self.active.all():
-            readings[~self.active] = by_turn[~self.active]
+            readings[~self.active] = self._known_monitors.read(by_turn[~self.active])
         return readings.reshape(beam.shape)
+
+    def _monitors(self, causes: Sequence[Cause]) -> Monitors:
+        """The monitors with what is known of them and with causes."""
+        monitors = self._known_monitors.copy()
+        for cause in causes:
+            effect = find(cause.effect)
+            if isinstance(effect, ReadingEffect):
+                effect.set(monitors, self._monitor[cause.element or ""], cause.amount)
+        return monitors
 
     def paths(
         self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS
@@ -280,8 +298,9 @@ class Model:
                     own[..., b] += R2[..., pair] * x[:, :, None, a]
             slopes[shots] = own @ part[1][:, where]
         beam = self.beam(launches, causes, kicks)
-        monitors = np.tile(np.eye(2), (self.shots, len(self.at), 1, 1))
-        monitors[self.active] = monitors_with(self.ring, causes).matrix()
+        monitors = np.empty((self.shots, len(self.at), 2, 2))
+        monitors[:] = self._known_monitors.matrix()
+        monitors[self.active] = self._monitors(causes).matrix()
         turned = np.einsum(
             "smij,stmjk->stmik", monitors, slopes.reshape(self.shots, self.turns, -1, 2, n)
         ).reshape(slopes.shape)
@@ -323,7 +342,7 @@ class Model:
         ring = [i for i, (name, _) in enumerate(hypotheses) if isinstance(find(name), RingEffect)]
         if ring:
             self._ring_signatures(paths, [hypotheses[i] for i in ring], np.array(ring), out)
-        index = {monitor: i for i, monitor in enumerate(self.maps.monitors)}
+        index = self._monitor
         count = len(self.at)
         for i, (name, place) in enumerate(hypotheses):
             effect = find(name)
@@ -450,7 +469,8 @@ class Model:
     def _directions(self, hypotheses: list[Hypothesis], group: _Group) -> Directions:
         key = tuple(hypotheses)
         if key not in self._base.directions:
-            self._base.directions[key] = directions(self.layers, hypotheses)
+            design = _base(self.design, (), self.dimension).layers
+            self._base.directions[key] = directions(design, hypotheses)
         base = self._base.directions[key]
         replaced = set_elements(self.ring, group.settings)
         if not replaced:

@@ -1,0 +1,102 @@
+"""A machine with small errors everywhere: the background against which a fault must be seen.
+
+The errors are Gaussian with known rms, the same in all shots, and far too many to be found one by
+one; what they do to the readings is a covariance. It is linear only about orbits near the true
+ones, which small errors move by millimetres. So the likeliest errors are worked out, put into the
+model, and the covariance is taken anew about that model; the data are moved so that the errors'
+prior still stands about zero.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.data import Data
+from tmlattice.diagnosis.model import Hypothesis, Model
+from tmlattice.diagnosis.refine import Fit, Problem, fit
+from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.effects import Cause
+from tmlattice.lattice import Ring
+
+Array = NDArray[np.float64]
+
+ROUNDS = 2
+"""Linearisations: about the design, and about the likeliest errors."""
+
+
+@dataclass(frozen=True)
+class SmallErrors:
+    """The background, linear about its likeliest amounts.
+
+    Attributes:
+        model: with those amounts in it.
+        data: readings plus what the signatures make of the amounts.
+        spread: rms times signature of every error, [error, shot, reading, 2], m.
+        before: launches alone, in this model.
+        hypotheses, rms: of every error.
+    """
+
+    model: Model
+    data: Data
+    spread: Array
+    before: Fit
+    hypotheses: tuple[Hypothesis, ...]
+    rms: Array
+
+    def estimate(self, explained: Fit) -> list[Cause]:
+        """The likeliest small errors beside an explanation."""
+        whitening = Whitening(self.data, self.spread)
+        clean = explained.projection.out(explained.residual)
+        return _causes(self.hypotheses, self.rms, self.spread, whitening, clean)
+
+
+def _causes(
+    hypotheses: Sequence[Hypothesis], rms: Array, spread: Array, whitening: Whitening, clean: Array
+) -> list[Cause]:
+    rows = clean.reshape(whitening.shots, -1)[:, :-5]
+    weights = whitening.back(rows[None])[0]
+    amounts = rms * np.einsum("esrp,srp->e", spread, weights, optimize=True)
+    return [Cause(*h, float(a)) for h, a in zip(hypotheses, amounts, strict=True)]
+
+
+def small_errors(
+    ring: Ring,
+    data: Data,
+    known: Sequence[Cause],
+    rms: Mapping[str, float],
+    launches: Array,
+) -> SmallErrors:
+    """The background of a machine as these data show it.
+
+    Args:
+        ring: the design.
+        data: all shots, those of a reference too: it is the same machine.
+        known: causes that are there anyway.
+        rms: by effect.
+        launches: first guess, [shot, 5].
+    """
+    estimate: list[Cause] = []
+    for _ in range(ROUNDS):
+        model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
+        alone = fit(Problem(model, data, Whitening(data), {}), (), launches)
+        hypotheses: list[Hypothesis] = []
+        parts, sizes = [], []
+        for name, size in rms.items():
+            some = model.hypotheses([name])
+            if some:
+                hypotheses += some
+                sizes += [size] * len(some)
+                parts.append(size * np.nan_to_num(model.signatures(alone.paths, some, launches)))
+        spread = np.concatenate(parts)
+        scale = np.array(sizes)
+        amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
+        moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
+        shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
+        whitening = Whitening(shifted, spread)
+        before = fit(Problem(model, shifted, whitening, {}), (), alone.launches)
+        launches = before.launches
+        clean = before.projection.out(before.residual)
+        estimate = _causes(hypotheses, scale, spread, whitening, clean)
+    return SmallErrors(model, shifted, spread, before, tuple(hypotheses), scale)
