@@ -368,7 +368,7 @@ def _expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
     energy = ring.energy * 1e9
     bent = sum(e.angle**2 / e.length for e in ring.elements if e.kind == "bend")
     wiggled = sum(_wiggler_curvature(e, energy) for e in ring.elements if e.kind == "wiggler")
-    return C_GAMMA * energy**4 / (2 * np.pi) * (bends * bent + wigglers * wiggled)
+    return float(C_GAMMA * energy**4 / (2 * np.pi) * (bends * bent + wigglers * wiggled))
 
 
 def _matrix(element: Element, energy: float) -> Array:
