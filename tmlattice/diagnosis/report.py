@@ -114,7 +114,7 @@ def least_text(effect: str, amount: float) -> str:
     """The least amount that would be seen; a fault's largest where that is less."""
     kind = find(effect)
     if not amount <= kind.largest:
-        return f"not even {amount_text(effect, kind.largest)}"
+        return f"not even the largest fault, {amount_text(effect, kind.largest)}"
     return amount_text(effect, amount)
 
 
@@ -161,9 +161,9 @@ def closed_text(diagnosis: Diagnosis) -> str:
     """How much of the gap is closed on held-out shots."""
     gap = diagnosis.heldout
     if gap is None:
-        return "no shot was held out: nobody but the fit judges the gap"
+        return "No shot was held out: nobody but the fit judges the gap"
     if gap.closed is None:
-        return "the held-out shots show no gap beyond the noise, so there is none to close"
+        return "The held-out shots show no gap beyond the noise, so there is none to close"
     text = f"{100 * gap.closed:.1f} % of the gap beyond the noise is closed on held-out readings"
     if gap.interval is not None:
         low, high = gap.interval
@@ -186,9 +186,10 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         if count > 1:
             open_ = f"for {len(several)} of them the data allow other explanations too"
         else:
+            others = len(found[0].credible_set) - 1
             open_ = (
-                f"{len(found[0].credible_set)} explanations fit the data alike, and these "
-                "readings cannot tell them apart"
+                "but these readings do not exclude "
+                + ("another explanation" if others == 1 else f"{others} other explanations")
             )
         return f"Likeliest: {what}; {open_}."
     if diagnosis.verdict == "located":

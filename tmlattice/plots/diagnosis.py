@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.diagnose import Diagnosis, Finding
+from tmlattice.diagnosis.explain import SHARES
 from tmlattice.diagnosis.report import words
 from tmlattice.diagnosis.scan import free_threshold
 from tmlattice.plots.strip import lattice_strip
@@ -28,12 +29,15 @@ GROUPS = {
 
 BEFORE, AFTER = "C0", "C3"
 
+NEAR, WIDE = 3, 300.0
+"""So many findings are drawn near by, if they are no wider than this, m."""
+
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
     yield (
         "readings",
-        "Readings of one shot of the fit, and what each model leaves of them.",
+        "Readings of one shot of the fit, and what each model leaves of them, its launch fitted.",
         plot_readings(diagnosis),
     )
     yield (
@@ -43,8 +47,15 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         "anywhere in the scan.",
         plot_scan(diagnosis),
     )
+    for number, finding in enumerate(diagnosis.findings[:NEAR], 1):
+        if finding.where is not None and finding.where[1] - finding.where[0] < WIDE:
+            yield (
+                f"scan-near-{number}",
+                f"The same scan around finding {number}, linear, with the monitors.",
+                plot_scan_near(diagnosis, finding),
+            )
     if diagnosis.heldout is not None:
-        _, ax = plt.subplots(figsize=(9, 4), layout="constrained")
+        _, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
         plot_gap(diagnosis, ax)
         yield (
             "gap",
@@ -149,6 +160,13 @@ def _mark(ax: Axes, diagnosis: Diagnosis) -> None:
 
 
 # --- the scan -------------------------------------------------------------------------------------
+FLOOR = 1.0
+"""Statistics below are as noise has them, and are not drawn."""
+
+ROOM = 60.0
+"""m, on both sides of a finding that is drawn near by."""
+
+
 def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
     """The statistic of every hypothesis along the ring, before anything was found.
 
@@ -158,50 +176,21 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
     """
     figure = plt.figure(figsize=(11, 6), layout="constrained") if figure is None else figure
     grid = figure.subplots(
-        2, 2, sharey="row", sharex="col", height_ratios=[6, 0.8], width_ratios=[7, 1]
+        2, 2, sharey="row", sharex="col", height_ratios=[6, 0.8], width_ratios=[8, 1]
     )
     ax, side, strip = grid[0, 0], grid[0, 1], grid[1, 0]
     grid[1, 1].axis("off")
     found = diagnosis.explanation.first
-    threshold = found.threshold(diagnosis.provenance["options"]["false_alarm"])
-    middles = {element.name: element.s for element in diagnosis.ring.elements}
-    s = np.array([middles.get(place or "", np.nan) for _, place in found.hypotheses])
-    groups = np.array([group(effect) for effect, _ in found.hypotheses])
-    floor = 0.1
-    top = max(float(found.statistic.max(initial=1.0)), threshold)
-    free = diagnosis.explanation.first_kicks
-    layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
-    order = np.argsort(layers)
-    ax.plot(
-        layers[order], np.maximum(free.statistic[order], floor),
-        color="0.6", linewidth=0.8, zorder=1, label="a free kick in each shot",
-    )  # fmt: skip
-    for name, (colour, _) in GROUPS.items():
-        own = (groups == name) & np.isfinite(s) & (found.statistic > 0)
-        if own.any():
-            ax.plot(
-                s[own], np.maximum(found.statistic[own], floor), ".",
-                color=colour, ms=3, label=name, zorder=2, rasterized=True,
-            )  # fmt: skip
-    _whole_ring(side, diagnosis, s, floor)
-    for axes in (ax, side):
-        axes.axhline(threshold, color="k", linestyle="--", linewidth=1, zorder=3)
-        axes.set_yscale("log")
-        axes.set_ylim(floor, 12 * top)
-        axes.grid(alpha=0.25)
-    freedom = int(np.median(free.freedom)) if len(free.freedom) else 1
-    kick_line = free_threshold(
-        diagnosis.provenance["options"]["false_alarm"], max(freedom, 1), len(free.places)
-    )
-    ax.axhline(kick_line, color="0.6", linestyle=":", linewidth=1)
-    ax.annotate(
-        f"threshold {threshold:.1f} (free kicks, dotted: {kick_line:.0f})", (0.995, 0.02),
-        xycoords="axes fraction", ha="right", fontsize="small",
-    )  # fmt: skip
-    ax.set_ylabel("fall of chi-square")
+    _draw_scan(ax, diagnosis, 3.0)
+    threshold = _thresholds(diagnosis)[0]
+    _whole_ring(side, diagnosis)
+    side.axhline(threshold, color="k", linestyle="--", linewidth=1, zorder=3)
+    ax.set_yscale("log")
+    ax.set_ylim(FLOOR, 12 * max(float(found.statistic.max(initial=1.0)), threshold))
+    side.grid(alpha=0.25)
     _mark_findings(ax, diagnosis)
     ax.legend(
-        loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize="small", frameon=False,
+        loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
         markerscale=3,
     )  # fmt: skip
     lattice_strip(diagnosis.ring, strip)
@@ -209,32 +198,136 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
     return figure
 
 
-def _whole_ring(side: Axes, diagnosis: Diagnosis, s: Array, floor: float) -> None:
+def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None = None) -> Figure:
+    """The same around one finding, with the monitors; linear, so that neighbours can be told apart.
+
+    Args:
+        diagnosis: of `diagnose`.
+        finding: one of its findings, with a place.
+        figure: an empty one; else a new one.
+    """
+    assert finding.where is not None
+    figure = plt.figure(figsize=(11, 5), layout="constrained") if figure is None else figure
+    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[6, 0.8])
+    low, high = _around(diagnosis, finding)
+    _draw_scan(ax, diagnosis, 7.0)
+    seen = [line.get_ydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
+    places = [line.get_xdata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
+    values = np.concatenate([np.asarray(v, dtype=float) for v in seen])
+    inside = np.concatenate([np.asarray(x, dtype=float) for x in places])
+    top = np.nanmax(values[(inside >= low) & (inside <= high)], initial=FLOOR)
+    ax.set_ylim(0, 1.2 * max(float(top), _thresholds(diagnosis)[0]))
+    ax.ticklabel_format(axis="y", style="sci", scilimits=(0, 4))
+    for monitor in diagnosis.ring.monitors:
+        if low <= monitor.s <= high:
+            ax.annotate(
+                monitor.name, (monitor.s, 0), xytext=(2, 4), textcoords="offset points",
+                rotation=90, fontsize="x-small", color="0.35", va="bottom",
+            )  # fmt: skip
+            ax.axvline(monitor.s, color="0.8", linewidth=0.7, zorder=0)
+    _mark_findings(ax, diagnosis, (low, high))
+    ax.legend(
+        loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
+        markerscale=1.3,
+    )  # fmt: skip
+    lattice_strip(diagnosis.ring, strip)
+    _mark(strip, diagnosis)
+    ax.set_xlim(low, high)
+    return figure
+
+
+def _around(diagnosis: Diagnosis, finding: Finding) -> tuple[float, float]:
+    assert finding.where is not None
+    low, high = finding.where
+    return max(low - ROOM, 0.0), min(high + ROOM, diagnosis.ring.length)
+
+
+def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
+    """Of the named effects and of free kicks."""
+    explanation = diagnosis.explanation
+    rate = diagnosis.provenance["options"]["false_alarm"]
+    free = explanation.first_kicks
+    freedom = max(int(np.median(free.freedom)), 1)
+    return (
+        explanation.first.threshold(rate * SHARES["named"]),
+        free_threshold(rate * SHARES["kick"], freedom, len(free.places)),
+    )
+
+
+def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
+    """Statistics at their places, one colour for each group, and both thresholds."""
+    found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
+    s = _middles(diagnosis)
+    groups = np.array([group(effect) for effect, _ in found.hypotheses])
+    layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
+    order = np.argsort(layers)
+    ax.plot(
+        layers[order], np.maximum(free.statistic[order], FLOOR),
+        color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
+    )  # fmt: skip
+    for name, (colour, _) in GROUPS.items():
+        own = (groups == name) & np.isfinite(s) & (found.statistic > FLOOR)
+        if own.any():
+            ax.plot(
+                s[own], found.statistic[own], linestyle="none", marker=".", color=colour,
+                ms=size, label=name, zorder=2,
+            )  # fmt: skip
+    named, kicks = _thresholds(diagnosis)
+    ax.axhline(
+        named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
+    )
+    ax.axhline(
+        kicks, color="0.5", linestyle=":", linewidth=1.2, label=f"of free kicks {kicks:.1f}"
+    )
+    ax.set_ylabel("fall of chi-square")
+    ax.grid(alpha=0.25)
+
+
+def _middles(diagnosis: Diagnosis) -> Array:
+    """Where each hypothesis of the first scan sits, m; NaN for those without a place."""
+    middles = {element.name: element.s for element in diagnosis.ring.elements}
+    return np.array(
+        [
+            np.nan if place is None else middles.get(place, np.nan)
+            for _, place in diagnosis.explanation.first.hypotheses
+        ]
+    )
+
+
+def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     """Hypotheses without a place, the best of each effect."""
     found = diagnosis.explanation.first
     best: dict[str, float] = {}
-    for (effect, _), place, value in zip(found.hypotheses, s, found.statistic, strict=True):
-        if not np.isfinite(place):
-            best[effect] = max(best.get(effect, floor), float(value))
+    places = _middles(diagnosis)
+    for (effect, _), s, value in zip(found.hypotheses, places, found.statistic, strict=True):
+        if not np.isfinite(s):
+            best[effect] = max(best.get(effect, FLOOR), float(value))
     for i, (effect, value) in enumerate(best.items()):
-        colour = GROUPS[group(effect)][0]
-        side.plot(i, max(value, floor), "D", color=colour, ms=5)
-    side.set_xticks(range(len(best)), [name.replace("_", " ") for name in best])
-    side.tick_params(axis="x", labelrotation=90, labelsize="small", labelbottom=True)
+        side.plot(i, value, "D", color=GROUPS[group(effect)][0], ms=5, clip_on=False, zorder=4)
+    names = [name.replace("radiation_loss_", "loss in ").replace("_", " ") for name in best]
+    side.set_xticks(range(len(best)), names)
+    side.tick_params(axis="x", labelrotation=90, labelsize="x-small", labelbottom=True)
+    for label in side.get_xticklabels():
+        label.set_in_layout(False)  # they hang into the empty corner beside the strip
     side.set_xlim(-0.7, max(len(best), 1) - 0.3)
     side.set_title("whole ring", fontsize="small")
 
 
-def _mark_findings(ax: Axes, diagnosis: Diagnosis) -> None:
+def _mark_findings(
+    ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | None = None
+) -> None:
     _mark(ax, diagnosis)
-    length = diagnosis.ring.length
-    placed = [f for f in diagnosis.findings if f.where is not None]
-    for k, finding in enumerate(placed):
-        assert finding.where is not None
-        s = finding.s if finding.s is not None else float(np.mean(finding.where))
+    low, high = span or (0.0, diagnosis.ring.length)
+    placed = [
+        (finding.s if finding.s is not None else float(np.mean(finding.where)), finding)
+        for finding in diagnosis.findings
+        if finding.where is not None
+    ]
+    placed = [(s, finding) for s, finding in placed if low <= s <= high]
+    for k, (s, finding) in enumerate(placed):
         name = finding.effect or "unnamed"
         text = f"{name.replace('_', ' ')} {finding.element or ''}".strip()
-        left = s > 0.6 * length
+        left = s > low + 0.6 * (high - low)
         ax.annotate(
             text, (s, 0.97 - 0.05 * (k % 6)), xycoords=("data", "axes fraction"),
             xytext=(-5 if left else 5, 0), textcoords="offset points",
@@ -314,7 +407,7 @@ def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
             f"{100 * member.probability:.1f} %", (100 * member.probability, row),
             xytext=(4, 0), textcoords="offset points", va="center", fontsize="small",
         )  # fmt: skip
-    ax.set_yticks(rows, [f"{m.effect} {m.element or ''}".strip() for m in members])
+    ax.set_yticks(rows, [f"{m.effect.replace('_', ' ')}  {m.element or ''}".rstrip() for m in members])
     ax.invert_yaxis()
     ax.set_xlim(0, 112)
     ax.set_xticks(range(0, 101, 20))
