@@ -163,7 +163,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[str], None]]:
         yield lambda _: None
         return
     with screen.status("reading") as status:
-        yield lambda text: status.update(text)
+        yield status.update
 
 
 def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any]) -> None:

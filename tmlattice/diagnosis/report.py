@@ -162,6 +162,11 @@ def closed_text(diagnosis: Diagnosis) -> str:
     gap = diagnosis.heldout
     if gap is None:
         return "No shot was held out: nobody but the fit judges the gap"
+    if diagnosis.findings and not diagnosis.causes:
+        return (
+            "What has no name cannot be put into the lattice, so the gap of the held-out shots "
+            "stays"
+        )
     if gap.closed is None:
         return "The held-out shots show no gap beyond the noise, so there is none to close"
     text = f"{100 * gap.closed:.1f} % of the gap beyond the noise is closed on held-out readings"
@@ -187,9 +192,8 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
             open_ = f"for {len(several)} of them the data allow other explanations too"
         else:
             others = len(found[0].credible_set) - 1
-            open_ = (
-                "but these readings do not exclude "
-                + ("another explanation" if others == 1 else f"{others} other explanations")
+            open_ = "but these readings do not exclude " + (
+                "another explanation" if others == 1 else f"{others} other explanations"
             )
         return f"Likeliest: {what}; {open_}."
     if diagnosis.verdict == "located":
@@ -197,9 +201,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         where = "; ".join(f"{f.where[0]:.1f} m to {f.where[1]:.1f} m" for f in places if f.where)
         named = [f for f in found if f.effect is not None]
         also = f" Besides: {'; '.join(_short(f) for f in named)}." if named else ""
-        return (
-            f"Something acts at s = {where}, and no effect of the catalogue explains it.{also}"
-        )
+        return f"Something acts at s = {where}, and no effect of the catalogue explains it.{also}"
     if diagnosis.verdict == "distributed":
         return (
             "The data differ from the model all along the ring; no single place, and no few "
@@ -262,8 +264,8 @@ def _enough(separation: float) -> str:
     """How many such shots make 5 standard deviations."""
     if separation >= 5:
         return "."
-    if separation < 0.5:
-        return ": hardly at all; no candidate does better."
+    if separation < 1:
+        return ": too few; no candidate does better."
     return f"; {int(np.ceil((5 / separation) ** 2))} such shots reach 5."
 
 
@@ -282,12 +284,9 @@ def left_text(diagnosis: Diagnosis) -> str:
     """What is left when all that was found is in the model."""
     p_value = diagnosis.unexplained["p_value"]
     places = diagnosis.unexplained["places"]
-    if p_value >= 0.01:
-        text = f"What is left is noise (p = {p_value:.2g})"
-    elif p_value >= 1e-4:
-        text = f"What is left is slightly more than the noise (p = {p_value:.1g})"
-    else:
-        text = f"What is left is more than the noise (p = {p_value:.1g})"
+    how = "noise" if p_value >= 0.01 else "slightly more than the noise"
+    how = how if p_value >= 1e-4 else "more than the noise"
+    text = f"What is left is {how} ({_chance(p_value)})"
     if diagnosis.noise_estimated:
         text += "; the noise was taken from the same data, which weakens this check"
     if places:
@@ -322,8 +321,11 @@ def _seen_text(finding: Finding) -> str:
     if not np.isfinite(found.statistic):
         return "in the readings themselves, before any fit"
     text = f"statistic {found.statistic:.4g}, threshold {found.threshold:.3g}"
-    chance = "< 1e-12" if found.p_value < 1e-12 else f"= {found.p_value:.1g}"
-    return f"{text}, p {chance} for the whole scan"
+    return f"{text}, {_chance(found.p_value)} for the whole scan"
+
+
+def _chance(p_value: float) -> str:
+    return "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
 
 
 MOST = 6

@@ -105,7 +105,7 @@ def plot_readings(
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
     if shot is None:
-        left = np.nan_to_num((readings - models[0])) ** 2 * data.active[:, None, None]
+        left = np.nan_to_num(readings - models[0]) ** 2 * data.active[:, None, None]
         shot = int(left.sum(axis=(1, 2)).argmax())
     first = slice(0, len(monitors))
     s = np.array([monitor.s for monitor in monitors])
@@ -217,7 +217,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     inside = np.concatenate([np.asarray(x, dtype=float) for x in places])
     top = np.nanmax(values[(inside >= low) & (inside <= high)], initial=FLOOR)
     ax.set_ylim(0, 1.2 * max(float(top), _thresholds(diagnosis)[0]))
-    ax.ticklabel_format(axis="y", style="sci", scilimits=(0, 4))
+    ax.yaxis.set_major_formatter("{x:,.0f}")
     for monitor in diagnosis.ring.monitors:
         if low <= monitor.s <= high:
             ax.annotate(
@@ -276,9 +276,7 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     ax.axhline(
         named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
     )
-    ax.axhline(
-        kicks, color="0.5", linestyle=":", linewidth=1.2, label=f"of free kicks {kicks:.1f}"
-    )
+    ax.axhline(kicks, color="0.5", linestyle=":", linewidth=1.2, label=f"of free kicks {kicks:.1f}")
     ax.set_ylabel("fall of chi-square")
     ax.grid(alpha=0.25)
 
@@ -313,9 +311,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     side.set_title("whole ring", fontsize="small")
 
 
-def _mark_findings(
-    ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | None = None
-) -> None:
+def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> None:
     _mark(ax, diagnosis)
     low, high = span or (0.0, diagnosis.ring.length)
     placed = [
@@ -407,7 +403,9 @@ def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
             f"{100 * member.probability:.1f} %", (100 * member.probability, row),
             xytext=(4, 0), textcoords="offset points", va="center", fontsize="small",
         )  # fmt: skip
-    ax.set_yticks(rows, [f"{m.effect.replace('_', ' ')}  {m.element or ''}".rstrip() for m in members])
+    ax.set_yticks(
+        rows, [f"{m.effect.replace('_', ' ')}  {m.element or ''}".rstrip() for m in members]
+    )
     ax.invert_yaxis()
     ax.set_xlim(0, 112)
     ax.set_xticks(range(0, 101, 20))
