@@ -133,7 +133,7 @@ def test_command_reports_writes_and_draws(outcome, folders, schema):
     names = {path.name for path in (folder / "day").iterdir()}
     assert names == {
         "diagnosis.json", "report.html", "report.txt", "readings.png", "scan.png",
-        "scan-near-1.png", "gap.png", "credible-set-1.png",
+        "scan-near.png", "gap.png", "credible-set-1.png",
     }  # fmt: skip
     for name in names:
         if name.endswith(".png"):
@@ -323,7 +323,7 @@ def test_every_verdict_has_its_figures(diagnoses, verdict):
     assert names[:2] == ["readings", "scan"]
     assert "gap" in names
     assert ("credible-set-1" in names) == (verdict == "equivalent")
-    assert ("scan-near-1" in names) == bool(diagnoses[verdict].findings)
+    assert ("scan-near" in names) == bool(diagnoses[verdict].findings)
 
 
 def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):

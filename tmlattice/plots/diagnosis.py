@@ -29,8 +29,8 @@ GROUPS = {
 
 BEFORE, AFTER = "C0", "C3"
 
-NEAR, WIDE = 3, 300.0
-"""So many findings are drawn near by, if they are no wider than this, m."""
+WIDE = 300.0
+"""A finding whose place is wider than this is not drawn near by, m."""
 
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
@@ -47,13 +47,14 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         "anywhere in the scan.",
         plot_scan(diagnosis),
     )
-    for number, finding in enumerate(diagnosis.findings[:NEAR], 1):
-        if finding.where is not None and finding.where[1] - finding.where[0] < WIDE:
-            yield (
-                f"scan-near-{number}",
-                f"The same scan around finding {number}, linear, with the monitors.",
-                plot_scan_near(diagnosis, finding),
-            )
+    first = next((f for f in diagnosis.findings if np.isfinite(f.detection.statistic)), None)
+    if first is not None and first.where is not None and np.ptp(first.where) < WIDE:
+        yield (
+            "scan-near",
+            "The same scan around the clearest finding, linear, with the monitors. Later findings "
+            "show only once this one is in the model.",
+            plot_scan_near(diagnosis, first),
+        )
     if diagnosis.heldout is not None:
         _, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
         plot_gap(diagnosis, ax)
@@ -184,10 +185,8 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
     _draw_scan(ax, diagnosis, 3.0)
     threshold = _thresholds(diagnosis)[0]
     _whole_ring(side, diagnosis)
-    side.axhline(threshold, color="k", linestyle="--", linewidth=1, zorder=3)
     ax.set_yscale("log")
     ax.set_ylim(FLOOR, 12 * max(float(found.statistic.max(initial=1.0)), threshold))
-    side.grid(alpha=0.25)
     _mark_findings(ax, diagnosis)
     ax.legend(
         loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
@@ -300,6 +299,11 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     for (effect, _), s, value in zip(found.hypotheses, places, found.statistic, strict=True):
         if not np.isfinite(s):
             best[effect] = max(best.get(effect, FLOOR), float(value))
+    if not best:
+        side.axis("off")
+        return
+    side.grid(alpha=0.25)
+    side.axhline(_thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
     for i, (effect, value) in enumerate(best.items()):
         side.plot(i, value, "D", color=GROUPS[group(effect)][0], ms=5, clip_on=False, zorder=4)
     names = [name.replace("radiation_loss_", "loss in ").replace("_", " ") for name in best]
