@@ -217,13 +217,17 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     top = np.nanmax(values[(inside >= low) & (inside <= high)], initial=FLOOR)
     ax.set_ylim(0, 1.2 * max(float(top), _thresholds(diagnosis)[0]))
     ax.yaxis.set_major_formatter("{x:,.0f}")
+    labelled = -np.inf
     for monitor in diagnosis.ring.monitors:
-        if low <= monitor.s <= high:
+        if not low <= monitor.s <= high:
+            continue
+        ax.axvline(monitor.s, color="0.8", linewidth=0.7, zorder=0)
+        if monitor.s - labelled > 0.012 * (high - low):  # else the names would overlap
+            labelled = monitor.s
             ax.annotate(
                 monitor.name, (monitor.s, 0), xytext=(2, 4), textcoords="offset points",
                 rotation=90, fontsize="x-small", color="0.35", va="bottom",
             )  # fmt: skip
-            ax.axvline(monitor.s, color="0.8", linewidth=0.7, zorder=0)
     _mark_findings(ax, diagnosis, (low, high))
     ax.legend(
         loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
