@@ -41,17 +41,56 @@ class Launch(click.ParamType):  # type: ignore[type-arg]
         return numbers
 
 
-def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
-    """LATTICE, and which sequence of it, at which energy."""
+class BackgroundText(click.ParamType):  # type: ignore[type-arg]
+    """NAME or NAME=RMS."""
+
+    name = "NAME[=RMS]"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, float | None]:
+        """Effect and rms, or None for the catalogue's."""
+        if isinstance(value, tuple):
+            return value
+        name, _, size = str(value).partition("=")
+        try:
+            return name.strip(), float(size) if size else None
+        except ValueError:
+            self.fail(f"'{size}' is no rms; give {name}=1e-3, say", param, ctx)
+
+
+class NameList(click.ParamType):  # type: ignore[type-arg]
+    """Names separated by commas."""
+
+    name = "NAME,NAME"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """One name or more."""
+        if isinstance(value, tuple):
+            return value
+        names = tuple(name.strip() for name in str(value).split(",") if name.strip())
+        if not names:
+            self.fail("give one name or more, separated by commas", param, ctx)
+        return names
+
+
+def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Which sequence of the lattice, at which energy."""
     for decorate in (
         click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
                      help="Beam energy; else what the lattice states."),
         click.option("--sequence", metavar="NAME",
                      help="The lattice file's variable that holds the ring."),
-        click.argument("lattice", default="petra3"),
     ):  # fmt: skip
         function = decorate(function)
     return function
+
+
+def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
+    """LATTICE, petra3 where none is named, and its options."""
+    return click.argument("lattice", default="petra3")(lattice_options(function))
 
 
 def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:

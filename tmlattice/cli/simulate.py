@@ -7,7 +7,14 @@ from typing import Any
 
 import click
 
-from tmlattice.cli.options import FILE, console, lattice_argument, quiet_option, table
+from tmlattice.cli.options import (
+    FILE,
+    BackgroundText,
+    console,
+    lattice_argument,
+    quiet_option,
+    table,
+)
 
 
 class CauseText(click.ParamType):  # type: ignore[type-arg]
@@ -34,24 +41,6 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
                 ctx,
             )
         return words[0], words[1] if len(words) == 3 else None, amount
-
-
-class BackgroundText(click.ParamType):  # type: ignore[type-arg]
-    """NAME or NAME=RMS."""
-
-    name = "NAME[=RMS]"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, float | None]:
-        """Effect and rms, or None for the catalogue's."""
-        if isinstance(value, tuple):
-            return value
-        name, _, size = str(value).partition("=")
-        try:
-            return name.strip(), float(size) if size else None
-        except ValueError:
-            self.fail(f"'{size}' is no rms; give {name}=1e-3, say", param, ctx)
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]

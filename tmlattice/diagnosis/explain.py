@@ -87,6 +87,7 @@ class Explanation:
         monitors: those set aside because no named cause explains them.
         spikes: readings left out, (shot, reading, plane).
         dropped: all readings left out, [shot, reading, 2].
+        first, first_kicks: the scans of the launches alone, which saw the first finding.
         scan, left: the last ones, of what is left.
         full: whether the search ended because no more findings were allowed.
     """
@@ -98,6 +99,8 @@ class Explanation:
     monitors: dict[int, Detection]
     spikes: list[tuple[int, int, int]]
     dropped: NDArray[np.bool_]
+    first: Scan
+    first_kicks: FreeScan
     scan: Scan
     left: FreeScan
     full: bool
@@ -236,9 +239,11 @@ class _Search:
     def run(self, before: Fit) -> Explanation:
         state = _State(before, [], {})
         steps = 0
+        first: tuple[Scan, FreeScan] | None = None
         while True:
             found = self.scan(state.fit)
             kicks = self.scan_kicks(state.fit)
+            first = first or (found, kicks)
             full = len(state.fit.causes) + len(state.fit.kicks) + len(self.monitors) >= self.most
             options = (
                 [] if full or len(self.spikes) > 40 else self._options(state.fit, found, kicks)
@@ -260,6 +265,8 @@ class _Search:
             monitors=self.monitors,
             spikes=self.spikes,
             dropped=self.dropped,
+            first=first[0],
+            first_kicks=first[1],
             scan=found,
             left=kicks,
             full=full,

@@ -1,0 +1,359 @@
+"""`tmlattice diagnose` as a user runs it, its report in words, its figures and its page."""
+
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from importlib.resources import files
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from tmlattice.cli.command import main
+from tmlattice.diagnosis import diagnose
+from tmlattice.diagnosis.report import (
+    WORDS,
+    amount_text,
+    least_text,
+    probability_text,
+    report_text,
+)
+from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.files import write_json
+from tmlattice.machine import simulate
+from tmlattice.measurement import OrbitResponse, write_measurement
+
+SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
+SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}
+WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
+CASES = {
+    "named": ([WEAK], {}, {"effects": ["quadrupole_gradient", "quadrupole_roll"]}),
+    "equivalent": ([WEAK], {}, {}),
+    "located": ([WEAK], {}, {"effects": ["monitor_gain_x", "dipole_field"]}),
+    "nothing": ([], {}, {}),
+    "distributed": (
+        [],
+        {"quadrupole_gradient": 0.02, "quadrupole_offset_x": None},
+        {"effects": ["quadrupole_roll"], "max_effects": 1},
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def schema():
+    return json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def diagnoses(small_ring):
+    """One diagnosis for each verdict."""
+    made = {}
+    for verdict, (causes, background, options) in CASES.items():
+        data = simulate(small_ring, causes, background=background, **SHOTS).measurement()
+        made[verdict] = diagnose(small_ring, data, **options)
+    return made
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory, small_ring):
+    """Measurement folders: a weak quadrupole, one shot, an orbit response, a strange monitor."""
+    place = tmp_path_factory.mktemp("folders")
+    data = simulate(small_ring, [WEAK], **SHOTS).measurement()
+    write_measurement(place / "weak", data)
+    write_measurement(place / "before", simulate(small_ring, [], **SHOTS).measurement())
+    write_measurement(place / "one", data.select(shots=[0]))
+    write_measurement(
+        place / "response",
+        OrbitResponse(("v1",), ("y",), np.ones(1), ("last_a",), np.zeros((1, 1, 2))),
+    )
+    (place / "strange").mkdir()
+    for file in (place / "weak").iterdir():
+        text = file.read_text().replace("last_a", "last_c")
+        (place / "strange" / file.name).write_text(text)
+    return place
+
+
+@pytest.fixture
+def tmlattice(monkeypatch, capsys):
+    """The command in this process: exit code, what it printed, its errors."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["tmlattice", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        printed = capsys.readouterr()
+        return end.value.code, printed.out, printed.err
+
+    return run
+
+
+class References(HTMLParser):
+    """Everything that a page would fetch, or leads to."""
+
+    def __init__(self):
+        super().__init__()
+        self.found, self.tags = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.found += [
+            value for name, value in attributes if name in ("src", "href", "srcset", "data")
+        ]
+
+
+# --- the command ----------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def outcome(folders, tmp_path_factory):
+    """A run as a user starts it, and its folder."""
+    folder = tmp_path_factory.mktemp("run")
+    done = subprocess.run(
+        [sys.executable, "-m", "tmlattice", "diagnose", SMALL, str(folders / "weak"), "--out",
+         "day", "--json", "extra.json"],
+        cwd=folder, capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def test_command_reports_writes_and_draws(outcome, folders, schema):
+    folder, done = outcome
+    assert done.stderr == ""
+    assert "\x1b" not in done.stdout
+    for words in ("QD::5", "between bpm::5 and end_5", "±", "held out", "fractional tunes",
+                  "What is left is noise", "written: day/"):  # fmt: skip
+        assert words in done.stdout
+    document = json.loads((folder / "day" / "diagnosis.json").read_text())
+    jsonschema.validate(document, schema)
+    assert json.loads((folder / "extra.json").read_text()) == document
+    assert document["findings"][0]["element"] == "QD::5"
+    assert document["provenance"]["measurement"] == str(folders / "weak")
+    names = {path.name for path in (folder / "day").iterdir()}
+    assert names == {
+        "diagnosis.json", "report.html", "report.txt", "readings.png", "scan.png",
+        "scan-near.png", "gap.png", "credible-set-1.png",
+    }  # fmt: skip
+    for name in names:
+        if name.endswith(".png"):
+            assert (folder / "day" / name).read_bytes().startswith(b"\x89PNG")
+    assert (folder / "day" / "report.txt").read_text().splitlines()[0] in done.stdout
+
+
+def test_page_opens_offline_and_holds_its_figures(outcome):
+    html = (outcome[0] / "day" / "report.html").read_text(encoding="utf-8")
+    parser = References()
+    parser.feed(html)
+    assert len(parser.found) == parser.tags.count("img") == 5
+    assert all(source.startswith("data:image/png;base64,") for source in parser.found)
+    assert not {"script", "link", "iframe", "object"} & set(parser.tags)
+    assert not re.search(r"https?://|url\(|@import", html)
+    for words in ("QD::5", "equivalent", "The gap", "Provenance", "false_alarm"):
+        assert words in html
+
+
+def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, tmlattice, schema):
+    path = tmp_path / "a.json"
+    code, out, errors = tmlattice(
+        "diagnose", SMALL, folders / "weak", "--quiet", "--json", path, "--effects",
+        "quadrupole_gradient, quadrupole_roll", "--background", "monitor_offset_x=1e-7",
+        "--seed", 3, "--max-effects", 2, "--radiation",
+    )  # fmt: skip
+    assert (code, out, errors) == (0, "", "")
+    assert list(tmp_path.iterdir()) == [path]
+    document = json.loads(path.read_text())
+    jsonschema.validate(document, schema)
+    options = document["provenance"]["options"]
+    assert options["effects"] == ["quadrupole_gradient", "quadrupole_roll"]
+    assert options["background"] == {"monitor_offset_x": 1e-7}
+    assert options["max_effects"] == 2
+    assert options["radiation"] is True
+    assert document["provenance"]["seed"] == 3
+
+
+def test_reference_and_single_shot(folders, tmp_path, tmlattice, schema):
+    path = tmp_path / "a.json"
+    code, out, _ = tmlattice(
+        "diagnose", SMALL, folders / "one", "--reference", folders / "before", "--json", path,
+        "--background", "quadrupole_gradient=1e-4",
+    )  # fmt: skip
+    assert code == 0
+    assert "No shot was held out" in out
+    document = json.loads(path.read_text())
+    jsonschema.validate(document, schema)
+    assert document["provenance"]["options"]["reference"] is True
+    assert document["gap"]["heldout"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([SMALL], "MEASUREMENT"),
+        ([SMALL, "nowhere"], "no measurement folder"),
+        (["petra4", "weak"], "no lattice 'petra4'; did you mean 'petra3'"),
+        (["nowhere/ring.py", "weak"], "no lattice file"),
+        ([SMALL, "response"], "is an orbit response, which is not diagnosed yet"),
+        ([SMALL, "weak", "--reference", "response"], "is an orbit response"),
+        ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
+        ([SMALL, "strange"], "no monitor 'last_c'; did you mean"),
+        ([SMALL, "weak", "--effects", "quadrupole_gradiant"], "did you mean 'quadrupole_gradient'"),
+        ([SMALL, "weak", "--effects", ","], "--effects"),
+        ([SMALL, "weak", "--background", "quadrupole_roll=a"], "is no rms"),
+        ([SMALL, "weak", "--background", "gradient_absolute"], "has no usual size"),
+        ([SMALL, "weak", "--background", "nothing=1"], "no effect 'nothing'"),
+        ([SMALL, "weak", "--holdout", "1"], "--holdout"),
+        ([SMALL, "weak", "--max-effects", "0"], "--max-effects"),
+        ([SMALL, "weak", "--sequence", "loop"], "no sequence"),
+        ([SMALL, "weak", "--json", "/no/such/folder/a.json"], "cannot write"),
+    ],
+)
+def test_wrong_input_ends_in_one_sentence_and_leaves_out_untouched(
+    folders, tmp_path, tmlattice, arguments, words
+):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "diagnosis.json").write_text("of yesterday")
+    local = {path.name: path for path in folders.iterdir()}
+    code, printed, errors = tmlattice(
+        "diagnose", *(local.get(word, word) for word in arguments), "--out", out
+    )
+    assert code == 2
+    assert printed == ""
+    assert words in errors
+    assert len(errors.strip().splitlines()) == 1
+    assert [path.name for path in out.iterdir()] == ["diagnosis.json"]
+    assert (out / "diagnosis.json").read_text() == "of yesterday"
+
+
+# --- the result -----------------------------------------------------------------------------------
+@pytest.mark.parametrize("verdict", list(CASES))
+def test_json_of_every_verdict_is_valid(diagnoses, schema, tmp_path, verdict):
+    diagnosis = diagnoses[verdict]
+    assert diagnosis.verdict == verdict
+    write_json(tmp_path / "a.json", diagnosis.as_json())
+    jsonschema.validate(json.loads((tmp_path / "a.json").read_text()), schema)
+
+
+def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, schema):
+    document = json.loads(json.dumps(diagnoses["named"].as_json()))
+    jsonschema.validate(document, schema)
+    for key in document:
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({k: v for k, v in document.items() if k != key}, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**document, "verdict": "nothing"}, schema)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("named", ["One cause explains the gap", "QD::5", "> 99.9 %", "between bpm::5 and end_5"]),
+        ("equivalent", ["do not exclude another explanation", "or else", "Next: One more shot",
+                        "the strength of QD::5 changed by +2 %"]),
+        ("located", ["no effect of the catalogue explains it", "Next: Look at what stands there",
+                     "(bpm::5, QD::5, end_5)", "cannot be put into the lattice"]),
+        ("nothing", ["No error is seen", "Would have been seen", "wrong strength of a quadrupole"]),
+        ("distributed", ["all along the ring", "--background all", "--reference"]),
+    ],
+)  # fmt: skip
+def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):
+    text = report_text(diagnoses[verdict])
+    flat = " ".join(text.split())
+    assert text.startswith(verdict.upper())
+    for word in words:
+        assert word in flat
+    assert "held out (shots" in flat
+    assert "noise of a reading" in flat
+    assert "nan" not in flat
+    assert "Would have been seen" not in flat or verdict == "nothing"
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_dead_monitor_in_report_and_json(small_ring, schema, tmp_path):
+    data = simulate(small_ring, [Cause("monitor_dead", "end_3", 1.0)], **SHOTS).measurement()
+    diagnosis = diagnose(small_ring, data)
+    assert "dead monitor: end_3, no signal" in report_text(diagnosis)
+    write_json(tmp_path / "a.json", diagnosis.as_json())
+    document = json.loads((tmp_path / "a.json").read_text())
+    jsonschema.validate(document, schema)
+    assert document["findings"][0]["detection"]["statistic"] is None
+
+
+@pytest.mark.parametrize(
+    ("effect", "amount", "sigma", "text"),
+    [
+        ("quadrupole_gradient", -0.2, 5.4e-4, "-20.000 ± 0.054 %"),
+        ("quadrupole_roll", 0.0104, 3.3e-4, "+10.40 ± 0.33 mrad"),
+        ("corrector_kick_x", 5e-5, 1.2e-6, "+50.0 ± 1.2 µrad"),
+        ("monitor_offset_x", -4e-4, 6e-6, "-400.0 ± 6.0 µm"),
+        ("quadrupole_offset_y", 1.5e-3, 2e-5, "+1.500 ± 0.020 mm"),
+        ("gradient_absolute", 0.0339, 2e-4, "+0.03390 ± 0.00020 1/m"),
+        ("energy_offset", 1e-3, None, "0.1 %"),
+        ("monitor_swap", 1.0, 0.0, ""),
+        ("monitor_dead", 2.0, 0.0, "frozen readings"),
+    ],
+)
+def test_amounts_read_in_the_units_of_the_field(effect, amount, sigma, text):
+    assert amount_text(effect, amount, sigma) == text
+
+
+def test_what_cannot_be_seen_is_not_given_a_number():
+    assert least_text("corrector_roll", 1.2e14) == "not even the largest fault, 100 mrad"
+    assert probability_text(0.99999) == "> 99.9 %"
+
+
+def test_every_effect_has_words():
+    assert set(WORDS) == set(CATALOGUE)
+
+
+# --- the figures ----------------------------------------------------------------------------------
+@pytest.mark.parametrize("verdict", list(CASES))
+def test_every_verdict_has_its_figures(diagnoses, verdict):
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots.diagnosis import figures
+
+    names = []
+    for name, caption, figure in figures(diagnoses[verdict]):
+        names.append(name)
+        assert caption.endswith(".")
+        figure.canvas.draw()
+        plt.close(figure)
+    assert names[:2] == ["readings", "scan"]
+    assert "gap" in names
+    assert ("credible-set-1" in names) == (verdict == "equivalent")
+    assert ("scan-near" in names) == bool(diagnoses[verdict].findings)
+
+
+def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots.diagnosis import plot_scan
+
+    diagnosis = diagnoses["named"]
+    figure = plot_scan(diagnosis)
+    ax = figure.axes[0]
+    lines = {line.get_label(): line for line in ax.lines}
+    points = lines["quadrupoles"]
+    best = int(np.argmax(points.get_ydata()))
+    assert points.get_xdata()[best] == pytest.approx(diagnosis.findings[0].s)
+    statistic = diagnosis.findings[0].detection.statistic
+    assert points.get_ydata()[best] == pytest.approx(statistic)
+    threshold = diagnosis.findings[0].detection.threshold
+    assert lines[f"threshold {threshold:.1f}"].get_ydata()[0] == pytest.approx(threshold)
+    assert diagnosis.explanation.scan.statistic.max() < threshold  # the last one saw nothing
+    plt.close(figure)
+
+
+def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots.diagnosis import plot_gap
+
+    diagnosis = diagnoses["named"]
+    ax = plot_gap(diagnosis)
+    heights = [bar.get_height() for bar in ax.patches]
+    assert heights == pytest.approx([1e6 * m.rms for m in diagnosis.heldout.misfits])
+    assert ax.lines[0].get_ydata()[0] == pytest.approx(2.0)
+    plt.close(ax.figure)

@@ -1,0 +1,197 @@
+"""`tmlattice diagnose`: where the gap lies, what causes it, how far it shrinks."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tmlattice.cli.options import (
+    FILE,
+    BackgroundText,
+    NameList,
+    console,
+    json_option,
+    lattice_options,
+    quiet_option,
+)
+
+if TYPE_CHECKING:
+    from tmlattice.diagnosis import Diagnosis
+    from tmlattice.measurement import Measurement
+
+
+@click.command("diagnose")
+@click.argument("lattice")
+@click.argument("measurement", type=FILE)
+@lattice_options
+@click.option(
+    "--holdout",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.33,
+    show_default=True,
+    help="Share of the shots that the fit does not see; they judge the gap.",
+)
+@click.option(
+    "--reference",
+    type=FILE,
+    metavar="DIR",
+    help="A measurement of the same machine before the fault: static errors cancel.",
+)
+@click.option(
+    "--background",
+    type=BackgroundText(),
+    multiple=True,
+    help="Small errors that the machine has everywhere, with this rms or the catalogue's; "
+    "`all`, or `all=SCALE`, for every usual one.",
+)
+@click.option(
+    "--max-effects", type=click.IntRange(1), default=8, show_default=True, help="Findings at most."
+)
+@click.option(
+    "--effects",
+    type=NameList(),
+    help="Look for these alone; else for the whole catalogue (`tmlattice effects`).",
+)
+@click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Of the split, the threshold's simulation and the bootstrap.",
+)
+@json_option
+@click.option(
+    "--out",
+    type=FILE,
+    metavar="DIR",
+    help="Folder for diagnosis.json, report.html, report.txt and the figures.",
+)
+@quiet_option
+def diagnose(
+    lattice: str,
+    measurement: Path,
+    sequence: str | None,
+    energy: float | None,
+    reference: Path | None,
+    background: tuple[tuple[str, float | None], ...],
+    effects: tuple[str, ...] | None,
+    json_file: Path | None,
+    out: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Say where the ring differs from LATTICE, by which effect, and how far the gap shrinks.
+
+    MEASUREMENT is a folder of first turns, as `tmlattice simulate` writes it. The verdict is one of
+    named, equivalent (several explanations fit alike), located (something is there that the
+    catalogue does not explain), distributed (no single place) and nothing; the exit code is 0 for
+    each of them.
+    """
+    from tmlattice.files import output_file, output_folder, write_json
+
+    with ExitStack() as files:
+        folder = files.enter_context(output_folder(out)) if out else None
+        extra = files.enter_context(output_file(json_file)) if json_file else None
+        from tmlattice.effects import background_rms, names
+        from tmlattice.lattice import load_ring
+
+        if effects is not None:
+            names(effects)  # a wrong name is known before the work
+        background_rms(dict(background))
+        data = _trajectories(measurement)
+        before = None if reference is None else _trajectories(reference)
+        ring = load_ring(lattice, sequence, energy)
+        with _progress(quiet) as progress:
+            result = _diagnosed(
+                ring, data, before, measurement, reference,
+                background=dict(background) or None, effects=effects, progress=progress, **options,
+            )  # fmt: skip
+            document = result.as_json()
+            provenance = {**document["provenance"], "measurement": str(measurement)}
+            document["provenance"] = provenance
+            if folder:
+                progress("figures")
+                _write_folder(result, folder, provenance)
+                write_json(folder / "diagnosis.json", document)
+            if extra:
+                write_json(extra, document)
+    if not quiet:
+        _print(result, out, json_file)
+
+
+def _trajectories(path: Path) -> "Measurement":
+    from tmlattice.errors import MeasurementError
+    from tmlattice.measurement import Measurement, read_measurement
+
+    data = read_measurement(path)
+    if not isinstance(data, Measurement):
+        raise MeasurementError(
+            f"'{path}' is an orbit response, which is not diagnosed yet; give first turns"
+        )
+    return data
+
+
+def _diagnosed(
+    ring: Any,
+    data: "Measurement",
+    before: "Measurement | None",
+    path: Path,
+    reference: Path | None,
+    **options: Any,
+) -> "Diagnosis":
+    """The diagnosis; an error of the data names their folder."""
+    from tmlattice.diagnosis import diagnose as run
+    from tmlattice.errors import MeasurementError, UnknownNameError
+
+    try:
+        return run(ring, data, reference=before, **options)
+    except (MeasurementError, UnknownNameError) as error:
+        where = str(path) if reference is None else f"{path} or {reference}"
+        raise MeasurementError(f"{where}: {error}") from error
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Tells on a terminal what is being done; elsewhere silent."""
+    from rich.console import Console
+
+    screen = Console(stderr=True, highlight=False, markup=False)
+    if quiet or not screen.is_terminal:
+        yield lambda _: None
+        return
+    with screen.status("reading") as status:
+        yield status.update
+
+
+def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any]) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from tmlattice.diagnosis.report import report_text
+    from tmlattice.report import draw, page
+
+    pictures = draw(result, folder)
+    html = page(result, pictures, provenance)
+    (folder / "report.html").write_text(html, encoding="utf-8")
+    (folder / "report.txt").write_text(report_text(result) + "\n", encoding="utf-8")
+
+
+def _print(result: "Diagnosis", out: Path | None, json_file: Path | None) -> None:
+    from tmlattice.diagnosis.report import report_text
+
+    screen = console()
+    screen.print(report_text(result, min(screen.width, 120)), soft_wrap=True)
+    seconds = result.provenance["seconds"]
+    shots = int(result.data.active.sum())
+    screen.print(
+        f"\n{result.ring.name}: {shots} shots in the fit, {len(result.heldout_shots)} held out, "
+        f"{len(result.explanation.first.hypotheses)} hypotheses, seed {result.provenance['seed']}, "
+        f"{seconds:.1f} s"
+    )
+    written = [f"{out}/: report.html, report.txt, diagnosis.json, figures"] if out else []
+    written += [str(json_file)] if json_file else []
+    if written:
+        screen.print(f"written: {'; '.join(written)}", soft_wrap=True)

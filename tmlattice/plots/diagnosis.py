@@ -1,0 +1,426 @@
+"""Figures of a diagnosis."""
+
+from collections.abc import Iterator
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.diagnose import Diagnosis, Finding
+from tmlattice.diagnosis.explain import SHARES
+from tmlattice.diagnosis.report import words
+from tmlattice.diagnosis.scan import free_threshold
+from tmlattice.plots.strip import lattice_strip
+
+Array = NDArray[np.float64]
+
+GROUPS = {
+    "quadrupoles": ("tab:red", ("quadrupole_", "gradient_", "skew_", "family_")),
+    "bends": ("tab:blue", ("dipole_",)),
+    "correctors": ("tab:orange", ("corrector_",)),
+    "sextupoles": ("tab:green", ("sextupole_",)),
+    "insertion devices": ("tab:purple", ("insertion_",)),
+    "monitors": ("tab:cyan", ("monitor_",)),
+    "beam": ("tab:brown", ()),
+}
+"""Name -> colour, and how its effects' names begin; the last takes the rest."""
+
+BEFORE, AFTER = "C0", "C3"
+
+WIDE = 300.0
+"""A finding whose place is wider than this is not drawn near by, m."""
+
+
+def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
+    """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
+    yield (
+        "readings",
+        "Readings of one shot of the fit, and what each model leaves of them, its launch fitted.",
+        plot_readings(diagnosis),
+    )
+    yield (
+        "scan",
+        "How much better each hypothesis alone explains the data (fall of chi-square), along the "
+        "ring, before anything was found. Above the dashed line it is no accident of the noise "
+        "anywhere in the scan.",
+        plot_scan(diagnosis),
+    )
+    first = next((f for f in diagnosis.findings if np.isfinite(f.detection.statistic)), None)
+    if first is not None and first.where is not None and np.ptp(first.where) < WIDE:
+        yield (
+            "scan-near",
+            "The same scan around the clearest finding, linear, with the monitors. Later findings "
+            "show only once this one is in the model.",
+            plot_scan_near(diagnosis, first),
+        )
+    if diagnosis.heldout is not None:
+        _, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
+        plot_gap(diagnosis, ax)
+        yield (
+            "gap",
+            "Readings of shots that the fit never saw less the model, as findings are added.",
+            _figure(ax),
+        )
+    for number, finding in enumerate(diagnosis.findings, 1):
+        if len(finding.credible_set) > 1:
+            height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
+            _, ax = plt.subplots(figsize=(9, height), layout="constrained")
+            plot_credible_set(finding, ax)
+            yield (
+                f"credible-set-{number}",
+                f"Explanations of finding {number} that the data do not exclude.",
+                _figure(ax),
+            )
+
+
+def _figure(ax: Axes) -> Figure:
+    figure = ax.figure
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def group(effect: str) -> str:
+    """The group of `GROUPS` that an effect belongs to."""
+    return next((name for name, (_, starts) in GROUPS.items() if effect.startswith(starts)), "beam")
+
+
+# --- readings -------------------------------------------------------------------------------------
+def plot_readings(
+    diagnosis: Diagnosis, figure: Figure | None = None, shot: int | None = None
+) -> Figure:
+    """First-turn readings of a shot of the fit and what the design and the repaired ring leave.
+
+    Args:
+        diagnosis: of `diagnose`.
+        figure: an empty one; else a new one.
+        shot: its place among those of the fit; else the one with the largest residual.
+    """
+    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+    data, found = diagnosis.data, diagnosis.explanation
+    explained = diagnosis.verdict != "distributed"
+    models = [found.before.paths.readings]
+    if explained:
+        models.append(found.fit.paths.readings)
+    monitors = diagnosis.ring.monitors
+    readings = np.where(data.valid, data.readings, np.nan)
+    if shot is None:
+        left = np.nan_to_num(readings - models[0]) ** 2 * data.active[:, None, None]
+        shot = int(left.sum(axis=(1, 2)).argmax())
+    first = slice(0, len(monitors))
+    s = np.array([monitor.s for monitor in monitors])
+    read, dropped = readings[shot, first], found.dropped[shot, first]
+    grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
+    names = ("design", "with the findings")
+    styles = ((BEFORE, "-"), (AFTER, "-"))
+    for plane, name in enumerate("xy"):
+        orbit, residual = grid[2 * plane], grid[2 * plane + 1]
+        orbit.plot(s, 1e3 * read[:, plane], "k.", ms=3, label="read by the monitors")
+        sigma = 1e3 * diagnosis.noise[plane]
+        residual.axhspan(-2 * sigma, 2 * sigma, color="0.88", zorder=0, label="noise, 2 rms")
+        texts = []
+        for model, label, (colour, style) in zip(models, names, styles, strict=False):
+            predicted = model[shot, first, plane]
+            orbit.plot(s, 1e3 * predicted, style, color=colour, linewidth=0.9, label=label)
+            left = np.where(dropped[:, plane], np.nan, read[:, plane] - predicted)
+            residual.plot(s, 1e3 * left, color=colour, linewidth=0.9)
+            rms = np.sqrt(np.nanmean(left**2)) if np.isfinite(left).any() else np.nan
+            texts.append(f"{1e6 * rms:.1f}")
+        if dropped[:, plane].any():
+            at = dropped[:, plane]
+            orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="left out")
+        orbit.set_ylabel(f"{name} [mm]")
+        residual.set_ylabel(f"residual {name} [mm]")
+        after = f", after {texts[1]}" if len(texts) > 1 else ""
+        residual.annotate(
+            f"rms before {texts[0]}{after}, noise {1e3 * sigma:.1f} µm (grey: 2 rms)",
+            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
+        )  # fmt: skip
+        low, high = residual.get_ylim()
+        residual.set_ylim(low, high + 0.3 * (high - low))  # room for the words
+        for ax in (orbit, residual):
+            _mark(ax, diagnosis)
+            ax.grid(alpha=0.25)
+    grid[0].legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize="small", frameon=False
+    )
+    grid[0].set_title(f"Shot {shot + 1} of the {len(readings)} of the fit", loc="left")
+    lattice_strip(diagnosis.ring, grid[4])
+    _mark(grid[4], diagnosis)
+    return figure
+
+
+def _mark(ax: Axes, diagnosis: Diagnosis) -> None:
+    """A dotted line, or a band, where the findings sit."""
+    for finding in diagnosis.findings:
+        if finding.effect is None and finding.where is not None:
+            ax.axvspan(*finding.where, color="gold", alpha=0.4, linewidth=0, zorder=0)
+        elif finding.s is not None:
+            ax.axvline(finding.s, color="0.45", linestyle=":", linewidth=1.1, zorder=0.5)
+
+
+# --- the scan -------------------------------------------------------------------------------------
+FLOOR = 1.0
+"""Statistics below are as noise has them, and are not drawn."""
+
+ROOM = 60.0
+"""m, on both sides of a finding that is drawn near by."""
+
+
+def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
+    """The statistic of every hypothesis along the ring, before anything was found.
+
+    Args:
+        diagnosis: of `diagnose`.
+        figure: an empty one; else a new one.
+    """
+    figure = plt.figure(figsize=(11, 6), layout="constrained") if figure is None else figure
+    grid = figure.subplots(
+        2, 2, sharey="row", sharex="col", height_ratios=[6, 0.8], width_ratios=[8, 1]
+    )
+    ax, side, strip = grid[0, 0], grid[0, 1], grid[1, 0]
+    grid[1, 1].axis("off")
+    found = diagnosis.explanation.first
+    _draw_scan(ax, diagnosis, 3.0)
+    threshold = _thresholds(diagnosis)[0]
+    _whole_ring(side, diagnosis)
+    ax.set_yscale("log")
+    ax.set_ylim(FLOOR, 12 * max(float(found.statistic.max(initial=1.0)), threshold))
+    _mark_findings(ax, diagnosis)
+    ax.legend(
+        loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
+        markerscale=3,
+    )  # fmt: skip
+    lattice_strip(diagnosis.ring, strip)
+    _mark(strip, diagnosis)
+    return figure
+
+
+def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None = None) -> Figure:
+    """The same around one finding, with the monitors; linear, so that neighbours can be told apart.
+
+    Args:
+        diagnosis: of `diagnose`.
+        finding: one of its findings, with a place.
+        figure: an empty one; else a new one.
+    """
+    assert finding.where is not None
+    figure = plt.figure(figsize=(11, 5), layout="constrained") if figure is None else figure
+    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[6, 0.8])
+    low, high = _around(diagnosis, finding)
+    _draw_scan(ax, diagnosis, 7.0)
+    seen = [line.get_ydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
+    places = [line.get_xdata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
+    values = np.concatenate([np.asarray(v, dtype=float) for v in seen])
+    inside = np.concatenate([np.asarray(x, dtype=float) for x in places])
+    top = np.nanmax(values[(inside >= low) & (inside <= high)], initial=FLOOR)
+    ax.set_ylim(0, 1.2 * max(float(top), _thresholds(diagnosis)[0]))
+    ax.yaxis.set_major_formatter("{x:,.0f}")
+    labelled = -np.inf
+    for monitor in diagnosis.ring.monitors:
+        if not low <= monitor.s <= high:
+            continue
+        ax.axvline(monitor.s, color="0.8", linewidth=0.7, zorder=0)
+        if monitor.s - labelled > 0.012 * (high - low):  # else the names would overlap
+            labelled = monitor.s
+            ax.annotate(
+                monitor.name, (monitor.s, 0), xytext=(2, 4), textcoords="offset points",
+                rotation=90, fontsize="x-small", color="0.35", va="bottom",
+            )  # fmt: skip
+    _mark_findings(ax, diagnosis, (low, high))
+    ax.legend(
+        loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
+        markerscale=1.3,
+    )  # fmt: skip
+    lattice_strip(diagnosis.ring, strip)
+    _mark(strip, diagnosis)
+    ax.set_xlim(low, high)
+    return figure
+
+
+def _around(diagnosis: Diagnosis, finding: Finding) -> tuple[float, float]:
+    assert finding.where is not None
+    low, high = finding.where
+    return max(low - ROOM, 0.0), min(high + ROOM, diagnosis.ring.length)
+
+
+def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
+    """Of the named effects and of free kicks."""
+    explanation = diagnosis.explanation
+    rate = diagnosis.provenance["options"]["false_alarm"]
+    free = explanation.first_kicks
+    freedom = max(int(np.median(free.freedom)), 1)
+    return (
+        explanation.first.threshold(rate * SHARES["named"]),
+        free_threshold(rate * SHARES["kick"], freedom, len(free.places)),
+    )
+
+
+def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
+    """Statistics at their places, one colour for each group, and both thresholds."""
+    found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
+    s = _middles(diagnosis)
+    groups = np.array([group(effect) for effect, _ in found.hypotheses])
+    layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
+    order = np.argsort(layers)
+    ax.plot(
+        layers[order], np.maximum(free.statistic[order], FLOOR),
+        color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
+    )  # fmt: skip
+    for name, (colour, _) in GROUPS.items():
+        own = (groups == name) & np.isfinite(s) & (found.statistic > FLOOR)
+        if own.any():
+            ax.plot(
+                s[own], found.statistic[own], linestyle="none", marker=".", color=colour,
+                ms=size, label=name, zorder=2,
+            )  # fmt: skip
+    named, kicks = _thresholds(diagnosis)
+    ax.axhline(
+        named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
+    )
+    ax.axhline(kicks, color="0.5", linestyle=":", linewidth=1.2, label=f"of free kicks {kicks:.1f}")
+    ax.set_ylabel("fall of chi-square")
+    ax.grid(alpha=0.25)
+
+
+def _middles(diagnosis: Diagnosis) -> Array:
+    """Where each hypothesis of the first scan sits, m; NaN for those without a place."""
+    middles = {element.name: element.s for element in diagnosis.ring.elements}
+    return np.array(
+        [
+            np.nan if place is None else middles.get(place, np.nan)
+            for _, place in diagnosis.explanation.first.hypotheses
+        ]
+    )
+
+
+def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
+    """Hypotheses without a place, the best of each effect."""
+    found = diagnosis.explanation.first
+    best: dict[str, float] = {}
+    places = _middles(diagnosis)
+    for (effect, _), s, value in zip(found.hypotheses, places, found.statistic, strict=True):
+        if not np.isfinite(s):
+            best[effect] = max(best.get(effect, FLOOR), float(value))
+    if not best:
+        side.axis("off")
+        return
+    side.grid(alpha=0.25)
+    side.axhline(_thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
+    for i, (effect, value) in enumerate(best.items()):
+        side.plot(i, value, "D", color=GROUPS[group(effect)][0], ms=5, clip_on=False, zorder=4)
+    names = [name.replace("radiation_loss_", "loss in ").replace("_", " ") for name in best]
+    side.set_xticks(range(len(best)), names)
+    side.tick_params(axis="x", labelrotation=90, labelsize="x-small", labelbottom=True)
+    for label in side.get_xticklabels():
+        label.set_in_layout(False)  # they hang into the empty corner beside the strip
+    side.set_xlim(-0.7, max(len(best), 1) - 0.3)
+    side.set_title("whole ring", fontsize="small")
+
+
+def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> None:
+    _mark(ax, diagnosis)
+    low, high = span or (0.0, diagnosis.ring.length)
+    placed = [
+        (finding.s if finding.s is not None else float(np.mean(finding.where)), finding)
+        for finding in diagnosis.findings
+        if finding.where is not None
+    ]
+    placed = [(s, finding) for s, finding in placed if low <= s <= high]
+    for k, (s, finding) in enumerate(placed):
+        name = finding.effect or "unnamed"
+        text = f"{name.replace('_', ' ')} {finding.element or ''}".strip()
+        left = s > low + 0.6 * (high - low)
+        ax.annotate(
+            text, (s, 0.97 - 0.05 * (k % 6)), xycoords=("data", "axes fraction"),
+            xytext=(-5 if left else 5, 0), textcoords="offset points",
+            ha="right" if left else "left", va="top", fontsize="small",
+        )  # fmt: skip
+
+
+# --- the gap --------------------------------------------------------------------------------------
+def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
+    """The rms residual of held-out readings as findings are added one after another.
+
+    Args:
+        diagnosis: with held-out shots.
+        ax: where to draw; else a new one.
+
+    Raises:
+        ValueError: no shot was held out.
+    """
+    if diagnosis.heldout is None:
+        raise ValueError("no shot was held out")
+    if ax is None:
+        _, ax = plt.subplots()
+    rms = np.array([1e6 * step.rms for step in diagnosis.heldout.misfits])
+    noise = 1e6 * float(np.sqrt(np.nanmean(np.square(diagnosis.noise))))
+    steps = np.arange(len(rms))
+    ax.bar(steps, rms, width=0.55, color=[BEFORE] + [AFTER] * (len(rms) - 1))
+    for step, value in zip(steps, rms, strict=True):
+        ax.annotate(
+            f"{value:.1f}", (step, value), xytext=(0, 3), textcoords="offset points", ha="center"
+        )
+    ax.axhline(noise, color="k", linestyle="--", linewidth=1, label=f"noise {noise:.1f} µm")
+    labels = ["design"] + [
+        f"+ {words(cause.effect)}\n{cause.element or ''}".rstrip() for cause in diagnosis.causes
+    ]
+    crowded = len(labels) > 4
+    ax.set_xticks(
+        steps,
+        labels if not crowded else [label.replace("\n", " ") for label in labels],
+        rotation=25 if crowded else 0,
+        ha="right" if crowded else "center",
+        fontsize="small",
+    )
+    ax.set_xlim(-0.6, max(len(rms), 2) - 0.4)
+    if rms.max() > 20 * max(rms.min(), 1e-9):
+        ax.set_yscale("log")
+        ax.set_ylim(0.4 * min(rms.min(), noise), 2.5 * rms.max())
+    else:
+        ax.set_ylim(0, 1.18 * max(rms.max(), noise))
+    shots = ", ".join(map(str, diagnosis.heldout_shots))
+    ax.set_ylabel("held-out readings less model,\nrms [µm]")
+    ax.set_title(f"Held-out shots {shots}", loc="left", fontsize="medium")
+    ax.legend(loc="upper right", fontsize="small")
+    ax.grid(axis="y", alpha=0.25)
+    return ax
+
+
+# --- credible set ---------------------------------------------------------------------------------
+MOST = 15
+"""Members of a credible set that are drawn."""
+
+
+def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
+    """Probabilities of the explanations of one finding.
+
+    Args:
+        finding: with a credible set.
+        ax: where to draw; else a new one.
+    """
+    if ax is None:
+        _, ax = plt.subplots()
+    members = finding.credible_set[:MOST]
+    rows = np.arange(len(members))
+    colours = [GROUPS[group(member.effect)][0] for member in members]
+    ax.barh(rows, [100 * member.probability for member in members], color=colours, height=0.6)
+    for row, member in zip(rows, members, strict=True):
+        ax.annotate(
+            f"{100 * member.probability:.1f} %", (100 * member.probability, row),
+            xytext=(4, 0), textcoords="offset points", va="center", fontsize="small",
+        )  # fmt: skip
+    ax.set_yticks(
+        rows, [f"{m.effect.replace('_', ' ')}  {m.element or ''}".rstrip() for m in members]
+    )
+    ax.invert_yaxis()
+    ax.set_xlim(0, 112)
+    ax.set_xticks(range(0, 101, 20))
+    ax.set_xlabel("probability [%]")
+    rest = len(finding.credible_set) - len(members)
+    if rest:
+        ax.set_title(f"{rest} less likely ones not drawn", loc="right", fontsize="small")
+    ax.grid(axis="x", alpha=0.25)
+    ax.set_axisbelow(True)
+    return ax
