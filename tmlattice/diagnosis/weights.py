@@ -24,8 +24,9 @@ An effect is taken where it acts through one layer and moves no read-out; not th
 all magnets, of monitors or of the beam.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -52,9 +53,12 @@ Indices = NDArray[np.int64]
 PARTS = ("physical", "symplectic", "non-symplectic")
 """Of a change: effects of the catalogue, other symplectic changes, the rest."""
 
-DEPENDENT = 1e-5
-"""Unit directions that others leave less of are no directions of their own: OCELOT's maps are
-symplectic to 2e-6, and derivatives by amounts are differences."""
+ALIKE = 1e-6
+"""Effects of which others leave less than this share are no directions of their own."""
+
+DEPENDENT = 1e-3
+"""The same for symplectic changes beside effects: an offset of a thick sextupole, in second-order
+maps, is symplectic but for its third order, which is cut."""
 
 UNSEEN = 1e-10
 """A kick of which launches leave less than this share of information is not seen."""
@@ -114,6 +118,30 @@ def layer_effects(
 
 
 @dataclass(frozen=True)
+class Split:
+    """A change of every layer taken apart, over many trajectories of the measured size.
+
+    Attributes:
+        amount, sigma: of every effect, all effects of its layer at once, in its unit; the smallest
+            ones where effects are alike, [hypothesis].
+        parts: norms of the parts, see `PARTS`, in sigma, [layer, 3].
+        freedom: number of directions that each part has, [layer, 3].
+    """
+
+    amount: Array
+    sigma: Array
+    parts: Array
+    freedom: Indices
+
+    @property
+    def shares(self) -> Array:
+        """Of the parts in the squared norm of a layer's change, [layer, 3]; 0 without a change."""
+        squares = self.parts**2
+        whole = squares.sum(axis=1, keepdims=True)
+        return np.asarray(squares / np.where(whole > 0, whole, 1.0))
+
+
+@dataclass(frozen=True)
 class WeightReading:
     """Weight changes, or gradients, of all layers, read as physics.
 
@@ -128,11 +156,6 @@ class WeightReading:
             gradient: the best amount of the linear model.
         sigma: its standard deviation, launch projected out; inf for what is not seen.
         score: amount / sigma, signed; 0 for what is not seen.
-        together: amounts of all effects of a layer at once, over many trajectories, [hypothesis];
-            the smallest ones where effects are alike.
-        parts: norms of the parts of a change, see `PARTS`, in sigma, [layer, 3]; of a gradient:
-            those of the step that it asks for, information^-1 gradient.
-        freedom: number of directions in each part, [layer, 3].
         launches: fitted to the design, (x, px, y, py, delta), [shot, 5].
         chi2, readings: of the design with these launches; number of readings.
     """
@@ -145,19 +168,16 @@ class WeightReading:
     amount: Array = field(repr=False)
     sigma: Array = field(repr=False)
     score: Array = field(repr=False)
-    together: Array = field(repr=False)
-    parts: Array = field(repr=False)
-    freedom: Indices = field(repr=False)
     launches: Array = field(repr=False)
     chi2: float
     readings: int
+    _take_apart: Callable[[], Split] = field(repr=False)
 
-    @property
-    def shares(self) -> Array:
-        """Of the parts in the squared norm of a layer's change, [layer, 3]; 0 without a change."""
-        squares = self.parts**2
-        whole = squares.sum(axis=1, keepdims=True)
-        return np.asarray(squares / np.where(whole > 0, whole, 1.0))
+    @cached_property
+    def split(self) -> Split:
+        """The parts of the change; of a gradient: of the step information^-1 gradient that it asks
+        for. Made when it is first asked for: some seconds on a large ring."""
+        return self._take_apart()
 
     @property
     def best(self) -> Array:
@@ -182,7 +202,7 @@ class WeightReading:
     def as_json(self, first: int = 20) -> dict[str, Any]:
         """The `first` layers by score and by raw norm, with what was read of them."""
         magnets = self.ring.magnets
-        shares, best = self.shares, self.best
+        split, best = self.split, self.best
 
         def entry(k: int) -> dict[str, Any]:
             own = [i for i in np.flatnonzero(self.layer == k) if np.isfinite(self.sigma[i])]
@@ -192,15 +212,16 @@ class WeightReading:
                 "s": magnets[k].s,
                 "raw": float(self.raw[k]),
                 "score": float(best[k]),
-                "parts": {name: float(v) for name, v in zip(PARTS, self.parts[k], strict=True)},
-                "shares": {name: float(v) for name, v in zip(PARTS, shares[k], strict=True)},
+                "parts": {name: float(v) for name, v in zip(PARTS, split.parts[k], strict=True)},
+                "shares": {name: float(v) for name, v in zip(PARTS, split.shares[k], strict=True)},
                 "effects": [
                     {
                         "effect": self.hypotheses[i][0],
                         "element": self.hypotheses[i][1],
                         "amount": float(self.amount[i]),
                         "amount_sigma": float(self.sigma[i]),
-                        "together": float(self.together[i]),
+                        "together": float(split.amount[i]),
+                        "together_sigma": float(split.sigma[i]),
                         "score": float(self.score[i]),
                     }
                     for i in sorted(own, key=lambda i: -abs(self.score[i]))
@@ -294,7 +315,6 @@ def _read(
         raw = _euclidean(change)
     safe = np.where(visible, norm, 1.0)
     stacked = _stacked(gradient if network is None else change)
-    together, parts, freedom = _split(seen, effects, stacked, network is None)
     return WeightReading(
         kind="gradient" if network is None else "change",
         ring=ring,
@@ -304,12 +324,10 @@ def _read(
         amount=np.where(visible, inner / safe, 0.0),
         sigma=np.where(visible, 1 / np.sqrt(safe), np.inf),
         score=np.where(visible, inner / np.sqrt(safe), 0.0),
-        together=together,
-        parts=parts,
-        freedom=freedom,
         launches=seen.launches,
         chi2=seen.chi2,
         readings=seen.readings,
+        _take_apart=partial(_split, seen, effects, stacked, network is None),
     )
 
 
@@ -353,7 +371,7 @@ class _Trajectories:
         launch_sigma = data.launch_sigma.copy()
         if n == 4:
             launch_sigma[:, 4] = 0.0
-        data = type(data)(**{**vars(data), "launch_sigma": launch_sigma})
+        data = replace(data, launch_sigma=launch_sigma)
         self.model = model = Model(ring, data.settings, dimension=n)
         if not np.isfinite(data.sigma[data.valid]).all():
             rough = data.with_sigma(np.array([1e-4, 1e-4]))
@@ -488,8 +506,8 @@ def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
 
 def _split(
     seen: _Trajectories, effects: LayerEffects, weights: Array, gradient: bool
-) -> tuple[Array, Array, Indices]:
-    """Amounts of all effects of a layer together, norms of parts, their numbers of directions.
+) -> Split:
+    """Effects, other symplectic changes, the rest.
 
     Args:
         weights: change, or gradient, [layer, n, P].
@@ -498,7 +516,7 @@ def _split(
     maps = seen.model.maps
     kicked, trajectory = seen.roots(), seen.ensemble()
     rows = _stacked((effects.D0, effects.D1, effects.D2))
-    together = np.zeros(len(rows))
+    together, sigma = np.zeros(len(rows)), np.full(len(rows), np.inf)
     parts, freedom = np.zeros((len(weights), 3)), np.zeros((len(weights), 3), dtype=np.int64)
     order = np.argsort(effects.layer, kind="stable")
     first = np.searchsorted(effects.layer[order], np.arange(len(weights) + 1))
@@ -518,11 +536,13 @@ def _split(
         size = np.linalg.norm(columns, axis=0)
         unit = columns / np.where(size > 0, size, 1.0)
         U, values, V = np.linalg.svd(unit, full_matrices=False)
-        kept = values > DEPENDENT
+        kept = values > ALIKE
         physical = U[:, kept]
         inside = physical.T @ vector
-        amounts = V[kept].T @ (inside / values[kept])
-        together[own] = amounts / np.where(size > 0, size, 1.0)
+        size = np.where(size > 0, size, np.inf)
+        inverse = V[kept].T / values[kept]
+        together[own] = inverse @ inside / size
+        sigma[own] = np.where(size < np.inf, np.linalg.norm(inverse, axis=1) / size, np.inf)
         other = sized(symplectic_directions(maps.W0[k], maps.W1[k], maps.W2[k])).T
         size = np.linalg.norm(other, axis=0)
         other = other[:, size > 0] / size[size > 0]
@@ -535,4 +555,4 @@ def _split(
         seen_weights = np.linalg.matrix_rank(left) * np.linalg.matrix_rank(right)
         freedom[k, :2] = physical.shape[1], symplectic.shape[1]
         freedom[k, 2] = seen_weights - freedom[k, :2].sum()
-    return together, parts, freedom
+    return Split(together, sigma, parts, freedom)
