@@ -86,7 +86,11 @@ def tune_fit(
 @study.command("localisation")
 @lattice_argument
 @click.option(
-    "--cases", type=click.IntRange(1), default=40, show_default=True, help="Faults, drawn at random."
+    "--cases",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Faults, at random.",
 )
 @click.option(
     "--signal-to-noise",

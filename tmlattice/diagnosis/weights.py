@@ -504,9 +504,7 @@ def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
     return np.array(found)
 
 
-def _split(
-    seen: _Trajectories, effects: LayerEffects, weights: Array, gradient: bool
-) -> Split:
+def _split(seen: _Trajectories, effects: LayerEffects, weights: Array, gradient: bool) -> Split:
     """Effects, other symplectic changes, the rest.
 
     Args:
