@@ -411,8 +411,8 @@ class _Trajectories:
     def kicks(self, layer: Indices, weights: Sequence[Array]) -> Array:
         """At the exits of layers, by weights' rows, along the trajectories, [shot, row, n]."""
         out = np.empty((len(self.states), 1, len(layer), self.states.shape[2]))
-        rows = [np.ascontiguousarray(w) for w in weights]
-        kernels.kicks(layer, *rows, self.states, self.states.shape[1] - 1, out)
+        D0, D1, D2 = (np.ascontiguousarray(w) for w in weights)
+        kernels.kicks(layer, D0, D1, D2, self.states, self.states.shape[1] - 1, out)
         return out[:, 0]
 
     def gradient(self) -> tuple[Array, Array, Array]:
