@@ -330,3 +330,21 @@ def test_study_names_the_place_by_normalised_gradient(tmp_path):
     assert row["cases"] == 4
     assert row["rankings"]["normalised gradient"]["within_one_gap"] == 1.0
     assert row["chi2_after"] < row["chi2_before"]
+
+
+@pytest.mark.parametrize("which", ["gradient", "change"])
+def test_figure_marks_the_first_layer_of_each_ranking(
+    small_ring, small_network, measurement, gradient, which
+):
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots import plot_weights
+
+    nothing = read_network(small_ring, small_network, measurement)
+    reading = gradient if which == "gradient" else nothing  # a figure of nothing is one too
+    figure = plot_weights(reading, mark=FAULT.element)
+    figure.canvas.draw()
+    raw, score, *_ = figure.axes
+    for ax, by in ((raw, "raw"), (score, "score")):
+        assert small_ring.magnets[reading.places(by)[0]].name in ax.texts[0].get_text()
+    plt.close(figure)

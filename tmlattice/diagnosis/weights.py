@@ -175,8 +175,9 @@ class WeightReading:
 
     @cached_property
     def split(self) -> Split:
-        """The parts of the change; of a gradient: of the step information^-1 gradient that it asks
-        for. Made when it is first asked for: some seconds on a large ring."""
+        """The parts of the change; of a gradient: those of the steepest step, -information^-1
+        gradient, whose shares mean something and whose norms are no sigma. Made when it is first
+        asked for: some seconds on a large ring."""
         return self._take_apart()
 
     @property

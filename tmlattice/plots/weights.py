@@ -11,6 +11,9 @@ from tmlattice.plots.strip import lattice_strip
 if TYPE_CHECKING:
     from tmlattice.diagnosis.weights import WeightReading
 
+BINS = 120
+"""Along s, in which the squares of layers' parts are added up for their shares."""
+
 _COLOURS = ("tab:blue", "0.55", "tab:orange")
 
 
@@ -46,19 +49,23 @@ def plot_weights(
             ha="left" if s[first] < 0.7 * ring.length else "right", fontsize="small",
         )  # fmt: skip
         ax.set_ylim(0, 1.1 * values.max() if values.max() > 0 else 1.0)
-    below = np.zeros(len(s))
+    edges = np.linspace(0, ring.length, BINS + 1)
+    squares = np.stack([np.histogram(s, edges, weights=w)[0] for w in (split.parts**2).T])
+    whole = squares.sum(axis=0)
+    below = np.zeros(BINS)
     for i, name in enumerate(PARTS):
         size.plot(s, split.parts[:, i], ".", ms=1.5, color=_COLOURS[i], label=name)
-        top = below + split.shares[:, i]
-        share.vlines(s, below, top, color=_COLOURS[i], linewidth=0.8)
+        top = below + squares[i] / np.where(whole > 0, whole, 1.0)
+        share.stairs(top, edges, baseline=below, fill=True, color=_COLOURS[i])
         below = top
-    if (split.parts > 0).any():
+    largest = split.parts.max()
+    if largest > 0:
         size.set_yscale("log")
-        size.set_ylim(max(split.parts[split.parts > 0].min(), 1e-4 * split.parts.max()))
-    size.set_ylabel("parts [sigma]")
+        size.set_ylim(1e-3 * largest, 20 * largest)  # room for the words
+    size.set_ylabel("parts of the\nsteepest step" if gradient else "parts [sigma]")
     size.legend(loc="upper right", ncols=3, fontsize="small", markerscale=5, framealpha=0.9)
     share.set_ylim(0, 1)
-    share.set_ylabel("share of\nthe square")
+    share.set_ylabel("share of the\nsquare")
     for ax in (raw, score, size, share):
         if mark is not None:
             ax.axvline(ring[mark].s, color="0.4", linestyle=":", linewidth=1, zorder=0)
