@@ -83,6 +83,116 @@ def tune_fit(
         _print(summary)
 
 
+@study.command("localisation")
+@lattice_argument
+@click.option(
+    "--cases",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Faults, at random.",
+)
+@click.option(
+    "--signal-to-noise",
+    type=click.FloatRange(0, min_open=True),
+    multiple=True,
+    default=(20.0,),
+    show_default=True,
+    help="Norm of the change of all readings over the noise, launch fitted; repeat for several.",
+)
+@click.option(
+    "--shots",
+    type=click.IntRange(1),
+    multiple=True,
+    default=(1, 4),
+    show_default=True,
+    help="Of a measurement; repeat for several.",
+)
+@click.option(
+    "--noise",
+    type=click.FloatRange(0, min_open=True),
+    default=2e-5,
+    show_default=True,
+    help="Rms of one reading, m.",
+)
+@click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    default=1000,
+    show_default=True,
+    help="Gradient steps at most.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Of faults, launches and noise.",
+)
+@json_option
+@quiet_option
+def localisation(
+    lattice: str,
+    sequence: str | None,
+    energy: float | None,
+    json_file: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """The place of a gradient fault, as a network's raw and its normalised weights name it."""
+    from tmlattice import __version__
+    from tmlattice.challenge.localisation import study_localisation, summarise
+    from tmlattice.files import output_file, write_json
+    from tmlattice.lattice import load_ring
+
+    with output_file(json_file) if json_file else nullcontext() as path:
+        ring = load_ring(lattice, sequence, energy)
+        cases = list(study_localisation(ring, progress=not quiet, **options))
+        rows = summarise(cases)
+        if path:
+            summary = {
+                "format": "tmlattice-study-localisation",
+                "version": 1,
+                "package": __version__,
+                "lattice": lattice,
+                "options": {name: _plain(value) for name, value in options.items()},
+                "summary": rows,
+                "results": [
+                    {name: _plain(value) for name, value in vars(case).items()} for case in cases
+                ],
+            }
+            write_json(path, summary)
+    if not quiet:
+        _print_localisation(rows)
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _print_localisation(rows: list[dict[str, Any]]) -> None:
+    screen = console()
+    for row in rows:
+        names = table(
+            f"signal to noise {row['signal_to_noise']:g}, {row['shots']} shots, "
+            f"{row['cases']} faults",
+            "element", "within one monitor gap", "median gaps off",
+        )  # fmt: skip
+        for name, found in row["rankings"].items():
+            names.add_row(
+                name,
+                f"{found['element']:.0%}",
+                f"{found['within_one_gap']:.0%}",
+                f"{found['median_gaps']:g}",
+            )
+        screen.print(names)
+        screen.print(
+            f"chi-square a reading {row['chi2_before']:.3f} before fine-tuning, "
+            f"{row['chi2_after']:.3f} after; seconds: fine-tuning "
+            f"{row['seconds_fine_tuning']:.1f}, reading {row['seconds_reading']:.1f}"
+        )
+
+
 def _print(summary: dict[str, Any]) -> None:
     screen = console()
     screen.print(

@@ -1,0 +1,350 @@
+"""Weight changes read as physics: against torch's gradient, the scan, and maps made by hand."""
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from tmlattice import TaylorMap, TaylorNetwork, fine_tune
+from tmlattice.diagnosis.data import of_measurement
+from tmlattice.diagnosis.model import Model
+from tmlattice.diagnosis.refine import Problem, fit
+from tmlattice.diagnosis.scan import scan
+from tmlattice.diagnosis.weights import (
+    layer_effects,
+    read_gradient,
+    read_network,
+    symplectic_directions,
+)
+from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.effects import Cause
+from tmlattice.errors import LatticeError, MeasurementError
+from tmlattice.machine import simulate
+from tmlattice.network.reference import plain_readings
+
+SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
+FAULT = Cause("quadrupole_gradient", "QD::7", 0.03)
+
+
+@pytest.fixture(scope="module")
+def measurement(small_ring):
+    return simulate(small_ring, [FAULT], shots=3, amplitude=5e-4, seed=4).measurement()
+
+
+@pytest.fixture(scope="module")
+def effects(small_ring):
+    return layer_effects(small_ring)
+
+
+@pytest.fixture(scope="module")
+def gradient(small_ring, measurement, effects):
+    return read_gradient(small_ring, measurement, effects=effects)
+
+
+def changed(network, layer, weights):
+    new = network.copy()
+    with torch.no_grad():
+        for own, change in zip((new.W0, new.W1, new.W2), weights, strict=True):
+            own[layer] += torch.from_numpy(np.ascontiguousarray(change))
+    return new
+
+
+def layer_of(ring, name):
+    return [magnet.name for magnet in ring.magnets].index(name)
+
+
+def taken_apart(stacked):
+    """W0, W1, W2 of one stacked change."""
+    n = len(stacked)
+    return stacked[:, 0], stacked[:, 1 : 1 + n], stacked[:, 1 + n :]
+
+
+@pytest.mark.parametrize("dimension", [4, 6])
+def test_score_of_the_gradient_is_the_scans_signed_root(small_ring, measurement, dimension):
+    reading = read_gradient(small_ring, measurement, dimension)
+    model = Model(small_ring, measurement.settings or [{}] * 3, dimension=dimension)
+    data = of_measurement(small_ring, measurement)
+    problem = Problem(model, data, Whitening(data), {})
+    found = fit(problem, (), data.launches)
+    referee = scan(
+        model, found.paths, found.launches, reading.hypotheses, problem.whitening,
+        found.projection, found.residual, data.active, effective=1.0,
+    )  # fmt: skip
+    root = np.sign(referee.amount) * np.sqrt(referee.statistic)
+    # what launches leave a millionth of has lost as many digits in both
+    seen = referee.information > 1e-4 * np.median(referee.information)
+    assert seen.mean() > 0.7
+    assert np.abs(root).max() > 10
+    np.testing.assert_allclose(reading.score[seen], root[seen], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(reading.amount[seen], referee.amount[seen], rtol=1e-6, atol=1e-12)
+
+
+def test_gradient_is_torchs(small_ring, small_network, measurement, gradient):
+    """With exact launches nothing is projected out: the gradient is the plain one."""
+    exact = replace(measurement, launches=gradient.launches, launch_sigma=np.full((3, 5), 1e-11))
+    reading = read_gradient(small_ring, exact)
+    network = small_network.copy()
+    ordered = exact.in_order_of(network.monitors)
+    readings = plain_readings(network, torch.from_numpy(gradient.launches[:, :4].copy()))
+    left = (readings - torch.from_numpy(ordered.readings[:, 0])) / torch.from_numpy(ordered.noise)
+    loss = left.square().sum() / 2
+    loss.backward()
+    referee = np.sqrt(
+        sum(
+            (w.grad.numpy().reshape(len(network.layers), -1) ** 2).sum(axis=1)
+            for w in network.parameters()
+        )
+    )
+    np.testing.assert_allclose(reading.raw, referee, rtol=1e-9, atol=1e-9 * referee.max())
+    assert reading.chi2 == pytest.approx(2 * loss.item(), rel=1e-12)
+
+
+def test_the_fault_is_read_at_its_place_with_its_amount(small_ring, gradient):
+    layer = gradient.places()[0]
+    assert small_ring.magnets[layer].name == FAULT.element
+    which = gradient.hypotheses.index(("quadrupole_gradient", FAULT.element))
+    assert gradient.amount[which] == pytest.approx(FAULT.amount, abs=4 * gradient.sigma[which])
+    assert gradient.sigma[which] < 0.1 * FAULT.amount
+
+
+@pytest.mark.parametrize(
+    ("effect", "element", "amount"),
+    [
+        ("quadrupole_gradient", "QD::7", 1e-3),
+        ("quadrupole_offset_y", "QF::5", -1e-4),
+        ("dipole_roll", "bend::8", 1e-3),
+        ("sextupole_strength", "sf::6", 0.2),
+    ],
+)
+def test_an_effects_own_change_is_that_effect(
+    small_ring, small_network, measurement, effects, effect, element, amount
+):
+    which = effects.hypotheses.index((effect, element))
+    layer = layer_of(small_ring, element)
+    assert effects.layer[which] == layer
+    weights = (amount * D[which] for D in (effects.D0, effects.D1, effects.D2))
+    network = changed(small_network, layer, weights)
+    reading = read_network(small_ring, network, measurement, effects)
+    assert reading.amount[which] == pytest.approx(amount, rel=1e-9)
+    split = reading.split
+    assert split.amount[which] == pytest.approx(amount, rel=1e-5)
+    others = np.flatnonzero((effects.layer == layer) & (np.arange(len(effects.layer)) != which))
+    assert (
+        np.abs(split.amount[others] / split.sigma[others]).max()
+        < 1e-4 * abs(amount / split.sigma[which]) + 1e-9
+    )
+    np.testing.assert_allclose(split.shares[layer], [1, 0, 0], atol=1e-12)
+    elsewhere = np.arange(len(reading.raw)) != layer
+    assert not reading.raw[elsewhere].any()
+    assert not split.parts[elsewhere].any()
+    assert reading.places("raw")[0] == reading.places("score")[0] == layer
+
+
+@pytest.mark.parametrize("name", ["QF::5", "bend::8"])
+def test_a_symplectic_change_without_a_name_is_symplectic(
+    small_ring, small_network, measurement, effects, name
+):
+    """The flow of H = x px y behind a magnet: no effect of the catalogue does that."""
+    layer = layer_of(small_ring, name)
+    own = small_network.layer_map(layer)
+    bends = np.zeros((4, 10))
+    bends[0, 2] = 1e-3  # x' = dH/dpx = x y: the pair (x, y)
+    bends[1, 5] = -1e-3  # px' = -dH/dx = -px y
+    bends[3, 1] = -1e-3  # py' = -dH/dy = -x px
+    bent = TaylorMap([np.zeros(4), np.eye(4), bends]).after(own, 2)
+    weights = [a - b for a, b in zip(bent.coefficients, own.coefficients, strict=True)]
+    network = changed(small_network, layer, weights)
+    physical, symplectic, rest = read_network(
+        small_ring, network, measurement, effects
+    ).split.shares[layer]
+    assert symplectic > 0.9
+    assert rest < 1e-9
+    assert physical + symplectic + rest == pytest.approx(1, abs=1e-12)
+
+
+def test_a_change_that_is_not_symplectic_is_the_rest(
+    small_ring, small_network, measurement, effects
+):
+    """x and px both grow with y: no H does that. A symplectic change comes nearest to three
+    quarters of it, in what monitors see, and no effect to any."""
+    layer = layer_of(small_ring, "QF::5")
+    own = small_network.layer_map(layer)
+    bends = np.zeros((4, 10))
+    bends[0, 2] = bends[1, 5] = 1e-3
+    bent = TaylorMap([np.zeros(4), np.eye(4), bends]).after(own, 2)
+    weights = [a - b for a, b in zip(bent.coefficients, own.coefficients, strict=True)]
+    reading = read_network(small_ring, changed(small_network, layer, weights), measurement, effects)
+    shares = reading.split.shares[layer]
+    assert shares[2] > 0.2
+    assert shares[0] < 0.01
+    assert shares.sum() == pytest.approx(1, abs=1e-12)
+
+
+def test_scaling_x_is_half_a_stretch_and_half_a_growth(
+    small_ring, small_network, measurement, effects
+):
+    layer = layer_of(small_ring, "QF::5")
+    own = [getattr(small_network.maps, w)[layer] for w in ("W0", "W1", "W2")]
+    norms = {}
+    for name, scale in (("x", (1, 0)), ("growth", (0.5, 0.5)), ("stretch", (0.5, -0.5))):
+        weights = [1e-4 * np.diag([*scale, 0.0, 0.0]) @ w for w in own]
+        network = changed(small_network, layer, weights)
+        norms[name] = read_network(small_ring, network, measurement, effects).split.parts[layer]
+    assert norms["x"][2] > 0
+    assert norms["stretch"][2] < 1e-6 * norms["x"][2]
+    assert norms["x"][2] == pytest.approx(norms["growth"][2], rel=1e-6)
+
+
+def test_parts_add_up_to_the_information_of_the_whole(
+    small_ring, small_network, measurement, effects, rng
+):
+    """Over many trajectories the mean square of a change's kicks, by drawing them."""
+    layer = layer_of(small_ring, "QD::5")
+    weights = [1e-6 * rng.standard_normal(s) for s in ((4,), (4, 4), (4, 10))]
+    weights[0] *= 1e-3
+    network = changed(small_network, layer, weights)
+    reading = read_network(small_ring, network, measurement, effects)
+    states = small_network.states(reading.launches[:, :4])
+    closing = small_network.maps.closing
+    states = np.concatenate([states, closing(states[:, -1])[:, None]], axis=1)
+    x = np.sqrt((states**2).mean(axis=(0, 1))) * rng.standard_normal((200_000, 4))
+    i, j = np.triu_indices(4)
+    kicks = weights[0] + x @ weights[1].T + (x[:, i] * x[:, j]) @ weights[2].T
+    # what readings know of a kick, by tracking it with the launch refitted
+    M, still = np.zeros((4, 4)), np.zeros(4)
+    sigma = measurement.noise[0, 0]
+    for shot in range(3):
+        launch = reading.launches[shot, :4]
+
+        def read(launch, kick=still):
+            moved = changed(small_network, layer, [kick, np.zeros((4, 4)), np.zeros((4, 10))])
+            return moved(launch[None]).detach().numpy().reshape(-1) / sigma
+
+        step = 1e-7 * np.eye(4)
+        A = np.stack([(read(launch, d) - read(launch, -d)) / 2e-7 for d in step], axis=1)
+        L = np.stack([(read(launch + d) - read(launch - d)) / 2e-7 for d in step], axis=1)
+        prior = np.diag(1 / measurement.launch_sigma[shot, :4] ** 2)
+        M += A.T @ A - A.T @ L @ np.linalg.solve(L.T @ L + prior, L.T @ A)
+    referee = np.einsum("ti,ij,tj->t", kicks, M, kicks)
+    error = referee.std() / np.sqrt(len(referee))
+    found = (reading.split.parts[layer] ** 2).sum()
+    assert found == pytest.approx(referee.mean(), abs=4 * error + 1e-4 * found)
+
+
+@pytest.mark.parametrize("name", ["QD::3", "bend::4", "sf::5"])
+def test_symplectic_directions_are_all_and_only_those_without_defect(small_network, name):
+    """34 of 60 weights: the null space of the linearised conditions of degree 0 and 1."""
+    layer = small_network.layers.index(name)
+    maps = small_network.maps
+    own = [getattr(maps, w)[layer] for w in ("W0", "W1", "W2")]
+    if name.startswith("sf"):
+        own[2] = own[2] / 10
+    directions = symplectic_directions(*own)
+
+    def defect(change):
+        sides = []
+        for sign in (1, -1):
+            parts = [w + sign * c for w, c in zip(own, taken_apart(change), strict=True)]
+            zero, one, _ = TaylorMap(parts).symplectic_defect()
+            sides.append(np.concatenate([zero.ravel(), one.ravel()]))
+        return (sides[0] - sides[1]) / 2  # quadratic in the weights: exact
+
+    basis = np.eye(60).reshape(60, 4, 15)
+    conditions = np.array([defect(b) for b in basis]).T
+    values = np.linalg.svd(conditions, compute_uv=False)
+    assert (values < 1e-9 * values[0]).sum() == 34 == len(directions)
+    rows = directions.reshape(34, -1)
+    assert np.linalg.matrix_rank(rows) == 34
+    size = np.abs(conditions).max() * np.abs(rows).max()
+    assert np.abs(conditions @ rows.T).max() < 1e-5 * size  # OCELOT's own defect is 2e-6
+
+
+def test_the_designs_network_says_nothing(small_ring, small_network, measurement, effects):
+    reading = read_network(small_ring, small_network, measurement, effects)
+    assert not reading.raw.any()
+    assert not reading.amount.any()
+    assert not reading.score.any()
+    assert not reading.split.parts.any()
+    assert not reading.split.shares.any()
+
+
+def test_before_the_first_monitor_nothing_is_seen(small_ring, measurement, effects):
+    """A kick that no monitor has behind it, or that the free launch explains, has no score."""
+    last = [m.name for m in small_ring.monitors[-1:]]
+    alone = replace(measurement.select(monitors=last), launch_sigma=None)
+    blind = read_gradient(small_ring, alone, effects=effects)
+    assert not blind.score.any()
+    assert np.isinf(blind.sigma).all()
+
+
+def test_fine_tuned_network_of_all_layers(small_ring, small_network, measurement, gradient):
+    launched = replace(measurement, launches=gradient.launches)
+    fitted = fine_tune(small_network, launched, epochs=100, progress=False)
+    reading = read_network(small_ring, fitted.network, measurement)
+    assert (reading.raw[:-1] > 0).all()
+    assert np.abs(reading.score).max() > 0.1
+    np.testing.assert_allclose(reading.split.shares.sum(axis=1)[10:-10], 1, atol=1e-9)
+    json.dumps(reading.as_json(), allow_nan=False)
+
+
+def test_another_rings_network_is_refused(small_ring, petra3_network, measurement, small_network):
+    with pytest.raises(LatticeError, match="another lattice"):
+        read_network(small_ring, petra3_network, measurement)
+    maps = replace(small_network.maps, W1=1.01 * small_network.maps.W1)
+    with pytest.raises(LatticeError, match="another lattice"):
+        read_network(small_ring, TaylorNetwork(maps), measurement)
+
+
+def test_shots_with_settings_are_refused(small_ring, measurement):
+    settings = ({"v3": {"kick": 1e-5}}, {}, {})
+    with pytest.raises(MeasurementError, match="different settings"):
+        read_gradient(small_ring, replace(measurement, settings=settings))
+
+
+def test_unknown_noise_is_estimated(small_ring, measurement, gradient, effects):
+    reading = read_gradient(small_ring, replace(measurement, noise=None), effects=effects)
+    which = gradient.hypotheses.index(("quadrupole_gradient", FAULT.element))
+    assert reading.sigma[which] == pytest.approx(gradient.sigma[which], rel=0.35)
+
+
+def test_study_names_the_place_by_normalised_gradient(tmp_path):
+    from tmlattice.cli.command import tmlattice
+
+    file = tmp_path / "study.json"
+    arguments = [
+        "study", "localisation", str(SMALL), "--cases", "4", "--shots", "2", "--epochs", "20",
+        "--signal-to-noise", "40", "--json", str(file), "--quiet",
+    ]  # fmt: skip
+    done = CliRunner().invoke(tmlattice, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    result = json.loads(file.read_text())
+    schema = files("tmlattice") / "schemas" / "study-localisation.schema.json"
+    jsonschema.validate(result, json.loads(schema.read_text()))
+    (row,) = result["summary"]
+    assert row["cases"] == 4
+    assert row["rankings"]["normalised gradient"]["within_one_gap"] == 1.0
+    assert row["chi2_after"] < row["chi2_before"]
+
+
+@pytest.mark.parametrize("which", ["gradient", "change"])
+def test_figure_marks_the_first_layer_of_each_ranking(
+    small_ring, small_network, measurement, gradient, which
+):
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots import plot_weights
+
+    nothing = read_network(small_ring, small_network, measurement)
+    reading = gradient if which == "gradient" else nothing  # a figure of nothing is one too
+    figure = plot_weights(reading, mark=FAULT.element)
+    figure.canvas.draw()
+    raw, score, *_ = figure.axes
+    for ax, by in ((raw, "raw"), (score, "score")):
+        assert small_ring.magnets[reading.places(by)[0]].name in ax.texts[0].get_text()
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""The blind challenge: the diagnosis checked on data whose cause is withheld."""

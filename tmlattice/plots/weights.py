@@ -1,0 +1,77 @@
+"""What a network says of its ring, along s."""
+
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from tmlattice.plots.strip import lattice_strip
+
+if TYPE_CHECKING:
+    from tmlattice.diagnosis.weights import WeightReading
+
+BINS = 120
+"""Along s, in which the squares of layers' parts are added up for their shares."""
+
+_COLOURS = ("tab:blue", "0.55", "tab:orange")
+
+
+def plot_weights(
+    reading: "WeightReading", figure: Figure | None = None, mark: str | None = None
+) -> Figure:
+    """Raw change, normalised score and shares of the parts of every layer, and the lattice.
+
+    Args:
+        reading: of `read_network` or `read_gradient`.
+        figure: an empty one; else a new one.
+        mark: an element to show, such as the true cause.
+    """
+    from tmlattice.diagnosis.weights import PARTS
+
+    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+    raw, score, size, share, strip = figure.subplots(
+        5, 1, sharex=True, height_ratios=[2, 2.6, 2, 2, 0.8]
+    )
+    ring, split = reading.ring, reading.split
+    s = np.array([magnet.s for magnet in ring.magnets])
+    gradient = reading.kind == "gradient"
+    raw.vlines(s, 0, reading.raw, color="k", linewidth=0.6)
+    raw.set_ylabel("raw gradient\n[1/m, 1/rad, ...]" if gradient else "raw change\n[m, rad, ...]")
+    score.vlines(s, 0, reading.best, color="tab:red", linewidth=0.6)
+    score.set_ylabel("normalised\nscore [sigma]")
+    for ax, values in ((raw, reading.raw), (score, reading.best)):
+        first = int(values.argmax())
+        ax.plot(s[first], values[first], "o", ms=4, mfc="none", color="k")
+        ax.annotate(
+            f"{ring.magnets[first].name}, s = {s[first]:.1f} m", (s[first], values[first]),
+            xytext=(6 if s[first] < 0.7 * ring.length else -6, -3), textcoords="offset points",
+            ha="left" if s[first] < 0.7 * ring.length else "right", fontsize="small",
+        )  # fmt: skip
+        ax.set_ylim(0, 1.1 * values.max() if values.max() > 0 else 1.0)
+    edges = np.linspace(0, ring.length, BINS + 1)
+    squares = np.stack([np.histogram(s, edges, weights=w)[0] for w in (split.parts**2).T])
+    whole = squares.sum(axis=0)
+    below = np.zeros(BINS)
+    for i, name in enumerate(PARTS):
+        size.plot(s, split.parts[:, i], ".", ms=1.5, color=_COLOURS[i], label=name)
+        top = below + squares[i] / np.where(whole > 0, whole, 1.0)
+        share.stairs(top, edges, baseline=below, fill=True, color=_COLOURS[i])
+        below = top
+    largest = split.parts.max()
+    if largest > 0:
+        size.set_yscale("log")
+        size.set_ylim(1e-3 * largest, 20 * largest)  # room for the words
+    size.set_ylabel("parts of the\nsteepest step" if gradient else "parts [sigma]")
+    size.legend(loc="upper right", ncols=3, fontsize="small", markerscale=5, framealpha=0.9)
+    share.set_ylim(0, 1)
+    share.set_ylabel("share of the\nsquare")
+    for ax in (raw, score, size, share):
+        if mark is not None:
+            ax.axvline(ring[mark].s, color="0.4", linestyle=":", linewidth=1, zorder=0)
+        ax.grid(alpha=0.25)
+    what = "Gradient of the loss at the design" if gradient else "Weights after fine-tuning"
+    dotted = "" if mark is None else f" (dotted: {mark}, s = {ring[mark].s:.1f} m)"
+    raw.set_title(f"{what}, layer by layer{dotted}")
+    lattice_strip(ring, strip)
+    return figure
