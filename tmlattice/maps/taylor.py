@@ -159,6 +159,11 @@ class TaylorMap:
         return _table(self.n, self.order)
 
     @property
+    def exponents(self) -> Indices:
+        """Exponents of the monomials of degree 0 to the order, [monomial, n]."""
+        return self._table.exponents.copy()
+
+    @property
     def coefficients(self) -> list[Array]:
         """W0 [n], W1 [n, n], W2 [n, n (n + 1) / 2], ..., copies."""
         starts = self._table.starts
@@ -168,13 +173,17 @@ class TaylorMap:
     def __repr__(self) -> str:
         return f"TaylorMap(n={self.n}, order={self.order})"
 
-    def __call__(self, x: ArrayLike) -> Array:
-        """Images of the states x [..., n], the same shape."""
+    def monomials(self, x: ArrayLike) -> Array:
+        """Monomials of degree 0 to the order of the states x [..., n], [..., monomial]."""
         x = np.asarray(x, dtype=float)
         values = np.ones((*x.shape[:-1], len(self._table.exponents)))
         for i, (parent, variable) in enumerate(self._table.parents[1:], start=1):
             values[..., i] = values[..., parent] * x[..., variable]
-        return np.asarray(values @ self._rows.T)
+        return values
+
+    def __call__(self, x: ArrayLike) -> Array:
+        """Images of the states x [..., n], the same shape."""
+        return np.asarray(self.monomials(x) @ self._rows.T)
 
     def truncated(self, order: int) -> "TaylorMap":
         """The same map cut, or filled with zeros, to another order."""
