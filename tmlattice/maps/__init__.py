@@ -7,7 +7,13 @@
 >>> maps = ring_maps(load_ring("petra3"))            # stacked weights of all layers
 """
 
-from tmlattice.maps.magnets import RingMaps, element_map, ring_maps, ring_matrix
+from tmlattice.maps.magnets import (
+    RingMaps,
+    element_map,
+    part_maps,
+    ring_maps,
+    ring_matrix,
+)
 from tmlattice.maps.ode import (
     ode_of_taylor_map,
     recentred,
@@ -22,6 +28,7 @@ __all__ = [
     "element_map",
     "kronecker_exponents",
     "ode_of_taylor_map",
+    "part_maps",
     "recentred",
     "right_hand_side",
     "ring_maps",

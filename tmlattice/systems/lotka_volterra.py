@@ -39,7 +39,9 @@ def solutions(starts: ArrayLike, steps: int = STEPS) -> Array:
     slope = right_hand_side(EQUATION)
     times = STEP * np.arange(steps + 1)
     return np.array([
-        solve_ivp(slope, (0, times[-1]), x, method="DOP853", t_eval=times, rtol=1e-12, atol=1e-14).y.T
+        solve_ivp(
+            slope, (0, times[-1]), x, method="DOP853", t_eval=times, rtol=1e-12, atol=1e-14
+        ).y.T
         for x in np.asarray(starts, dtype=float)
     ])  # fmt: skip
 
@@ -102,10 +104,10 @@ def race(
     seed: int = 0,
     progress: bool = False,
 ) -> Race:
-    """Train a multilayer perceptron and LSTMs on the one solution, and run all alone from unseen starts.
+    """Train a multilayer perceptron and LSTMs on the one solution, then run all alone.
 
     Every network sees windows of five states and gives the next; afterwards it gets five true
-    states and runs on its own output for the rest of 4.65 s. Adam, rate 1e-3, the whole solution a
+    states and runs on its own output for the rest of 4.65 s. Adam, rate 3e-3, the whole solution a
     step; L2 is a weight decay of 1e-4, dropout leaves out a tenth of the hidden values.
 
     Args:
@@ -192,7 +194,7 @@ def _train(network: "torch.nn.Module", solution: Array, how: str, checkpoints: A
     windows = data.unfold(0, SEEN + 1, 1).transpose(1, 2)  # [window, 6, 2]
     given, wanted = windows[:, :SEEN].contiguous(), windows[:, SEEN].contiguous()
     decay = 1e-4 if how == "L2" else 0.0
-    adam = torch.optim.Adam(network.parameters(), lr=1e-3, weight_decay=decay)
+    adam = torch.optim.Adam(network.parameters(), lr=3e-3, weight_decay=decay)
     for epoch in range(1, int(checkpoints[-1]) + 1):
         network.train()
         adam.zero_grad()

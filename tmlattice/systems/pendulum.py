@@ -236,8 +236,8 @@ def comparisons(done: PendulumStudy) -> list[Comparison]:
         ("filmed swing a", done.real, ("0.28 m, by the builder", "not known")),
     ):
         if made is None:
-            rows.append(Comparison(f"{what}: length [m]", TRUE_LENGTH, "no film here",
-                                   "set TMLATTICE_DATA to the folder that holds pendulum/"))  # fmt: skip
+            why = "set TMLATTICE_DATA to the folder that holds pendulum/"
+            rows.append(Comparison(f"{what}: length [m]", TRUE_LENGTH, "no film here", why))
             continue
         (length, dl), (damping, dd) = made.length, made.damping
         rows += [
