@@ -9,6 +9,7 @@ import click
 
 from tmlattice import __version__
 from tmlattice.cli.info import info
+from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
 from tmlattice.errors import TmlatticeError
@@ -30,6 +31,7 @@ def tmlattice() -> None:
 tmlattice.add_command(tune_fit)
 tmlattice.add_command(info)
 tmlattice.add_command(study)
+tmlattice.add_command(reproduce)
 
 
 def main() -> NoReturn:

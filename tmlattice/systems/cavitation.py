@@ -8,8 +8,8 @@ With z = 1 / R and c = cos(omega t) it is a polynomial in five coordinates (R, R
     u'  = -3/2 u^2 z + z (p_B - p_0 - p_a s) / rho - 4 nu u z^2 - 2 sigma / rho z^2
     z'  = -u z^2        s' = omega c        c' = -omega s
 
-Lengths are in the radius at rest R0, times in R0 sqrt(rho / p_0), pressures in p_0; maps expand about
-the bubble at rest (1, 0, 1, 0, 0).
+Lengths are in the radius at rest R0, times in R0 sqrt(rho / p_0), pressures in p_0; maps expand
+about the bubble at rest (1, 0, 1, 0, 0).
 
 >>> bubble = Bubble(drive=0.8)
 >>> run = ladder(bubble).follow(bubble.start, bubble.period)
@@ -94,12 +94,14 @@ class Bubble:
             (0, 0, 0, 0, 1): (3, omega),
             (0, 0, 0, 1, 0): (4, -omega),
         }
-        terms = {e: value * np.eye(5)[row] for e, (row, value) in rows.items()}
+        terms: dict[tuple[int, ...], Array] = {
+            e: value * np.eye(5)[row] for e, (row, value) in rows.items()
+        }
         terms[0, 1, 2, 0, 0] = terms[0, 1, 2, 0, 0] - np.eye(5)[2]  # z' = -u z^2
         return recentred(terms, REST)
 
     def solution(self, times: ArrayLike) -> Array:
-        """True distances from `REST` at the scaled times, [time, 5], from the closed equation in R."""
+        """True distances from `REST` at the scaled times, [time, 5], by the equation in R alone."""
         surface = 2 * self.tension / (self.radius * self.pressure)
         vapour = self.vapour / self.pressure
         omega = 2 * np.pi / self.period
@@ -115,13 +117,14 @@ class Bubble:
         done = solve_ivp(
             slope, (0.0, t[-1]), [1.0, 0.0], method="DOP853", t_eval=t, rtol=1e-12, atol=1e-14
         )
-        R, u = done.y
-        return np.stack([R, u, 1 / R, np.sin(omega * t), np.cos(omega * t)], axis=1) - REST
+        R, u = np.asarray(done.y)
+        wave = np.sin(omega * t), np.cos(omega * t)
+        return np.asarray(np.stack([R, u, 1 / R, *wave], axis=1) - REST)
 
 
 @dataclass(frozen=True)
 class Run:
-    """A solution by maps: scaled times [step + 1], states as distances from `REST` [step + 1, 5]."""
+    """A solution by maps: scaled times [step + 1], distances from `REST` [step + 1, 5]."""
 
     times: Array
     states: Array

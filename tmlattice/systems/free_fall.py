@@ -193,7 +193,7 @@ def comparisons(errors: StepErrors, masses: MassErrors) -> list[Comparison]:
         Comparison(
             "the same: coefficients from v^6 on that are wrong by more than half", None,
             int((difference > 0.5 * np.abs(weights_of(true16)[0]))[6:].sum()),
-            "of 11; terms with v^k need the step to the power k - 1, it has four",
+            "of 11; v^k begins with the step to the power k - 1, and it has powers to four right",
         ),
     ]  # fmt: skip
     names = " / ".join(f"map {order}" for order in errors.taylor)

@@ -4,7 +4,7 @@ x' = y + x y, y' = -2 x - x y, in the units of the equilibrium; a solution from 
 after 4.53 s.
 
 >>> learned = learn()                         # third order, from the one solution
->>> race(epochs=(100, 1000)).cells            # multilayer perceptron and LSTM on the same data
+>>> race(epochs=(300, 3000)).cells            # multilayer perceptron and LSTM on the same data
 """
 
 from collections.abc import Sequence
@@ -98,7 +98,7 @@ class Race:
 
 
 def race(
-    epochs: Sequence[int] = (100, 1000),
+    epochs: Sequence[int] = (300, 3000),
     cells: Sequence[int] = (1, 5, 10, 100),
     regularizations: Sequence[str] = ("none", "L2", "dropout"),
     seed: int = 0,

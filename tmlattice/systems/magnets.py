@@ -5,9 +5,9 @@ canonical coordinates (x, px, y, py), px = Px / p0:
 
     H = -(1 + h x) sqrt(1 - px^2 - py^2) + h x + h^2 x^2 / 2 + k1 V1 + k2 V2
 
-with h the curvature, V1 = (x^2 - y^2) / 2 and V2 = (x^3 - 3 x y^2) / 6 and what a curved magnet adds
-to keep the field free of sources (it follows from Laplace's equation). The root is expanded, so
-that the map of the body is right to the order asked for, up to the third.
+with h the curvature, V1 = (x^2 - y^2) / 2 and V2 = (x^3 - 3 x y^2) / 6 and what a curved magnet
+adds to keep the field free of sources (it follows from Laplace's equation). The root is expanded,
+so that the map of the body is right to the order asked for, up to the third.
 
 >>> magnet_map(ring["qd::4"], order=3)
 >>> third_order_turn(ring, [3e-3, 0, 3e-3, 0]).rms()     # what third order adds to a turn, m
@@ -247,20 +247,19 @@ WHY: dict[str, str] = {
     "drift": "both are the expanded exact drift: no second order; third is L p^2 px / 2",
     "quadrupole": "the same physics; no second order at the nominal energy",
     "bend": "the same physics: sector body with the field of the exact curved frame",
-    "sextupole": "OCELOT's thick sextupole",
+    "sextupole": "the same physics: k2 along the length, no thin kick",
 }
 
 
 def comparisons(done: MagnetStudy) -> list[Comparison]:
     """OCELOT's maps beside those of the equation of motion, and what third order adds."""
-    rows = []
-    for a in done.agreements:
-        rows.append(
-            Comparison(f"{a.count} {a.kind}s: largest difference to OCELOT in W1 / W2", None,
-                       f"{a.first:.1e} / {a.second:.1e}",
-                       f"largest W2 {a.second_size:.3g}, left-out W3 {a.third_size:.3g}; "
-                       f"{WHY[a.kind]}")
-        )  # fmt: skip
+    rows = [
+        Comparison(f"{a.count} {a.kind}s: largest difference to OCELOT in W1 / W2", None,
+                   f"{a.first:.1e} / {a.second:.1e}",
+                   f"largest W2 {a.second_size:.3g}, left-out W3 {a.third_size:.3g}; "
+                   f"{WHY[a.kind]}")
+        for a in done.agreements
+    ]  # fmt: skip
     for turn in done.turns:
         x, y = turn.rms()
         rows.append(

@@ -242,7 +242,9 @@ def comparisons(done: PendulumStudy) -> list[Comparison]:
         (length, dl), (damping, dd) = made.length, made.damping
         rows += [
             Comparison(f"{what}: length [m]", TRUE_LENGTH, f"{length:.4f} ± {dl:.4f}",
-                       f"truth {truth[0]}; the model begins with 0.30"),
+                       f"truth {truth[0]}; the model begins with 0.30" if made is done.simulated
+                       else f"{truth[0]}; its period here is "
+                       f"{2 * np.pi * np.sqrt(length / GRAVITY):.3f} s, if 10 frames a second hold"),
             Comparison(f"{what}: damping [1/s]", None, f"{damping:.3f} ± {dd:.3f}",
                        f"truth {truth[1]}; the model begins with 0"),
             Comparison(f"{what}: noise of one angle [mrad]", None, round(1e3 * made.noise, 2),
@@ -254,8 +256,8 @@ def comparisons(done: PendulumStudy) -> list[Comparison]:
         rows.append(
             Comparison("filmed swing b, learned alone: length [m], damping [1/s]", None,
                        f"{length:.4f} ± {dl:.4f}, {damping:.3f} ± {dd:.3f}",
-                       "the two swings differ by more than their noise: friction and the pivot "
-                       "depend on the amplitude, so the errors above are too small for the film")
+                       "the two swings differ by more than their noise (friction may depend on "
+                       "the amplitude): the errors above are too small for the film")
         )  # fmt: skip
     for test in done.tests:
         learned, ideal = test.rms()
