@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from tmlattice.lattice.ring import Ring
@@ -26,6 +27,12 @@ def _finish(ax: Axes, x: str, y: str, title: str = "", legend: str | None = "bes
         ax.legend(fontsize="small", loc=legend)  # type: ignore[call-overload]
 
 
+def _room(ax: Axes, values: NDArray[np.float64]) -> None:
+    """Limits that leave room for the legend above the curves."""
+    size = np.abs(values).max()
+    ax.set_ylim(-1.15 * size, 2.3 * size)
+
+
 def plot_free_fall(errors: "StepErrors", masses: "MassErrors") -> Figure:
     """Error against step of Euler, maps and Runge-Kutta; falls of masses not learned from."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
@@ -43,7 +50,7 @@ def plot_free_fall(errors: "StepErrors", masses: "MassErrors") -> Figure:
     words = "Lines: truth, dots: map" + (
         "" if masses.forest_falls is None else ", crosses: random forest"
     )
-    _finish(right, "time [s]", "velocity [m/s]", f"Learned from 100 and 80 kg. {words}")
+    _finish(right, "time [s]", "velocity [m/s]", f"Learned from 100 and 80 kg\n{words}")
     return figure
 
 
@@ -64,7 +71,7 @@ def plot_lotka_volterra(done: "Race") -> Figure:
             ax.plot(*truth[0], "o", color="k" if i == 0 else f"C{i}", ms=5, zorder=3,
                     label=["learned", "unseen", "unseen", f"unseen {point}"][i])  # fmt: skip
         ax.set_xlim(-0.85, 1.35)
-        ax.set_ylim(-1.0, 1.6)
+        ax.set_ylim(-1.1, 2.3)
         _finish(ax, "x", "y", name, "upper right" if ax is axes[0] else None)
     last = axes[len(names)]
     for i, name in enumerate(dict.fromkeys(name for name, _ in done.curves)):
@@ -90,6 +97,7 @@ def plot_pendulum(done: "PendulumStudy") -> Figure:
     axes = list(grid.flat)
     for ax, (name, angles, made) in zip(axes, learned, strict=False):
         time = 0.1 * np.arange(len(angles))
+        _room(ax, 1e3 * angles)
         ax.plot(time, 1e3 * angles, "k.", label="camera")
         ax.plot(time, 1e3 * (angles - made.fit.residuals[:, 0]), "C3-", label="learned map")
         (length, dl), (damping, dd) = made.length, made.damping
@@ -97,6 +105,7 @@ def plot_pendulum(done: "PendulumStudy") -> Figure:
         _finish(ax, "time [s]", "angle [mrad]", title, "upper right")
     for ax, test in zip(axes[len(learned) :], done.tests, strict=False):
         time = 0.1 * np.arange(len(test.angles))
+        _room(ax, 1e3 * test.angles)
         ax.plot(time, 1e3 * test.angles, "k.", label="truth" if test.seen == 1 else "camera")
         ax.plot(time, 1e3 * test.ideal, "C0-", linewidth=1, label="ideal map")
         ax.plot(time, 1e3 * test.learned, "C3-", label="learned map")
@@ -138,17 +147,18 @@ def plot_cavitation(done: "CavitationStudy") -> Figure:
     b.semilogy(time[1:], unit * np.diff(done.run.times), "C0-", linewidth=1, label="step [µs]")
     error = np.abs(done.run.states - done.truth)[1:, 0]
     b.semilogy(time[1:], np.maximum(error, 1e-12), "C3-", linewidth=1, label="error of R / R0")
-    _finish(b, "time [µs]", "step [µs], error", "The ladder's steps and the error", "upper left")
-    period = len(done.observed) - 1
-    step = 1e6 * done.learned.bubble.time * done.learned.bubble.period / period
-    t = step * np.arange(2 * period + 1)
-    c.plot(t[: period + 1], done.observed, "k.", ms=2.5, label="observed")
+    _finish(b, "time [µs]", "step [µs], error", "The ladder's steps and the error", "lower right")
+    wave = 1e6 * done.learned.bubble.time * done.learned.bubble.period
+    t = np.linspace(0, 2 * wave, len(done.model))
+    c.plot(t[: len(done.observed)], done.observed, "k.", ms=2.5, label="observed")
     c.plot(t, done.model, "C0-", linewidth=1, label="model of wrong viscosity")
     c.plot(t, done.learned.radii(2), "C3-", linewidth=1, label="learned")
     drive = done.learned.bubble.drive
-    _finish(c, "time [µs]", "R / R0", f"Drive {drive:g} p0: learned from one period", "lower left")
+    _finish(
+        c, "time [µs]", "R / R0", f"Drive {drive:g} p0: learned from one oscillation", "upper left"
+    )
     d.plot(t, done.stronger_truth, color="0.75", linewidth=4, label="truth")
     d.plot(t, done.stronger_model, "C0-", linewidth=1, label="model of wrong viscosity")
     d.plot(t, done.learned.radii(2, done.stronger), "C3-", linewidth=1, label="learned")
-    _finish(d, "time [µs]", "R / R0", f"Drive {done.stronger:g} p0: predicted", "lower left")
+    _finish(d, "time [µs]", "R / R0", f"Drive {done.stronger:g} p0: predicted", "upper left")
     return figure

@@ -200,6 +200,7 @@ GENTLE = Bubble(drive=0.4)  # learned from: its collapse needs no halved steps
 WRONG = 0.5  # of the true viscosity, the model that learning begins with
 STEPS = 400  # a period
 ORDER = 5
+OBSERVED = 1.5  # periods: one growth, collapse and rebound of the bubble
 READING = 1e-3  # rms of one radius, in units of the radius at rest
 
 
@@ -210,7 +211,7 @@ def damping_of(taylor_map: TaylorMap, time: float) -> float:
 
 @dataclass(frozen=True)
 class LearnedBubble:
-    """A map learned from the radius over one period.
+    """A map learned from the radius over one oscillation.
 
     Attributes:
         fit: the map over a period / `STEPS`, and its covariance.
@@ -235,13 +236,13 @@ class LearnedBubble:
 
 
 def learn(radii: ArrayLike, model: Bubble) -> LearnedBubble:
-    """Fine-tune the map of a model on the radius over one period.
+    """Fine-tune the map of a model on the radius over one oscillation.
 
     Of the weights those of the velocity move that multiply products of (u, z) up to the third
     degree: what gas, surface and viscosity can do. The wave and what R and z are stay.
 
     Args:
-        radii: R / R0 at each of `STEPS` steps of a period and its start, [step + 1], from rest.
+        radii: R / R0 from rest on, `STEPS` times a period of the wave, [step].
         model: with the wrong viscosity.
     """
     step = model.period / STEPS
@@ -252,8 +253,10 @@ def learn(radii: ArrayLike, model: Bubble) -> LearnedBubble:
     free = np.zeros((5, len(degree)), dtype=bool)
     free[1, inside] = True
     y = np.asarray(radii, dtype=float)[:, None] - 1.0
-    # a prior of one unit of force: it decides what the solution does not
-    return LearnedBubble(fit_map(first, y, (0,), model.start, READING, free, prior=step), model)
+    # a prior of a tenth of the unit of force: it decides what the solution does not
+    return LearnedBubble(
+        fit_map(first, y, (0,), model.start, READING, free, prior=0.1 * step), model
+    )
 
 
 @dataclass(frozen=True)
@@ -282,7 +285,8 @@ def study(
     rng = np.random.default_rng(seed)
     times = GENTLE.period / STEPS * np.arange(2 * STEPS + 1)
     truth = GENTLE.solution(times)[:, 0] + 1.0
-    observed = truth[: STEPS + 1] + READING * rng.normal(size=STEPS + 1)
+    seen = round(OBSERVED * STEPS) + 1
+    observed = truth[:seen] + READING * rng.normal(size=seen)
     wrong = replace(GENTLE, viscosity=WRONG * GENTLE.viscosity)
     learned = learn(observed, wrong)
     stronger = 1.25 * GENTLE.drive
@@ -313,7 +317,7 @@ def comparisons(done: CavitationStudy) -> list[Comparison]:
                    f"{len(taken)} steps over {run.times[-1] / done.bubble.period:g} periods, from "
                    f"1/{done.bubble.period / taken.max():.0f} to "
                    f"1/{done.bubble.period / taken.min():.0f} of a period"),
-        Comparison("learned from one period: viscosity [m²/s]", None,
+        Comparison("learned from one oscillation: viscosity [m²/s]", None,
                    f"{viscosity:.3e} ± {error:.1e}",
                    f"truth {GENTLE.viscosity:.1e}, the model began with "
                    f"{done.learned.bubble.viscosity:.1e}; {READING:g} R0 noise"),

@@ -50,7 +50,7 @@ def runge_kutta_map(step: float, mass: float = 100.0) -> TaylorMap:
     k3 = slope(v + step / 2 * k2)
     k4 = slope(v + step * k3)
     end = v + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return map_of_weights(end.coef[None, :], 16)
+    return map_of_weights(np.asarray(end.coef, dtype=np.float64)[None, :], 16)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def predicted_masses(masses: Sequence[float], forest: bool = True, seed: int = 0
         seed: of the forest.
     """
     step, count = 0.5, 30
-    time = step * np.arange(count + 1)
+    time: Array = np.asarray(step * np.arange(count + 1), dtype=np.float64)
     truth = velocity(time, np.array(masses)[:, None])
     starts = np.stack([np.zeros(len(masses)), 100 / np.array(masses)], axis=1)
     by_map = follow(masses_map(step=step), starts, count)[:, :, 0].T

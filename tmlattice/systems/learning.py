@@ -185,7 +185,7 @@ def fit_map(
         max_nfev=evaluations,
     )  # fmt: skip
     learned, begun = unpacked(found.x)
-    _, singular, axes = np.linalg.svd(found.jac, full_matrices=False)
+    _, singular, axes = np.linalg.svd(np.asarray(found.jac), full_matrices=False)
     kept = singular > 1e-13 * singular[0]
     covariance = (axes[kept].T / singular[kept] ** 2) @ axes[kept]
     left = y - follow(learned, begun, len(y) - 1)[:, columns]

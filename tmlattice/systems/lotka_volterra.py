@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-EQUATION = {(0, 1): [1.0, 0.0], (1, 0): [0.0, -2.0], (1, 1): [1.0, -1.0]}
+EQUATION: dict[tuple[int, ...], list[float]] = {
+    (0, 1): [1.0, 0.0],
+    (1, 0): [0.0, -2.0],
+    (1, 1): [1.0, -1.0],
+}
 STEP = 0.01  # s
 STEPS = 465
 LEARNED_FROM = (0.5, 0.5)
@@ -247,14 +251,10 @@ def comparisons(done: Race) -> list[Comparison]:
 
 
 def _period() -> float:
-    """How long the learned solution takes to cross the start's y again, downwards, s."""
-
-    def crossing(t: float, x: Array) -> float:
-        return float(x[1] - LEARNED_FROM[1]) if t > 1.0 else 1.0
-
-    crossing.direction = -1.0  # type: ignore[attr-defined]
+    """How long the learned solution takes to come back to its start, s."""
+    times = np.linspace(3.0, 6.0, 30_001)
     done = solve_ivp(
-        right_hand_side(EQUATION), (0, 6), LEARNED_FROM, method="DOP853", events=crossing,
-        rtol=1e-12, atol=1e-14,
+        right_hand_side(EQUATION), (0.0, 6.0), np.array(LEARNED_FROM), method="DOP853",
+        t_eval=times, rtol=1e-12, atol=1e-14,
     )  # fmt: skip
-    return float(done.t_events[0][-1])
+    return float(times[np.argmin(np.linalg.norm(done.y.T - np.array(LEARNED_FROM), axis=1))])

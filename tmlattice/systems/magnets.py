@@ -73,6 +73,10 @@ def _body(element: "Element", order: int) -> TaylorMap:
     return taylor_map_of_ode(terms, order, element.length)
 
 
+def _tilted(element: "Element") -> bool:
+    return bool(getattr(element.source, "tilt", False))
+
+
 def magnet_map(element: "Element", order: int = 3) -> TaylorMap:
     """The map of a magnet's body from its equation of motion, in (x, px, y, py).
 
@@ -83,7 +87,7 @@ def magnet_map(element: "Element", order: int = 3) -> TaylorMap:
     Raises:
         ValueError: another kind, or a tilted one.
     """
-    if element.kind not in KINDS or getattr(element.source, "tilt", 0):
+    if element.kind not in KINDS or _tilted(element):
         raise ValueError(
             f"'{element.name}' is no upright {', '.join(KINDS[:-1])} or {KINDS[-1]}; its map "
             "comes from OCELOT: element_map"
@@ -95,7 +99,7 @@ def henon_map(tune: float, strength: float = 1.0) -> TaylorMap:
     """Henon's map: a sextupole kick px -= strength x^2, then a turn of 2 pi tune; exact."""
     angle = 2 * np.pi * tune
     c, s = np.cos(angle), np.sin(angle)
-    kick = TaylorMap([[0, 0], np.eye(2), [[0, 0, 0], [-strength, 0, 0]]])
+    kick = TaylorMap([np.zeros(2), np.eye(2), np.array([[0, 0, 0], [-strength, 0, 0]])])
     return TaylorMap.linear([[c, s], [-s, c]]) @ kick
 
 
@@ -129,7 +133,7 @@ def agreements(ring: "Ring") -> list[Agreement]:
             key = (element.length, element.angle, element.k1, element.k2)
             if element.kind != kind or key in seen or element.length <= 0:
                 continue
-            if getattr(element.source, "tilt", 0):
+            if _tilted(element):
                 continue
             seen.add(key)
             ours = magnet_map(element, 3).coefficients
@@ -190,7 +194,7 @@ def _maps_of(element: "Element", energy: float, order: int) -> list[TaylorMap]:
         if element.length == 0:
             return []
         return [taylor_map_of_ode(hamilton_equations(hamiltonian()), order, element.length)]
-    if element.kind in KINDS and not getattr(element.source, "tilt", 0) and element.length:
+    if element.kind in KINDS and not _tilted(element) and element.length:
         parts = part_maps(element, energy)
         parts[len(parts) // 2] = _body(element, order)
         return parts

@@ -165,7 +165,11 @@ def predict(taylor_map: TaylorMap, angles: ArrayLike, seen: int = 5) -> Array:
         [frame], rad.
     """
     y = np.asarray(angles, dtype=float)
-    found = least_squares(lambda x: follow(taylor_map, x, seen - 1)[:, 0] - y[:seen], [y[0], 0.0])
+
+    def residuals(x: Array) -> Array:
+        return np.asarray(follow(taylor_map, x, seen - 1)[:, 0] - y[:seen])
+
+    found = least_squares(residuals, np.array([y[0], 0.0]))
     return follow(taylor_map, found.x, len(y) - 1)[:, 0]
 
 
@@ -205,18 +209,18 @@ def study(seed: int = 0) -> PendulumStudy:
     simulated = learn(angles)
     tests = []
     for angle in (0.05, 0.17, 0.3):
-        other = filmed(angle, rng, noise=0.0)
+        swing = filmed(angle, rng, noise=0.0)
         ideal = follow(ideal_map(), [angle, 0.0], LAYERS)[:, 0]
         tests.append(
-            SwingTest(f"simulated, {angle:g} rad", other, simulated.swing(angle), ideal, 1)
+            SwingTest(f"simulated, {angle:g} rad", swing, simulated.swing(angle), ideal, 1)
         )
     a, b = film("a"), film("b")
     real = None if a is None else learn(a)
     other = None if b is None else learn(b)
     if real is not None and b is not None:
         seen = 5
-        either = [predict(m, b, seen) for m in (real.fit.taylor_map, ideal_map())]
-        tests.append(SwingTest("filmed, swing b", b, *either, seen))
+        by_learned, by_ideal = (predict(m, b, seen) for m in (real.fit.taylor_map, ideal_map()))
+        tests.append(SwingTest("filmed, swing b", b, by_learned, by_ideal, seen))
     return PendulumStudy(angles, simulated, tuple(tests), a, real, other)
 
 
@@ -243,13 +247,13 @@ def comparisons(done: PendulumStudy) -> list[Comparison]:
         rows += [
             Comparison(f"{what}: length [m]", TRUE_LENGTH, f"{length:.4f} ± {dl:.4f}",
                        f"truth {truth[0]}; the model begins with 0.30" if made is done.simulated
-                       else f"{truth[0]}; its period here is "
-                       f"{2 * np.pi * np.sqrt(length / GRAVITY):.3f} s, if 10 frames a second hold"),
+                       else f"{truth[0]}; the period here, "
+                       f"{2 * np.pi * np.sqrt(length / GRAVITY):.3f} s, if 10 frames a second"),
             Comparison(f"{what}: damping [1/s]", None, f"{damping:.3f} ± {dd:.3f}",
                        f"truth {truth[1]}; the model begins with 0"),
             Comparison(f"{what}: noise of one angle [mrad]", None, round(1e3 * made.noise, 2),
                        f"put in {1e3 * CAMERA_NOISE:g}" if made is done.simulated
-                       else "the film's pixels are about 4 mrad"),
+                       else "the camera was not calibrated; steps of 4 mrad"),
         ]  # fmt: skip
     if done.other is not None:
         (length, dl), (damping, dd) = done.other.length, done.other.damping
