@@ -40,7 +40,7 @@ def test_a_race_repeats_itself_and_leaves_torch_as_it_was():
     import torch
 
     threads, state = torch.get_num_threads(), torch.get_rng_state()
-    first, again = (race(epochs=(20,), cells=(5,), regularizations=("dropout",)) for _ in range(2))
+    first, again = (race(epochs=(10,), cells=(5,), regularizations=("dropout",)) for _ in range(2))
     assert [c.learned for c in first.cells] == [c.learned for c in again.cells]
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.get_rng_state(), state)
