@@ -11,6 +11,7 @@ from tmlattice import __version__
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.info import info
+from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
@@ -37,6 +38,7 @@ tmlattice.add_command(study)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
 tmlattice.add_command(diagnose)
+tmlattice.add_command(reproduce)
 
 
 def main() -> NoReturn:

@@ -213,6 +213,22 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
     return TaylorMap(_quadratic(element, energy, dimension).reduced())
 
 
+def part_maps(element: Element, energy: float, dimension: int = 4) -> list[TaylorMap]:
+    """OCELOT's second-order maps of an element's parts: the body, or edge, body and edge.
+
+    Args:
+        element, energy, dimension: see `element_map`.
+    """
+    maps = []
+    for B, R, T in _parts(element.source, energy):
+        bent = T[:dimension, :dimension, :dimension]
+        part = _Quadratic(
+            B[:dimension], R[:dimension, :dimension], 0.5 * (bent + bent.swapaxes(1, 2))
+        )
+        maps.append(TaylorMap(part.reduced()))
+    return maps
+
+
 @dataclass(frozen=True)
 class RingMaps:
     """The weights of a ring's chain of layers, stacked.

@@ -57,25 +57,21 @@ class _Table:
     exponents: Indices  # [monomial, n]
     starts: tuple[int, ...]  # of each degree, and the end
     parents: Indices  # [monomial, 2]: it is monomial parents[., 0] times variable parents[., 1]
-    left: Indices  # products left * right = target that stay within the order
+    left: Indices  # products left * right that stay within the order, by target
     right: Indices
-    target: Indices
+    first: Indices  # [monomial]: the products from first[k] to first[k + 1] go to monomial k
 
     def multiply(self, a: Array, b: Array) -> Array:
         """Product of polynomials [..., monomial], truncated at the order."""
-        products = a[..., self.left] * b[..., self.right]
-        result = np.zeros(np.broadcast_shapes(a.shape, b.shape))
-        np.add.at(result, (..., self.target), products)  # type: ignore[arg-type]
-        return result
+        # products are sorted by target and every monomial is a target: 1 times itself
+        return np.asarray(
+            np.add.reduceat(a[..., self.left] * b[..., self.right], self.first, axis=-1)
+        )
 
-    def monomials(self, factors: Array) -> list[Array]:
-        """All monomials of the given n polynomials `factors` [n, monomial], truncated."""
-        one = np.zeros_like(factors[0])
-        one[0] = 1.0
-        values = [one]
-        for parent, variable in self.parents[1:]:
-            values.append(self.multiply(values[parent], factors[variable]))
-        return values
+    def convolve(self, a: Array, b: Array) -> Array:
+        """Sum over i of the products a[i] b[i] of polynomials [i, monomial], [monomial]."""
+        products = np.einsum("ij,ij->j", a[:, self.left], b[:, self.right])
+        return np.asarray(np.add.reduceat(products, self.first))
 
 
 @functools.cache
@@ -99,13 +95,14 @@ def _table(n: int, order: int) -> _Table:
             target.append(index[tuple(x + y for x, y in zip(a, b, strict=True))])
     arrays = (np.array(v, dtype=np.intp) for v in (rows, parents, left, right, target))
     exponents, parent_array, left_array, right_array, target_array = arrays
+    by_target = np.argsort(target_array, kind="stable")
     return _Table(
         exponents.reshape(len(rows), n),
         tuple(starts),
         parent_array,
-        left_array,
-        right_array,
-        target_array,
+        left_array[by_target],
+        right_array[by_target],
+        np.searchsorted(target_array[by_target], np.arange(len(rows))).astype(np.intp),
     )
 
 
@@ -162,6 +159,11 @@ class TaylorMap:
         return _table(self.n, self.order)
 
     @property
+    def exponents(self) -> Indices:
+        """Exponents of the monomials of degree 0 to the order, [monomial, n]."""
+        return self._table.exponents.copy()
+
+    @property
     def coefficients(self) -> list[Array]:
         """W0 [n], W1 [n, n], W2 [n, n (n + 1) / 2], ..., copies."""
         starts = self._table.starts
@@ -171,13 +173,17 @@ class TaylorMap:
     def __repr__(self) -> str:
         return f"TaylorMap(n={self.n}, order={self.order})"
 
-    def __call__(self, x: ArrayLike) -> Array:
-        """Images of the states x [..., n], the same shape."""
+    def monomials(self, x: ArrayLike) -> Array:
+        """Monomials of degree 0 to the order of the states x [..., n], [..., monomial]."""
         x = np.asarray(x, dtype=float)
         values = np.ones((*x.shape[:-1], len(self._table.exponents)))
         for i, (parent, variable) in enumerate(self._table.parents[1:], start=1):
             values[..., i] = values[..., parent] * x[..., variable]
-        return np.asarray(values @ self._rows.T)
+        return values
+
+    def __call__(self, x: ArrayLike) -> Array:
+        """Images of the states x [..., n], the same shape."""
+        return np.asarray(self.monomials(x) @ self._rows.T)
 
     def truncated(self, order: int) -> "TaylorMap":
         """The same map cut, or filled with zeros, to another order."""

@@ -1,0 +1,342 @@
+"""Polynomial differential equations as truncated Taylor maps, and back.
+
+dX/dt = sum over exponents of coefficient * X^exponents, written as `terms`: exponents ->
+coefficient vector [n]. Free fall with drag, dv/dt = 9.8 - 0.00392 v^2:
+
+>>> fall = taylor_map_of_ode({(0,): [9.8], (2,): [-0.00392]}, order=2, time=0.1)
+>>> fall.coefficients                    # [0.979874527], [[0.999615938]], [[-3.91799e-4]]
+>>> ode_of_taylor_map(fall, time=0.1)    # {(0,): [9.8], (1,): [0], (2,): [-0.00392]}
+
+A coefficient that depends on time is a function of t that returns the vector.
+"""
+
+from collections.abc import Callable, Mapping
+from itertools import product
+from math import comb
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm, logm
+
+from tmlattice.errors import TmlatticeError
+from tmlattice.maps.taylor import TaylorMap, _Table, _table, kronecker_exponents
+
+Array = NDArray[np.float64]
+Exponents = tuple[int, ...]
+Terms = Mapping[Exponents, ArrayLike | Callable[[float], ArrayLike]]
+
+ROUNDING = 1e-17  # below half a unit in the last place
+STEPS = 10_000
+
+
+class OdeError(TmlatticeError):
+    """An equation without a map over that time, or a map without an equation."""
+
+
+class _Equation:
+    """The right-hand side, compiled: exponents with their coefficients, and how to build them."""
+
+    def __init__(self, terms: Terms) -> None:
+        if not terms:
+            raise ValueError("an equation needs at least one term: {exponents: coefficients}")
+        self.n = len(next(iter(terms)))
+        self.constant = not any(callable(c) for c in terms.values())
+        self._coefficients = dict(terms)
+        needed: dict[Exponents, None] = {}
+        for exponents, coefficient in terms.items():
+            if len(exponents) != self.n or any(e < 0 for e in exponents) or not self.n:
+                raise ValueError(f"{exponents} are no exponents of {self.n} coordinates")
+            if not callable(coefficient) and np.shape(coefficient) != (self.n,):
+                raise ValueError(
+                    f"the coefficient of {exponents} has the shape {np.shape(coefficient)}; "
+                    f"it should be ({self.n},)"
+                )
+            below = tuple(exponents)
+            while sum(below) > 0:
+                needed[below] = None
+                below = _parent(below)[0]
+        self.products = sorted((e for e in needed if sum(e) > 1), key=sum)  # parents come first
+
+    def coefficients(self, t: float) -> list[tuple[Exponents, Array]]:
+        """Exponents and coefficient vectors at the time t."""
+        return [
+            (e, np.asarray(c(t) if callable(c) else c, dtype=float))
+            for e, c in self._coefficients.items()
+        ]
+
+    def of_state(self, t: float, x: Array) -> Array:
+        """dX/dt of states x [..., n]."""
+        total = np.zeros_like(x)
+        for exponents, coefficient in self.coefficients(t):
+            total += np.prod(x ** np.array(exponents), axis=-1)[..., None] * coefficient
+        return total
+
+    def of_map(self, t: float, rows: Array, table: _Table) -> Array:
+        """d rows/dt of a map's rows [n, monomial]: the right-hand side of the weights."""
+        values = self._units(rows)
+        for exponents in self.products:
+            below, variable = _parent(exponents)
+            values[exponents] = table.multiply(values[below], rows[variable])
+        total = np.zeros_like(rows)
+        for exponents, coefficient in self.coefficients(t):
+            total += coefficient[:, None] * values[exponents]
+        return total
+
+    def _units(self, rows: Array) -> dict[Exponents, Array]:
+        """X^0 = 1 and the coordinates themselves."""
+        one = np.zeros_like(rows[0])
+        one[..., 0] = 1.0
+        units = {tuple(int(i == j) for j in range(self.n)): rows[i] for i in range(self.n)}
+        return {(0,) * self.n: one, **units}
+
+
+def _parent(exponents: Exponents) -> tuple[Exponents, int]:
+    """The monomial with one factor less, and which variable that factor is."""
+    variable = next(i for i, e in enumerate(exponents) if e)
+    below = list(exponents)
+    below[variable] -= 1
+    return tuple(below), variable
+
+
+def right_hand_side(terms: Terms) -> Callable[[float, ArrayLike], Array]:
+    """dX/dt as a function of the time and of states [..., n], for a numerical solver.
+
+    Args:
+        terms: exponents -> coefficient vector [n], or a function of t that returns it.
+    """
+    equation = _Equation(terms)
+    return lambda t, x: equation.of_state(t, np.asarray(x, dtype=float))
+
+
+def recentred(terms: Mapping[Exponents, ArrayLike], centre: ArrayLike) -> dict[Exponents, Array]:
+    """The same equation for the distance from `centre` [n]: X = centre + distance."""
+    centre = np.asarray(centre, dtype=float)
+    result: dict[Exponents, Array] = {}
+    for exponents, coefficient in terms.items():
+        for kept in product(*(range(e + 1) for e in exponents)):
+            factor = 1.0
+            for e, k, c in zip(exponents, kept, centre, strict=True):
+                factor *= comb(e, k) * c ** (e - k)
+            if factor:
+                part = factor * np.asarray(coefficient, dtype=float)
+                result[kept] = result.get(kept, np.zeros(len(centre))) + part
+    return result
+
+
+def taylor_map_of_ode(
+    terms: Terms, order: int, time: float, start: float = 0.0, tolerance: float = 1e-13
+) -> TaylorMap:
+    """The map from X(start) to X(start + time) under dX/dt = sum of terms, truncated at `order`.
+
+    The flow is differentiable by its start as often as one likes, and this is its Taylor polynomial
+    about X = 0, constant terms included: each coefficient up to the order is that of the exact
+    flow, whatever the degree of the terms. The weights obey an equation of their own, dM/dt =
+    F(M) truncated at the order. With constant coefficients it is solved by Lie series (Taylor
+    series in time), in as many steps as rounding-error convergence asks for; with coefficients
+    that depend on time by DOP853.
+
+    Args:
+        terms: exponents [n] -> coefficient vector [n], or a function of t that returns it; units
+            are the coordinates' own.
+        order: of the truncation in X, 1 or more.
+        time: how long; it may be negative.
+        start: the time at which it begins; matters only where coefficients depend on time.
+        tolerance: relative error of the weights; only where coefficients depend on time.
+
+    Raises:
+        OdeError: the solution that starts at X = 0 does not reach the end: it runs to infinity.
+        ValueError: exponents and coefficients that do not fit together.
+
+    Source: M. Berz, Modern Map Methods in Particle Beam Physics (1999), for the expansion; A.
+    Jorba, M. Zou, Experimental Mathematics 14 (2005) 99, for series in time with steps.
+    """
+    equation = _Equation(terms)
+    if order < 1:
+        raise ValueError(f"a map has at least the order 1, not {order}")
+    table = _table(equation.n, order)
+    rows = TaylorMap.identity(equation.n, order)._rows
+    if time == 0:
+        return TaylorMap._of_rows(rows, order)
+    if equation.constant:
+        rows = _lie_series(equation, rows, time, table)
+    else:
+        rows = _integrated(equation, rows, (start, start + time), table, tolerance)
+    return TaylorMap._of_rows(rows, order)
+
+
+def _lie_series(equation: _Equation, rows: Array, time: float, table: _Table) -> Array:
+    degree = len(table.starts) + 20  # in time; the degree k in X may first appear at t^(k - 1)
+    blocks = list(zip(table.starts[:-1], table.starts[1:], strict=True))
+    left = abs(time)
+    for _ in range(STEPS):
+        series = _series(equation, rows, np.sign(time), degree, table)
+        # largest coefficient by power of time, coordinate and degree in X
+        size = np.stack([abs(series[:, :, a:b]).max(axis=2) for a, b in blocks], axis=2)
+        powers = np.arange(degree + 1)[:, None, None]
+        step = left
+        while step > 0:
+            sizes = size * step**powers
+            if (sizes[-2:] <= ROUNDING * sizes.max(axis=0)).all():
+                break
+            step *= 0.7
+        if not step > 1e-12 * abs(time):
+            break
+        rows = np.asarray(np.tensordot(step ** np.arange(degree + 1), series, 1))
+        left -= step
+        if left <= 0:
+            return rows
+    raise OdeError(
+        f"the solution from X = 0 runs to infinity after {abs(time) - left:.6g} of the "
+        f"{abs(time):.6g} asked for; take a shorter time, or another centre by `recentred`"
+    )
+
+
+def _series(
+    equation: _Equation, rows: Array, direction: float, degree: int, table: _Table
+) -> Array:
+    """Coefficients of time^0 to time^degree of the weights, [power, n, monomial]."""
+    n, monomials = rows.shape
+    x = np.zeros((degree + 1, n, monomials))
+    x[0] = rows
+    values = equation._units(x.swapaxes(0, 1))  # views of x: they grow with it
+    values[(0,) * n] = np.zeros((degree + 1, monomials))
+    values[(0,) * n][0, 0] = 1.0
+    for exponents in equation.products:
+        values[exponents] = np.zeros((degree + 1, monomials))
+    coefficients = equation.coefficients(0.0)
+    for j in range(degree):
+        for exponents in equation.products:
+            below, variable = _parent(exponents)
+            values[exponents][j] = table.convolve(values[below][: j + 1], x[j::-1, variable])
+        slope = sum(c[:, None] * values[e][j] for e, c in coefficients)
+        x[j + 1] = direction * slope / (j + 1)
+    return x
+
+
+def _integrated(
+    equation: _Equation, rows: Array, span: tuple[float, float], table: _Table, tolerance: float
+) -> Array:
+    def slope(t: float, flat: Array) -> Array:
+        return equation.of_map(t, flat.reshape(rows.shape), table).ravel()
+
+    done = solve_ivp(
+        slope, span, rows.ravel(), method="DOP853", rtol=tolerance, atol=1e-3 * tolerance
+    )
+    if not done.success:
+        raise OdeError(
+            f"the weights could not be followed beyond t = {done.t[-1]:.6g} ({done.message}); "
+            "take a shorter time"
+        )
+    return np.asarray(done.y[:, -1].reshape(rows.shape))
+
+
+def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Array]:
+    """The polynomial equation dX/dt of the map's own order whose map over `time` this is.
+
+    It is the logarithm of the map's action on monomials (Koopman's matrix, Carleman's in the
+    other reading), found degree by degree: the linear part is log(W1) / time, and each higher
+    degree is then a linear equation.
+
+    - Ambiguity: a map sees frequencies only modulo 1 / time. The principal logarithm of W1 is
+      taken, so every linear frequency is assumed to be below half a turn in `time`; products of
+      frequencies in the higher degrees are counted from it and may be above. A W1 with a negative
+      real eigenvalue has no real logarithm.
+    - Truncation: coefficients up to the map's order; of an equation of higher degree these are its
+      first coefficients if W0 = 0. With W0 not 0 higher degrees feed down, and what comes out is
+      the one equation of this degree that has this truncated map.
+    - A trained map need not come from an equation of low degree; then the coefficients are those
+      of the truncated logarithm, and high ones mean little.
+
+    Args:
+        taylor_map: W0, W1, ..., of order p.
+        time: between X and its image.
+
+    Returns:
+        Exponents -> coefficient vector [n], for all monomials of degree 0 to p.
+
+    Raises:
+        OdeError: W1 is singular or has a negative real eigenvalue, the frequencies are resonant,
+            or W0 is so large that the search does not close.
+    """
+    n, order = taylor_map.n, taylor_map.order
+    exponents = exponents_up_to(n, order)
+    rows = wanted = _logarithm(taylor_map, time)
+    for _ in range(50):
+        terms = dict(zip(exponents, rows.T, strict=True))
+        correction = wanted - _logarithm(taylor_map_of_ode(terms, order, time), time)
+        rows = rows + correction
+        if np.abs(correction).max() <= 1e-13 * np.abs(rows).max():
+            return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
+    if np.abs(correction).max() <= 1e-9 * np.abs(rows).max():  # rounding keeps it from closing
+        return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
+    raise OdeError(
+        "no equation of the map's order was found near its logarithm: W0 is too large for it; "
+        "expand the map about another centre"
+    )
+
+
+def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
+    """The equation's coefficients [n, monomial], exact where W0 = 0, else a close guess."""
+    n, order = taylor_map.n, taylor_map.order
+    W = taylor_map.coefficients
+    eigenvalues = np.linalg.eigvals(W[1])
+    negative = (eigenvalues.real <= 0) & (abs(eigenvalues.imag) < 1e-12 * abs(eigenvalues))
+    if negative.any() or np.linalg.matrix_rank(W[1]) < n:
+        raise OdeError(
+            f"W1 has the eigenvalue {eigenvalues[np.argmin(eigenvalues.real)]:.4g} and so no real "
+            "logarithm; a shorter time between the samples would turn less than half a turn"
+        )
+    A = np.real(logm(W[1])) / time
+    table = _table(n, order)
+    rows = np.zeros((n, table.starts[-1]))
+    rows[:, 1 : n + 1] = A
+    rows[:, 0] = np.linalg.solve(_phi(A, time), W[0])
+    exponents = exponents_up_to(n, order)
+    for degree in range(2, order + 1):
+        a, b = table.starts[degree], table.starts[degree + 1]
+        terms = dict(zip(exponents[1:a], rows[:, 1:a].T, strict=True))
+        so_far = taylor_map_of_ode(terms, degree, time).coefficients[degree]
+        # d W_k / dt = A W_k + P_k x^[k](t), and x^[k] moves with `derivation`
+        derivation = _derivation(A, degree)
+        generator = np.kron(np.eye(n), derivation.T) - np.kron(A, np.eye(b - a))
+        propagate = np.kron(expm(A * time), np.eye(b - a)) @ _phi(generator, time)
+        if np.linalg.cond(propagate) > 1e13:
+            raise OdeError(
+                f"the frequencies are resonant at degree {degree} in {time:g}; these terms "
+                "cannot be read off a map over that time"
+            )
+        missing = (W[degree] - so_far).ravel()
+        rows[:, a:b] = np.linalg.solve(propagate, missing).reshape(n, b - a)
+    return rows
+
+
+def _phi(matrix: Array, time: float) -> Array:
+    """The integral of exp(matrix s) over s from 0 to `time`."""
+    n = len(matrix)
+    block = np.zeros((2 * n, 2 * n))
+    block[:n, :n] = matrix
+    block[:n, n:] = np.eye(n)
+    return np.asarray(expm(block * time)[:n, n:])
+
+
+def _derivation(A: Array, degree: int) -> Array:
+    """d x^[degree] / dt = derivation x^[degree] where dx/dt = A x, [monomial, monomial]."""
+    n = len(A)
+    exponents = kronecker_exponents(n, degree)
+    index = {e: i for i, e in enumerate(exponents)}
+    result = np.zeros((len(exponents), len(exponents)))
+    for row, e in enumerate(exponents):
+        for i, power in enumerate(e):
+            if power:
+                for j in range(n):
+                    moved = list(e)
+                    moved[i] -= 1
+                    moved[j] += 1
+                    result[row, index[tuple(moved)]] += power * A[i, j]
+    return result
+
+
+def exponents_up_to(n: int, order: int) -> list[Exponents]:
+    """Exponents of degree 0 to `order` in n coordinates, in the order of a map's weights."""
+    return [e for degree in range(order + 1) for e in kronecker_exponents(n, degree)]
