@@ -4,7 +4,7 @@
 >>> outcome = tune_fit(load_ring("petra3"))        # the whole experiment of `tmlattice tune-fit`
 """
 
-from tmlattice.fitting.adam import FitResult, Regularization, fine_tune
+from tmlattice.fitting.adam import FitResult, Regularization, fit_adam as fine_tune
 from tmlattice.fitting.experiment import TuneFit, tune_fit
 
 __all__ = ["FitResult", "Regularization", "TuneFit", "fine_tune", "tune_fit"]

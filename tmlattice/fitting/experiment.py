@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import TmlatticeError, TooFewTurnsError
-from tmlattice.fitting.adam import FitResult, fine_tune
+from tmlattice.fitting.adam import FitResult, fit_adam as fine_tune
 from tmlattice.harmonics import MIN_TURNS, tunes
 from tmlattice.lattice import Ring, middle_of_first_arc
 from tmlattice.maps import element_map, ring_matrix

@@ -6,7 +6,7 @@ each x -> B + R x + x^T T x. The parts are composed to second order; what lies b
 way from the exit of magnet k - 1 to the exit of magnet k, and the chain of layers is the ring.
 """
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -105,6 +105,32 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
         dimension: 4 for (x, px, y, py), 6 for OCELOT's (x, px, y, py, tau, p).
     """
     return TaylorMap(_quadratic(element, energy, dimension).reduced())
+
+
+def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
+    """Second-order map of elements in beam order: a layer, with the drifts before its magnet.
+
+    Args:
+        elements: any, in beam order.
+        energy: GeV.
+        dimension: 4 or 6.
+    """
+    way = _identity(dimension)
+    for element in elements:
+        way = _quadratic(element, energy, dimension).after(way)
+    return TaylorMap(way.reduced())
+
+
+def layer_elements(ring: Ring) -> list[tuple[Element, ...]]:
+    """For each layer the elements that it is made of: the way to its magnet, and the magnet."""
+    layers: list[tuple[Element, ...]] = []
+    way: list[Element] = []
+    for element in ring.elements:
+        way.append(element)
+        if element.is_magnet:
+            layers.append(tuple(way))
+            way = []
+    return layers
 
 
 @dataclass(frozen=True)

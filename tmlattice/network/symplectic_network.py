@@ -191,7 +191,7 @@ class SymplecticNetwork(LayerChain):
     def jacobians(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
         the layers and of the closing way there [layer + 1, n, n]."""
-        path, middles, slopes, W1 = self._slopes(x)
+        path, _, slopes, W1 = self._slopes(x)
         half, one = 0.5 * slopes, np.eye(self.dimension)
         return path, np.linalg.solve(one - half, (one + half) @ W1)
 
