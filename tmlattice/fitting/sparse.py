@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.data import FirstTurn, first_turn, readings_of, tangents
-from tmlattice.fitting.strengths import Strength, slopes, strengths_of
+from tmlattice.fitting.strengths import Strength, ring_strengths
 from tmlattice.lattice import Ring
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import Measurement
@@ -301,11 +301,18 @@ def fit_sparse(
     if ring is None:
         raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
     data = first_turn(network, measurement, noise, launch_sigma)
-    strengths = strengths_of(ring, kinds)
+    known = ring_strengths(ring, kinds, network.dimension)
+    strengths, derivatives = known.strengths, known.slopes
     if candidates is not None:
         wanted = {ring[name].name for name in candidates}
-        strengths = [s for s in strengths if s.name in wanted]
-    search = _Search(network, strengths, data, fault, _slopes_of(strengths, network.dimension))
+        places = [i for i, s in enumerate(strengths) if s.name in wanted]
+        if not places:
+            raise TmlatticeError(
+                f"none of {sorted(wanted)} is a powered {' or '.join(kinds)}; name some that are"
+            )
+        strengths = [strengths[i] for i in places]
+        derivatives = (derivatives[0][places], derivatives[1][places], derivatives[2][places])
+    search = _Search(network, strengths, data, fault, derivatives)
     none = search.fit((), np.zeros(0))
     if none is None:
         raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
@@ -351,21 +358,7 @@ def fit_sparse(
     )
 
 
-_known_slopes: dict[tuple[int, ...], tuple[list[Strength], tuple[Array, Array, Array]]] = {}
-
-
-def _slopes_of(strengths: list[Strength], dimension: int) -> tuple[Array, Array, Array]:
-    """`slopes`, kept for the last ring: a study asks for the same hundreds of times."""
-    key = (dimension, *(id(s.elements[-1]) for s in strengths))
-    if key not in _known_slopes:
-        _known_slopes.clear()
-        _known_slopes[key] = strengths, slopes(strengths, dimension)  # the ids stay in use
-    return _known_slopes[key][1]
-
-
-def _best_of(
-    search: _Search, start: Explanation, number: int, limit: float = np.inf
-) -> Explanation | None:
+def _best_of(search: _Search, start: Explanation, number: int) -> Explanation | None:
     """`start` with the one more cause that has the best evidence, of `number` refined."""
     gain, amount = search.scan(start)
     best = None

@@ -7,6 +7,7 @@ direction of the layer's generator.
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,3 +95,35 @@ def directions(strengths: Sequence[Strength], dimension: int = 4) -> Array:
         cubic = cubic_generator(nearest_symplectic(W1), W2)
         rows.append(quadratic_generator(matrix) + (cubic[0] - cubic[1]) / (2 * STEP))
     return np.stack(rows)
+
+
+@dataclass(frozen=True)
+class RingStrengths:
+    """The strengths of a ring with their derivatives.
+
+    Attributes:
+        strengths: in beam order.
+        slopes: see `slopes`.
+        directions: see `directions`, [strength, coefficient].
+    """
+
+    strengths: list[Strength]
+    slopes: Weights
+    directions: Array
+
+
+_kept: list[tuple[Ring, tuple[Any, ...], RingStrengths]] = []
+
+
+def ring_strengths(ring: Ring, kinds: Sequence[str], dimension: int = 4) -> RingStrengths:
+    """`strengths_of` a ring with their derivatives; kept for the last rings asked for, as a study
+    fits hundreds of measurements of one design."""
+    key = (tuple(kinds), dimension)
+    for known, known_key, found in _kept:
+        if known is ring and known_key == key:
+            return found
+    strengths = strengths_of(ring, kinds)
+    made = RingStrengths(strengths, slopes(strengths, dimension), directions(strengths, dimension))
+    _kept.append((ring, key, made))
+    del _kept[:-4]
+    return made
