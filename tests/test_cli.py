@@ -213,15 +213,3 @@ def test_ctrl_c_ends_soon_with_nothing_half_written(tmp_path):
     assert time.monotonic() - sent < 10  # a second in life; a loaded test machine has its own pace
     assert "stopped" in errors
     assert list(tmp_path.iterdir()) == []
-
-
-def test_study_prints_median_and_worst(tmp_path):
-    done = tmlattice(
-        "study", "tune-fit", SMALL, "--magnets", 2, *QUICK, "--regularization", "none",
-        "--regularization", "l2", "--json", "study.json", "--workers", 1, cwd=tmp_path, check=0,
-    )  # fmt: skip
-    result = json.loads((tmp_path / "study.json").read_text())
-    jsonschema.validate(result, schema("study-tune-fit"))
-    assert set(result["methods"]) == {"none", "l2"}
-    assert result["cases"] == 2
-    assert "worst" in done.stdout
