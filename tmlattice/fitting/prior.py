@@ -72,10 +72,10 @@ def prior_directions(
     """
     n = network.dimension
     if prior is Prior.GENERATORS:
-        rms = np.array([GENERATOR_RMS[sum(row)] for row in exponents(n)])
+        sizes = np.array([GENERATOR_RMS[sum(row)] for row in exponents(n)])
         layers = len(network.layers)
-        pattern = np.tile(np.diag(rms), (layers, 1))
-        return Directions(np.repeat(np.arange(layers), len(rms)), pattern, (), 1.0)
+        pattern = np.tile(np.diag(sizes), (layers, 1))
+        return Directions(np.repeat(np.arange(layers), len(sizes)), pattern, (), 1.0)
     if ring is None:
         raise TmlatticeError("the prior on strengths needs the ring whose they are: give ring=")
     known = ring_strengths(ring, kinds, n)
@@ -113,7 +113,7 @@ class _Linear:
     def times(self, amounts: Array) -> Array:
         """J amounts: change of the readings [shot, monitor, 2]."""
         moved = self.running(np.moveaxis(self.shift * amounts[:, None], 1, 0))
-        return np.einsum("smpa,msa->smp", self.rows, moved)
+        return np.asarray(np.einsum("smpa,msa->smp", self.rows, moved))
 
     def transposed(self, weights: Array) -> Array:
         """J^T weights [shot, monitor, 2], [direction]."""
@@ -122,7 +122,7 @@ class _Linear:
         later[:-1] = np.cumsum(at_start[::-1], axis=0)[::-1]
         # The first monitor that sees direction j is the first with upto > j.
         first = np.searchsorted(self.upto, np.arange(self.shift.shape[1]), side="right")
-        return np.einsum("sja,jsa->j", self.shift, later[first])
+        return np.asarray(np.einsum("sja,jsa->j", self.shift, later[first]))
 
     def kernel(self) -> Array:
         """J J^T over all readings [reading, reading], in the order [shot, monitor, 2]."""

@@ -42,7 +42,7 @@ def field_matrix(n: int) -> Array:
                 gradient[i, place[below], k] += row[i]
     matrix = np.einsum("ab,bmk->amk", symplectic_form(n), gradient)
     matrix.flags.writeable = False
-    return matrix
+    return np.asarray(matrix)
 
 
 def field(generator: Array) -> tuple[Array, Array, Array]:

@@ -193,7 +193,7 @@ class SymplecticNetwork(LayerChain):
         the layers and of the closing way there [layer + 1, n, n]."""
         path, _, slopes, W1 = self._slopes(x)
         half, one = 0.5 * slopes, np.eye(self.dimension)
-        return path, np.linalg.solve(one - half, (one + half) @ W1)
+        return path, np.asarray(np.linalg.solve(one - half, (one + half) @ W1), dtype=float)
 
     def _slopes(self, x: Array) -> tuple[Array, Array, Array, Array]:
         """States [layer + 2, n], middles, the fields' slopes there and W1, [layer + 1, ...]."""
