@@ -60,7 +60,9 @@ def test_sparse_finds_two_causes_and_none(small_ring, small_network):
     fit = fine_tune(small_network, measurement, method="sparse")
     assert set(fit.changes) == {"QD::3", "QF::11"}
     _, quiet = measured(small_ring, [], 0)
-    assert fine_tune(small_network, quiet, method="sparse").changes == {}
+    fit = fine_tune(small_network, quiet, method="sparse")
+    assert fit.changes == {}
+    assert fit.tune_sigma is None  # what cannot be seen has no known effect
 
 
 def test_sparse_with_a_launch_that_is_off(small_ring, small_network):
@@ -170,12 +172,12 @@ def test_tune_slopes_match_differences(small_ring, small_network):
 
 @pytest.mark.parametrize("prior", ["strengths", "generators"])
 def test_map_fits_and_stays_symplectic(small_ring, small_network, prior):
-    machine, measurement = measured(small_ring, ["QD::5"], -0.02)
+    machine, measurement = measured(small_ring, ["QD::5"], -0.02, noise=1e-7)
     fit = fine_tune(small_network, measurement, method="map", prior=prior)
     assert isinstance(fit.network, SymplecticNetwork)
     left = fit.network(LAUNCH).detach().numpy() - measurement.readings[:, 0]
     before = small_network(LAUNCH).detach().numpy() - measurement.readings[:, 0]
-    assert np.sqrt(np.mean(left**2)) < 1.5e-6 < 0.2 * np.sqrt(np.mean(before**2))
+    assert np.sqrt(np.mean(left**2)) < 1.5e-7 < 0.2 * np.sqrt(np.mean(before**2))
     assert one_turn_optics(fit.network).growth == pytest.approx(1.0, abs=1e-9)
     away = fit.tunes - matrix_tunes(ring_matrix(machine))
     assert (np.abs(away) < 4 * fit.tune_sigma).all()
@@ -205,9 +207,9 @@ def test_map_states_its_error_where_its_prior_is_true(small_ring, small_network)
 
 
 def test_adam_on_a_symplectic_network_moves_generators(small_ring, small_network):
-    _, measurement = measured(small_ring, ["QD::5"], -0.02)
+    _, measurement = measured(small_ring, ["QD::5"], -0.02, noise=1e-7)
     network = small_network.symplectic()
-    fit = fine_tune(network, measurement, epochs=150, learning_rate=1e-5, progress=False)
+    fit = fine_tune(network, measurement, epochs=150, learning_rate=1e-8, progress=False)
     assert min(fit.loss) < 0.5 * fit.loss[0]
     assert one_turn_optics(fit.network).growth == pytest.approx(1.0, abs=1e-9)
     assert network.correction().any() == np.False_

@@ -289,7 +289,8 @@ def fit_sparse(
     Returns:
         The network of the refined ring, its tunes from its own matrix, and their standard error:
         that of the changes, and the spread over other magnets that explain the readings nearly as
-        well, weighted by their evidence.
+        well, weighted by their evidence. No error is stated where no cause was found: what a
+        fault too small to be seen does to the tunes is not known from these readings.
 
     Raises:
         MeasurementError: no reading, or no noise stated.
@@ -350,7 +351,7 @@ def fit_sparse(
             "candidates": None if candidates is None else list(candidates),
         },
         tunes=tunes,
-        tune_sigma=np.sqrt(np.diag(covariance)),
+        tune_sigma=np.sqrt(np.diag(covariance)) if best.causes else None,
         changes={
             strengths[c].name: (float(a), float(e))
             for c, a, e in zip(best.causes, best.amounts, errors, strict=True)
