@@ -73,16 +73,21 @@ class _Search:
         self.d0, self.d1, self.d2 = derivatives
         self.layer = np.array([s.layer for s in strengths])
         self.known: dict[tuple[int, ...], Explanation | None] = {}
+        self.now: dict[int, float] = {}
 
     def _put(self, causes: Sequence[int], amounts: ArrayLike) -> None:
         with torch.no_grad():
             for cause, amount in zip(causes, np.asarray(amounts), strict=True):
+                if self.now.get(cause) == float(amount):
+                    continue  # only the launches are moving
+                self.now[cause] = float(amount)
                 strength = self.strengths[cause]
                 new = strength.weights(float(amount), self.design.dimension)
                 for parameter, weight in zip(self.model.parameters(), new, strict=True):
                     parameter[strength.layer] = torch.from_numpy(weight)
 
     def _take_back(self, causes: Sequence[int]) -> None:
+        self.now.clear()
         with torch.no_grad():
             pairs = zip(self.model.parameters(), self.design.parameters(), strict=True)
             for parameter, design in pairs:
