@@ -208,9 +208,9 @@ def fit_map(
         progress: there is nothing to show; every method takes it.
 
     Returns:
-        A symplectic network, its tunes, and their standard error by the posterior covariance. That error
-        holds where the prior is true: many small changes. One magnet that is 20 % off is no draw
-        from it, and the error is then too small (use "sparse").
+        A symplectic network, its tunes, and their standard error by the posterior covariance.
+        That error holds where the prior is true: many small changes. One magnet that is 20 % off
+        is no draw from it, and the error is then too small (use "sparse").
 
     Raises:
         MeasurementError: no reading, or no noise stated.
