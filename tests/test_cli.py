@@ -294,15 +294,3 @@ def test_tune_fit_refuses_a_measurement(folders, tmp_path, name, more, words):
     assert words in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_study_prints_median_and_worst(tmp_path):
-    done = tmlattice(
-        "study", "tune-fit", SMALL, "--magnets", 2, *QUICK, "--regularization", "none",
-        "--regularization", "l2", "--json", "study.json", "--workers", 1, cwd=tmp_path, check=0,
-    )  # fmt: skip
-    result = json.loads((tmp_path / "study.json").read_text())
-    jsonschema.validate(result, schema("study-tune-fit"))
-    assert set(result["methods"]) == {"none", "l2"}
-    assert result["cases"] == 2
-    assert "worst" in done.stdout

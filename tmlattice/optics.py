@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import symplectic_form
-from tmlattice.network import TaylorNetwork
-from tmlattice.network.network import chain
+from tmlattice.network.network import LayerChain, chain
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -145,7 +144,7 @@ def _fractions(values: ComplexArray) -> Array:
     return np.asarray(np.angle(values) / (2 * np.pi) % 1.0)
 
 
-def closed_orbit(network: TaylorNetwork, delta: float = 0.0, tolerance: float = 1e-14) -> Array:
+def closed_orbit(network: LayerChain, delta: float = 0.0, tolerance: float = 1e-14) -> Array:
     """The state [n] that repeats after a turn, in x, px, y, py, by Newton's method.
 
     Args:
@@ -177,7 +176,7 @@ def closed_orbit(network: TaylorNetwork, delta: float = 0.0, tolerance: float = 
     )
 
 
-def one_turn_optics(network: TaylorNetwork) -> Optics:
+def one_turn_optics(network: LayerChain) -> Optics:
     """Tunes, alpha and beta at the start of the ring, on the network's own closed orbit.
 
     Raises:
@@ -202,7 +201,7 @@ def _alpha_beta(vectors: ComplexArray) -> tuple[Array, Array]:
     return -np.real(x.conj() * p), np.abs(x) ** 2
 
 
-def twiss(network: TaylorNetwork) -> Twiss:
+def twiss(network: LayerChain) -> Twiss:
     """Betas, alphas and phases along the ring, and the tunes with their integers.
 
     The phase of each step is that of the eigenvector, taken between -0.1 and 2 pi - 0.1: every
@@ -230,7 +229,7 @@ def twiss(network: TaylorNetwork) -> Twiss:
     return Twiss(s=s, beta=beta, alpha=alpha, phase=phase[:-1], total_tunes=whole + fraction)
 
 
-def off_momentum(network: TaylorNetwork, length: float, delta: float = 1e-4) -> OffMomentum:
+def off_momentum(network: LayerChain, length: float, delta: float = 1e-4) -> OffMomentum:
     """Chromaticity, dispersion and momentum compaction by differences between +delta and -delta.
 
     Args:

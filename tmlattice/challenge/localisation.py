@@ -160,6 +160,7 @@ def _case(
     launched = replace(measured, launches=gradient.launches)
     fitted = fine_tune(network, launched, progress=False, **recipe)
     begun = time.perf_counter()
+    assert isinstance(fitted.network, TaylorNetwork)
     change = read_network(ring, fitted.network, measured, effects)
     reading_seconds += time.perf_counter() - begun
     first = {

@@ -1,13 +1,13 @@
 """`tmlattice study`: an experiment over many magnets."""
 
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
 import click
 
 from tmlattice.cli.options import (
-    REGULARIZATIONS,
+    FILE,
     console,
     json_option,
     lattice_argument,
@@ -22,44 +22,105 @@ def study() -> None:
     """Run an experiment over many magnets."""
 
 
+class _Number(click.ParamType):  # type: ignore[type-arg]
+    """A number of magnets, or all of them (None)."""
+
+    name = "all|N"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | None:
+        """All, or one at least."""
+        if str(value) == "all":
+            return None
+        try:
+            number = int(value)
+        except ValueError:
+            number = 0
+        if number < 1:
+            self.fail(f"'{value}' is no number of magnets; give 'all' or 1, 2, ...", param, ctx)
+        return number
+
+
 @study.command("tune-fit")
 @lattice_argument
 @click.option(
     "--magnets",
-    type=click.IntRange(1),
-    default=40,
+    type=_Number(),
+    default="40",
     show_default=True,
-    help="Powered quadrupoles, evenly spread over the ring.",
+    help="Powered magnets, evenly spread over the ring.",
 )
 @click.option(
-    "--regularization",
-    "methods",
-    type=click.Choice(REGULARIZATIONS),
-    multiple=True,
-    help="Repeat for several; all where none is named.",
+    "--kind",
+    type=click.Choice(["quadrupole", "sextupole", "pair"]),
+    default="quadrupole",
+    show_default=True,
+    help="What is changed; a pair is two quadrupoles a third of the ring apart.",
 )
-@click.option("--workers", type=click.IntRange(1), help="Processes; else one a core.")
+@click.option(
+    "--methods",
+    default="adam,map,sparse",
+    show_default=True,
+    metavar="NAME,...",
+    help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, told (sparse that "
+    "knows the magnet).",
+)
+@click.option(
+    "--shots",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Trajectories, their launches turned in phase.",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Noises for each magnet and method.",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster; else local processes.")
+@click.option("--workers", type=click.IntRange(1), help="Local processes; else one a core.")
+@click.option(
+    "--out",
+    type=FILE,
+    default="study-tune-fit",
+    show_default=True,
+    metavar="DIR",
+    help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
+)
 @recipe_options
 @json_option
 @quiet_option
 def tune_fit(
     lattice: str,
-    methods: tuple[str, ...],
+    methods: str,
+    out: Path,
     json_file: Path | None,
     quiet: bool,
+    scheduler: str | None,
+    workers: int | None,
     **options: Any,
 ) -> None:
-    """Median, 95th percentile and worst tune error of the paper's recipe, by regularization."""
+    """Tune errors of fine-tuning over many magnets, each changed in turn."""
     from tmlattice import __version__
     from tmlattice.files import output_file, write_json
     from tmlattice.fitting.study import study_tune_fit, summarise
 
-    chosen = methods or tuple(REGULARIZATIONS)
-    with output_file(json_file) if json_file else nullcontext() as path:
-        cases = list(study_tune_fit(lattice, chosen, progress=not quiet, **options))
+    chosen = tuple(name.strip() for name in methods.split(","))
+    with ExitStack() as files:
+        path = files.enter_context(output_file(json_file)) if json_file else None
+        cases = list(
+            study_tune_fit(
+                lattice, chosen, progress=not quiet, folder=out, scheduler=scheduler,
+                workers=workers, **options,
+            )
+        )  # fmt: skip
+        cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
         summary = {
             "format": "tmlattice-study-tune-fit",
-            "version": 1,
+            "version": 2,
             "package": __version__,
             "lattice": lattice,
             "options": {**options, "launch": list(options["launch"])},
@@ -69,16 +130,23 @@ def tune_fit(
                     "magnet": case.magnet,
                     "s": case.s,
                     "method": case.method,
-                    "abs_dq": None if case.absolute_error is None else [*case.absolute_error],
-                    "rel_dq": None if case.relative_error is None else [*case.relative_error],
+                    "seed": case.seed,
+                    "abs_dq": case.absolute_error,
+                    "rel_dq": case.relative_error,
+                    "tune_sigma": case.tune_sigma,
                     "orbit_rms": case.orbit_rms,
+                    "prediction_rms": case.prediction_rms,
+                    "found": case.found,
                     "problem": case.problem,
                 }
-                for case in sorted(cases, key=lambda c: (c.s, c.method))
+                for case in cases
             ],
         }
+        with output_file(out / "study.json") as own:
+            write_json(own, summary)
         if path:
             write_json(path, summary)
+        _draw(lattice, options, cases, out)
     if not quiet:
         _print(summary)
 
@@ -193,6 +261,23 @@ def _print_localisation(rows: list[dict[str, Any]]) -> None:
         )
 
 
+def _draw(lattice: str, options: dict[str, Any], cases: list[Any], out: Path) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from tmlattice.files import output_file
+    from tmlattice.lattice import load_ring
+    from tmlattice.plots import plot_study
+
+    ring = load_ring(lattice, options["sequence"], options["energy"])
+    figure = plot_study(ring, cases)
+    with output_file(out / "study.png") as path:
+        figure.savefig(path, dpi=150, format="png")
+    plt.close(figure)
+
+
 def _print(summary: dict[str, Any]) -> None:
     screen = console()
     screen.print(
@@ -200,7 +285,7 @@ def _print(summary: dict[str, Any]) -> None:
         "(no tune exists; left out)"
     )
     for key, title, form in (
-        ("abs_dq", "|dQ|", "{:.5f}"),
+        ("abs_dq", "|dQ|", "{:.2e}"),
         ("rel_dq", "|dQ| relative to the fraction", "{:.2%}"),
     ):
         errors = table(title, "x median", "p95", "worst", "y median", "p95", "worst",
@@ -214,6 +299,16 @@ def _print(summary: dict[str, Any]) -> None:
                 str(entry["failed"]),
             )
         screen.print(errors)
+    more = table("", "right magnet", "within stated 95 %, x", "y", "residual [µm]",
+                 "new launches [µm]", "seconds")  # fmt: skip
     for name, entry in summary["methods"].items():
-        if entry["orbit_rms"] is not None:
-            screen.print(f"{name}: median residual {1e6 * entry['orbit_rms']:.2f} µm rms")
+        shown = (
+            (entry["right"], 1, "{:.1%}"),
+            (entry["coverage"]["x"], 1, "{:.1%}"),
+            (entry["coverage"]["y"], 1, "{:.1%}"),
+            (entry["orbit_rms"], 1e6, "{:.2f}"),
+            (entry["prediction_rms"]["median"], 1e6, "{:.2f}"),
+            (entry["seconds"], 1, "{:.2f}"),
+        )
+        more.add_row(name, *("-" if v is None else form.format(v * f) for v, f, form in shown))
+    screen.print(more)

@@ -1,14 +1,17 @@
 """Fine-tuning of a network on measured trajectories, and what it says of the tunes.
 
 >>> result = fine_tune(network, measurement)       # the paper's recipe
+>>> fine_tune(network, measurement, method="sparse").changes    # which magnet, by how much
 >>> outcome = tune_fit(load_ring("petra3"))        # the whole experiment of `tmlattice tune-fit`
 """
 
-from tmlattice.fitting.adam import FitResult, Regularization, fine_tune
+from tmlattice.fitting.adam import FitResult, Regularization
 from tmlattice.fitting.experiment import TuneFit, tune_fit, tune_fit_measurement
+from tmlattice.fitting.methods import Method, fine_tune
 
 __all__ = [
     "FitResult",
+    "Method",
     "Regularization",
     "TuneFit",
     "fine_tune",

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from tmlattice.errors import BeamLostError, MeasurementError
 from tmlattice.measurement import Measurement
-from tmlattice.network import TaylorNetwork, symplectic_penalty
+from tmlattice.network import SymplecticNetwork, TaylorNetwork, symplectic_penalty
 from tmlattice.network.symplectic import symplectic_coefficients
 
 
@@ -39,19 +40,26 @@ class FitResult:
         stopped_early: True where the patience ran out before the epochs did.
         seconds: of wall clock.
         options: everything that the fit was asked for.
+        tunes: fractional tunes (x, y) that the method itself predicts, [2], or None.
+        tune_sigma: their standard error, [2]; None where the method states none (Adam).
+        changes: relative changes of strengths, by magnet, with their standard errors: the causes
+            that `sparse` found, or all that `map` moved.
     """
 
-    network: TaylorNetwork
+    network: TaylorNetwork | SymplecticNetwork
     loss: list[float]
     penalty: list[float]
     best_epoch: int
     stopped_early: bool
     seconds: float
     options: dict[str, Any] = field(default_factory=dict)
+    tunes: NDArray[np.float64] | None = None
+    tune_sigma: NDArray[np.float64] | None = None
+    changes: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def fine_tune(
-    network: TaylorNetwork,
+def fit_adam(
+    network: TaylorNetwork | SymplecticNetwork,
     measurement: Measurement,
     *,
     epochs: int = 1000,
@@ -59,7 +67,7 @@ def fine_tune(
     regularization: Regularization | str = "symplectic",
     regularization_rate: float = 1e-10,
     relative_to_design: bool = False,
-    free: Sequence[str] = ("W1", "W2"),
+    free: Sequence[str] | None = None,
     clip: float = 1.0,
     patience: int | None = 200,
     progress: bool = True,
@@ -89,7 +97,8 @@ def fine_tune(
         regularization: see above.
         regularization_rate: lambda. The paper's 1e-10 does nothing in metres.
         relative_to_design: the symplectic penalty counts departures from the design's own defect.
-        free: names of the weights that move, among W0, W1, W2.
+        free: names of the weights that move: some of W0, W1, W2, or of W0, generator for a
+            symplectic network, whose penalty is zero whatever they are. None: all but W0.
         clip: largest norm of the gradient, before Adam.
         patience: stop after this many epochs without a loss lower by 0.1 %; None: never.
         progress: show a bar where there is a terminal.
@@ -114,16 +123,21 @@ def fine_tune(
     target = torch.from_numpy(np.where(present, first_turn, 0.0))
 
     model = network.copy()
+    if free is None:
+        free = ("generator",) if isinstance(network, SymplecticNetwork) else ("W1", "W2")
     unknown = set(free) - {name for name, _ in model.named_parameters()}
     if unknown or not free:
-        raise ValueError(f"no weights {sorted(unknown)}; free are some of W0, W1, W2")
+        known = ", ".join(name for name, _ in model.named_parameters())
+        raise ValueError(f"no weights {sorted(unknown)}; free are some of {known}")
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name in free)
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
     design = (
         symplectic_coefficients(network.W1, network.W2)
-        if relative_to_design and regularization is Regularization.SYMPLECTIC
+        if relative_to_design
+        and regularization is Regularization.SYMPLECTIC
+        and isinstance(network, TaylorNetwork)
         else None
     )
     threads = torch.get_num_threads()
@@ -192,11 +206,11 @@ def fine_tune(
 
 
 def _penalty(
-    model: TaylorNetwork, start: list[Tensor], kind: Regularization, design: Any
+    model: TaylorNetwork | SymplecticNetwork, start: list[Tensor], kind: Regularization, design: Any
 ) -> Tensor:
-    if kind is Regularization.SYMPLECTIC:
+    if kind is Regularization.SYMPLECTIC and isinstance(model, TaylorNetwork):
         return symplectic_penalty(model.W1, model.W2, design).sum()
-    if kind is Regularization.NONE:
+    if kind in (Regularization.NONE, Regularization.SYMPLECTIC):
         return torch.zeros((), dtype=torch.float64)
     moved = [p - s for p, s in zip(model.parameters(), start, strict=True)]
     if kind is Regularization.L1:

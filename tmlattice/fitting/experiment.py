@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, TmlatticeError, TooFewTurnsError
-from tmlattice.fitting.adam import FitResult, fine_tune
+from tmlattice.fitting.adam import FitResult
+from tmlattice.fitting.methods import fine_tune
 from tmlattice.harmonics import MIN_TURNS, tunes
 from tmlattice.lattice import Ring, middle_of_first_arc
 from tmlattice.maps import element_map, ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
+from tmlattice.network.network import LayerChain
 from tmlattice.optics import matrix_tunes, one_turn_optics
 
 Array = NDArray[np.float64]
@@ -338,15 +340,7 @@ def _fit_and_track(
     tune, signal, growth, problem = None, None, None, None
     with watch.stage("tunes"):
         try:
-            optics = one_turn_optics(fit.network)
-            growth = optics.growth
-            first = (optics.closed_orbit + TUNE_AMPLITUDE * start)[None]
-            states = fit.network.track(first, turns, keep_lost=True)
-            # the transverse plane: off the nominal energy, tau drifts without end
-            size = np.abs(states[0] - optics.closed_orbit)[:, :4].max(axis=1)
-            grown = ~(size < GROWTH_ALLOWED * np.abs(start).max() * TUNE_AMPLITUDE)
-            signal = states[:, : int(grown.argmax()) if grown.any() else None]
-            tune = tunes(signal, optics).fraction[0]
+            tune, signal, growth = network_tunes(fit.network, start, turns)
         except TmlatticeError as error:
             problem = f"the fine-tuned network has no tune: {error}"
     launches = measurement.states(network.dimension)
@@ -369,6 +363,27 @@ def _fit_and_track(
         "problem": problem,
         "shots": len(launches),
     }
+
+
+def network_tunes(network: LayerChain, launch: Array, turns: int) -> tuple[Array, Array, float]:
+    """Tunes of a network by tracking it, at a vanishing part of the launch [n].
+
+    Returns:
+        Fractions (x, y) [2]; the states they come from, [1, turns + 1, n], fewer where the motion
+        grew; the growth of the amplitude in a turn, 1 for a symplectic network.
+
+    Raises:
+        UnstableRingError: no closed orbit, or no tune.
+        TooFewTurnsError: the motion grew too fast.
+    """
+    optics = one_turn_optics(network)
+    first = (optics.closed_orbit + TUNE_AMPLITUDE * launch)[None]
+    states = network.track(first, turns, keep_lost=True)
+    # the transverse plane: off the nominal energy, tau drifts without end
+    size = np.abs(states[0] - optics.closed_orbit)[:, :4].max(axis=1)
+    grown = ~(size < GROWTH_ALLOWED * np.abs(launch).max() * TUNE_AMPLITUDE)
+    signal = states[:, : int(grown.argmax()) if grown.any() else None]
+    return tunes(signal, optics).fraction[0], signal, optics.growth
 
 
 def compile_kernels(network: TaylorNetwork) -> None:

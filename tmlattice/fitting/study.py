@@ -1,10 +1,19 @@
-"""The experiment of `tune_fit` over many magnets: one chosen case says little about a method."""
+"""The experiment of `tune_fit` over the whole ring: one chosen magnet says little about a method.
 
-import multiprocessing
+Cases run on Dask, on local processes or on a cluster; each is written to a folder as it ends, so a
+study that was stopped goes on where it was.
+"""
+
+import dataclasses
+import hashlib
+import json
+import logging
 import os
+import zlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,129 +21,377 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from tmlattice.errors import TmlatticeError, UnstableRingError
-from tmlattice.fitting.experiment import tune_fit
+from tmlattice.files import output_file, write_json
+from tmlattice.fitting.experiment import DEFAULT_LAUNCH, network_tunes, perturbed_ring
+from tmlattice.fitting.methods import fine_tune
 from tmlattice.lattice import Element, Ring, load_ring
+from tmlattice.maps import ring_matrix
+from tmlattice.measurement import Measurement
+from tmlattice.network import TaylorNetwork
+from tmlattice.optics import Optics, matrix_tunes, one_turn_optics
 
 Array = NDArray[np.float64]
+Pair = tuple[float, float]
+
+METHODS = ("adam", "adam-none", "adam-l1", "adam-l2", "map", "sparse", "told")
+"""Adam with the symplectic penalty, without, with l1, with l2; `map`; `sparse`; and `sparse` that
+is told which magnets changed: nothing else can be better."""
+
+UNSTABLE = "the perturbed ring is unstable"
+
+NEW_AMPLITUDE = 5.0
+"""New launches, for the prediction, have this many times the fitted launch's amplitude."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One magnet, fitted by one method.
+    """One fault, fitted by one method.
 
     Attributes:
-        magnet: name.
-        s: of its middle, m.
-        method: the regularization.
-        true_tunes: of the perturbed ring, [2], or None where it is unstable.
-        absolute_error, relative_error: of the tunes, [2], or None where there is no prediction.
-        orbit_rms: before and after, m.
+        magnet: name; two names with a + between for a pair.
+        s: of its middle, m; of the first of a pair.
+        method: one of `METHODS`.
+        seed: of the noise.
+        true_tunes: of the perturbed ring, or None where it is unstable.
+        absolute_error, relative_error: of the tunes, or None where there is no prediction.
+        tune_sigma: stated standard error of the tunes, or None where the method states none.
+        orbit_rms: residual before and after, m.
+        prediction_rms: error of the fitted network on new launches of five times the amplitude,
+            against readings without noise, m.
+        found: the magnets that the method names, or None where it names none.
+        seconds: of the fit.
         problem: what went wrong, or None.
     """
 
     magnet: str
     s: float
     method: str
-    true_tunes: Array | None
-    absolute_error: Array | None
-    relative_error: Array | None
-    orbit_rms: tuple[float, float] | None
-    problem: str | None
+    seed: int
+    true_tunes: Pair | None = None
+    absolute_error: Pair | None = None
+    relative_error: Pair | None = None
+    tune_sigma: Pair | None = None
+    orbit_rms: Pair | None = None
+    prediction_rms: float | None = None
+    found: tuple[str, ...] | None = None
+    seconds: float | None = None
+    problem: str | None = None
+
+    @property
+    def right(self) -> bool | None:
+        """Whether the magnets named are those that were changed, no more and no fewer."""
+        return None if self.found is None else set(self.found) == set(self.magnet.split("+"))
 
 
-def spread_magnets(ring: Ring, number: int) -> list[Element]:
-    """`number` powered quadrupoles, evenly spread in beam order; all, where there are fewer.
+def spread_magnets(
+    ring: Ring, number: int | None = None, kind: str = "quadrupole"
+) -> list[Element]:
+    """`number` powered magnets of a kind, evenly spread in beam order; None, or more: all.
 
     Raises:
         TmlatticeError: the ring has none.
     """
-    powered = [e for e in ring.magnets if e.kind == "quadrupole" and e.k1 != 0]
+    attribute = {"quadrupole": "k1", "sextupole": "k2"}[kind]
+    powered = [e for e in ring.magnets if e.kind == kind and getattr(e, attribute) != 0]
     if not powered:
-        raise TmlatticeError(f"'{ring.name}' has no powered quadrupole to study")
-    number = min(number, len(powered))
+        raise TmlatticeError(f"'{ring.name}' has no powered {kind} to study")
+    number = len(powered) if number is None else min(number, len(powered))
     return [powered[int((i + 0.5) * len(powered) / number)] for i in range(number)]
 
 
-_ring: Ring | None = None
+def faults(ring: Ring, number: int | None, kind: str) -> list[str]:
+    """The names of the cases: quadrupoles, sextupoles, or pairs of quadrupoles a third of the ring
+    apart, as name+name."""
+    if kind != "pair":
+        return [e.name for e in spread_magnets(ring, number, kind)]
+    powered = [e.name for e in spread_magnets(ring)]
+    other = [powered[(i + len(powered) // 3) % len(powered)] for i in range(len(powered))]
+    chosen = [powered.index(e.name) for e in spread_magnets(ring, number)]
+    return [f"{powered[i]}+{other[i]}" for i in chosen]
 
 
-def _start_worker(lattice: str, sequence: str | None, energy: float | None) -> None:
-    global _ring
-    _ring = load_ring(lattice, sequence, energy)
+def turned_launches(optics: Optics, launch: Array, phases: Array) -> Array:
+    """The launch [n] turned by phases [shot, 2], in rad, on its own ellipses: [shot, n]."""
+    launches = np.tile(launch, (len(phases), 1))
+    for plane in range(2):
+        alpha, beta = optics.alpha[plane], optics.beta[plane]
+        x, p = launch[2 * plane], launch[2 * plane + 1]
+        z = (x - 1j * (alpha * x + beta * p)) * np.exp(1j * phases[:, plane])
+        launches[:, 2 * plane] = z.real
+        launches[:, 2 * plane + 1] = (-z.imag - alpha * z.real) / beta
+    return launches
 
 
-def _run_case(magnet: str, method: str, options: dict[str, Any]) -> Case:
-    assert _ring is not None
-    s = _ring[magnet].s
+def run_case(
+    ring: Ring,
+    magnet: str,
+    method: str,
+    *,
+    change: float = -0.2,
+    launch: Sequence[float] = DEFAULT_LAUNCH,
+    shots: int = 1,
+    noise: float = 2e-5,
+    turns: int = 500,
+    seed: int = 0,
+    **recipe: Any,
+) -> Case:
+    """One case; a fit that fails says why in the case.
+
+    Args:
+        ring: the design.
+        magnet: name, or name+name.
+        method: one of `METHODS`.
+        change: relative, of each magnet.
+        launch: of the first shot; the others are the same turned by pi / shots each, in both
+            planes.
+        shots: trajectories.
+        noise: rms of one reading, m.
+        turns: tracked for Adam's tunes.
+        seed: of the noise.
+        recipe: options of Adam.
+    """
+    names = magnet.split("+")
+    s = ring[names[0]].s
+    empty = Case(ring[names[0]].name if len(names) == 1 else magnet, s, method, seed)
+    machine = ring
+    for name in names:
+        machine = perturbed_ring(machine, name, change)
     try:
-        found = tune_fit(_ring, magnet, progress=False, regularization=method, **options)
+        true = matrix_tunes(ring_matrix(machine))
     except UnstableRingError:
-        return Case(magnet, s, method, None, None, None, None, "the perturbed ring is unstable")
+        return dataclasses.replace(empty, problem=UNSTABLE)
+    design, truth = _network_of(ring), TaylorNetwork.from_ring(machine)
+    optics = one_turn_optics(design)
+    start = np.asarray(launch, dtype=float)
+    phases = np.pi * np.arange(shots)[:, None] / shots * np.ones(2)
+    launches = turned_launches(optics, start, phases)
+    # Each magnet has noise of its own: cases that share one would err together.
+    generator = np.random.default_rng([seed, zlib.crc32(empty.magnet.encode())])
+    clean = truth(launches).detach().numpy()
+    readings = clean + noise * generator.standard_normal(clean.shape)
+    stated = np.full((len(design.monitors), 2), noise) if noise else None
+    measurement = Measurement(launches, readings[:, None], design.monitors, stated)
+    known = dataclasses.replace(empty, true_tunes=_pair(true))
+    try:
+        kind, _, regularization = method.partition("-")
+        if kind == "adam":
+            options = {**recipe, "regularization": regularization or "symplectic"}
+            fit = fine_tune(design, measurement, progress=False, **options)
+            predicted = network_tunes(fit.network, start, turns)[0]
+        else:
+            only = {"candidates": names} if method == "told" else {}
+            way = "sparse" if method == "told" else method
+            fit = fine_tune(design, measurement, method=way, noise=noise, progress=False, **only)
+            if fit.tunes is None:
+                return dataclasses.replace(known, problem="the fitted network has no tune")
+            predicted = fit.tunes
     except TmlatticeError as error:
-        return Case(magnet, s, method, None, None, None, None, str(error))
-    return Case(
-        magnet, s, method, found.true_tunes, found.absolute_error, found.relative_error,
-        found.orbit_rms, found.problem,
-    )  # fmt: skip
+        return dataclasses.replace(known, problem=str(error))
+    away = np.abs((predicted - true + 0.5) % 1.0 - 0.5)
+    new = turned_launches(optics, NEW_AMPLITUDE * start, 2 * np.pi * np.random.default_rng(
+        [seed, 1]).random((4, 2)))  # fmt: skip
+    try:
+        miss = (truth(new) - fit.network(new)).detach().numpy()
+        prediction = float(np.sqrt(np.mean(miss**2)))
+    except TmlatticeError:
+        prediction = None  # five times the amplitude is lost in one of them
+    rms = [
+        float(np.sqrt(np.mean((readings - n(launches).detach().numpy()) ** 2)))
+        for n in (design, fit.network)
+    ]
+    return dataclasses.replace(
+        known,
+        absolute_error=_pair(away),
+        relative_error=_pair(away / true),
+        tune_sigma=None if fit.tune_sigma is None else _pair(fit.tune_sigma),
+        orbit_rms=_pair(np.array(rms)),
+        prediction_rms=prediction,
+        found=tuple(fit.changes) if method in ("sparse", "told") else None,
+        seconds=fit.seconds,
+    )
+
+
+def _pair(values: Array) -> Pair:
+    return float(values[0]), float(values[1])
+
+
+_networks: dict[int, tuple[Ring, TaylorNetwork]] = {}
+_rings: dict[tuple[Any, ...], Ring] = {}
+
+
+def _network_of(ring: Ring) -> TaylorNetwork:
+    if id(ring) not in _networks or _networks[id(ring)][0] is not ring:
+        _networks.clear()
+        _networks[id(ring)] = ring, TaylorNetwork.from_ring(ring)
+    return _networks[id(ring)][1]
+
+
+def _work(lattice: tuple[Any, ...], job: tuple[str, str, int], options: dict[str, Any]) -> Any:
+    """A worker's task: plain data in and out, the ring loaded once."""
+    if lattice not in _rings:
+        _rings[lattice] = load_ring(*lattice)
+    magnet, method, seed = job
+    return dataclasses.asdict(run_case(_rings[lattice], magnet, method, seed=seed, **options))
+
+
+@contextmanager
+def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
+    """A Dask client: of a cluster, or of local processes with one thread each."""
+    import distributed
+
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    if scheduler is not None:
+        try:
+            client = distributed.Client(scheduler, timeout=20)  # type: ignore[no-untyped-call]
+        except (OSError, ValueError) as error:
+            raise TmlatticeError(
+                f"no Dask scheduler answers at '{scheduler}': {error}; start one with "
+                "`dask scheduler`, or leave --scheduler out"
+            ) from error
+        with client:
+            yield client
+        return
+    threads = {name: os.environ.get(name) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    os.environ.update(dict.fromkeys(threads, "1"))  # the workers inherit it: one core each
+    try:
+        cluster = distributed.LocalCluster(  # type: ignore[no-untyped-call]
+            n_workers=workers or os.cpu_count() or 1,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.ERROR,
+        )
+        with cluster, distributed.Client(cluster) as client:  # type: ignore[no-untyped-call]
+            yield client
+    finally:
+        for name, value in threads.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _file_of(folder: Path, job: tuple[str, str, int]) -> Path:
+    digest = hashlib.sha256("\0".join(map(str, job)).encode()).hexdigest()[:16]
+    return folder / "cases" / f"{digest}.json"
+
+
+def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
+    """Make the folder of a study, or check that it is this study's.
+
+    Raises:
+        TmlatticeError: it holds the cases of another study, or cannot be written.
+    """
+    stated = folder / "options.json"
+    text = json.loads(json.dumps(identity))
+    if stated.exists():
+        if json.loads(stated.read_text(encoding="utf-8")) != text:
+            raise TmlatticeError(
+                f"'{folder}' holds a study with other options; name another folder with --out"
+            )
+        return
+    try:
+        (folder / "cases").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TmlatticeError(
+            f"cannot write to '{folder}': {error.strerror or error}; choose another place"
+        ) from error
+    with output_file(stated) as path:
+        write_json(path, text)
+
+
+def _read_case(path: Path) -> Case:
+    values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return Case(**plain)
 
 
 def study_tune_fit(
     lattice: str,
-    methods: Sequence[str] = ("symplectic", "none", "l1", "l2"),
-    magnets: int = 40,
+    methods: Sequence[str] = ("adam", "map", "sparse"),
+    magnets: int | None = 40,
+    *,
+    kind: str = "quadrupole",
+    seeds: int = 1,
+    seed: int = 0,
+    scheduler: str | None = None,
     workers: int | None = None,
+    folder: Path | None = None,
     sequence: str | None = None,
     energy: float | None = None,
     progress: bool = True,
     **options: Any,
 ) -> Iterator[Case]:
-    """Run `tune_fit` on magnets spread over the ring, by each regularization, case by case.
+    """Change magnet after magnet, measure, fine-tune by each method, and hold against the truth.
 
     Args:
         lattice: name or path; every worker loads it for itself.
-        methods: regularizations.
-        magnets: how many powered quadrupoles.
-        workers: processes; else one a core.
+        methods: some of `METHODS`.
+        magnets: how many, evenly spread; None: all.
+        kind: quadrupole, sextupole, or pair (of quadrupoles).
+        seeds: noises for each magnet and method, seed, seed + 1, ...
+        seed: the first.
+        scheduler: address of a Dask scheduler; None: local processes.
+        workers: local processes; else one a core.
+        folder: where every case is written as it ends, and read from when the study goes on.
         sequence, energy: see `load_ring`.
         progress: show a bar where there is a terminal.
-        options: of `tune_fit` and `fine_tune`.
+        options: of `run_case`.
 
     Yields:
-        Cases as they end. A case that fails says why and does not stop the rest.
+        Cases as they end, those of the folder first. A case that fails says why and does not stop
+        the rest; one whose worker died is tried again when the study is.
+
+    Raises:
+        TmlatticeError: an unknown method, another study's folder, or no scheduler.
     """
-    names = [e.name for e in spread_magnets(load_ring(lattice, sequence, energy), magnets)]
-    jobs = [(name, method) for name in names for method in methods]
-    threads = os.environ.get("NUMBA_NUM_THREADS")
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # the workers inherit it: one core each
-    pool = ProcessPoolExecutor(
-        min(workers or os.cpu_count() or 1, len(jobs)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(lattice, sequence, energy),
-    )
-    try:
-        running = [pool.submit(_run_case, *job, options) for job in jobs]
-        done = as_completed(running)
-        for future in tqdm(done, "cases", len(jobs), disable=None if progress else True):
-            yield future.result()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        if threads is None:
-            del os.environ["NUMBA_NUM_THREADS"]
-        else:
-            os.environ["NUMBA_NUM_THREADS"] = threads
+    unknown = [m for m in methods if m not in METHODS]
+    if unknown or not methods:
+        raise TmlatticeError(f"no method '{', '.join(unknown)}'; there are {', '.join(METHODS)}")
+    names = faults(load_ring(lattice, sequence, energy), magnets, kind)
+    jobs = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
+    if folder is not None:
+        identity = {"lattice": lattice, "sequence": sequence, "energy": energy, **options}
+        _open_folder(folder, identity)
+        done = [job for job in jobs if _file_of(folder, job).exists()]
+        for job in done:
+            yield _read_case(_file_of(folder, job))
+        there = set(done)
+        jobs = [job for job in jobs if job not in there]
+    if not jobs:
+        return
+    where = (lattice, sequence, energy)
+    with _client(scheduler, min(workers or os.cpu_count() or 1, len(jobs))) as client:
+        from distributed import as_completed
+
+        futures = {client.submit(_work, where, job, options, pure=False): job for job in jobs}
+        ended = as_completed(futures)  # type: ignore[no-untyped-call]
+        for future in tqdm(ended, "cases", len(jobs), disable=None if progress else True):
+            job = futures.pop(future)
+            error = future.exception()
+            if error is not None:  # not one of ours: the code, or the worker, broke
+                yield Case(job[0], float("nan"), job[1], job[2],
+                           problem=f"{type(error).__name__}: {error}")  # fmt: skip
+                continue
+            case = Case(**future.result())
+            if folder is not None:
+                with output_file(_file_of(folder, job)) as path:
+                    write_json(path, dataclasses.asdict(case))
+            yield case
 
 
 def summarise(cases: Sequence[Case]) -> dict[str, Any]:
-    """Median, 95th percentile and worst tune error of each method.
+    """Median, 95th percentile and worst tune error of each method, and what else counts.
 
     Returns:
         {"methods": {name: {"abs_dq": {"x": {"median", "p95", "worst"}, "y"}, "rel_dq", "orbit_rms"
-        (median after, m), "predicted", "failed"}}, "cases", "unstable"}; "unstable" counts
-        magnets whose perturbed ring has no tune.
+        (median after, m), "prediction_rms" {"median", "p95", "worst"} (m), "right" (fraction of
+        cases with exactly the right magnets, or null), "coverage" ({"x", "y"}: fraction of cases
+        within the stated 95 % error, or null), "seconds" (median), "predicted", "failed"}},
+        "cases", "unstable"}; "unstable" counts magnets whose perturbed ring has no tune.
     """
     methods: dict[str, Any] = {}
-    unstable = {c.magnet for c in cases if c.true_tunes is None and "unstable" in str(c.problem)}
+    unstable = {c.magnet for c in cases if c.problem == UNSTABLE}
     for name in dict.fromkeys(case.method for case in cases):
         mine = [c for c in cases if c.method == name and c.magnet not in unstable]
         good = [c for c in mine if c.absolute_error is not None]
@@ -144,6 +401,20 @@ def summarise(cases: Sequence[Case]) -> dict[str, Any]:
             entry[key] = {plane: _spread(errors[:, i]) for i, plane in enumerate("xy")}
         after = [c.orbit_rms[1] for c in good if c.orbit_rms]
         entry["orbit_rms"] = float(np.median(after)) if after else None
+        entry["prediction_rms"] = _spread(
+            np.array([c.prediction_rms for c in good if c.prediction_rms is not None])
+        )
+        named = [c.right for c in mine if c.right is not None]
+        entry["right"] = sum(named) / len(mine) if named else None
+        stated = [(c.absolute_error, c.tune_sigma) for c in good if c.tune_sigma is not None]
+        entry["coverage"] = {
+            plane: float(np.mean([e[i] <= 1.96 * s[i] for e, s in stated if e is not None]))
+            if stated
+            else None
+            for i, plane in enumerate("xy")
+        }
+        times = [c.seconds for c in good if c.seconds is not None]
+        entry["seconds"] = float(np.median(times)) if times else None
         methods[name] = entry
     return {
         "methods": methods,

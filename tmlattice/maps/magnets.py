@@ -7,7 +7,7 @@ way from the exit of magnet k - 1 to the exit of magnet k, and the chain of laye
 """
 
 import functools
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -219,14 +219,34 @@ def part_maps(element: Element, energy: float, dimension: int = 4) -> list[Taylo
     Args:
         element, energy, dimension: see `element_map`.
     """
-    maps = []
-    for B, R, T in _parts(element.source, energy):
-        bent = T[:dimension, :dimension, :dimension]
-        part = _Quadratic(
-            B[:dimension], R[:dimension, :dimension], 0.5 * (bent + bent.swapaxes(1, 2))
-        )
-        maps.append(TaylorMap(part.reduced()))
-    return maps
+    parts = _parts(element.source, energy, False)
+    return [TaylorMap(_of_ocelot(part, dimension).reduced()) for part in parts]
+
+
+def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
+    """Second-order map of elements in beam order: a layer, with the drifts before its magnet.
+
+    Args:
+        elements: any, in beam order.
+        energy: GeV.
+        dimension: 4 or 6.
+    """
+    way = _identity(dimension)
+    for element in elements:
+        way = _quadratic(element, energy, dimension).after(way)
+    return TaylorMap(way.reduced())
+
+
+def layer_elements(ring: Ring) -> list[tuple[Element, ...]]:
+    """For each layer the elements that it is made of: the way to its magnet, and the magnet."""
+    layers: list[tuple[Element, ...]] = []
+    way: list[Element] = []
+    for element in ring.elements:
+        way.append(element)
+        if element.is_magnet:
+            layers.append(tuple(way))
+            way = []
+    return layers
 
 
 @dataclass(frozen=True)

@@ -8,5 +8,6 @@
 
 from tmlattice.network.network import TaylorNetwork
 from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
+from tmlattice.network.symplectic_network import SymplecticNetwork
 
-__all__ = ["TaylorNetwork", "penalty_parts", "symplectic_penalty"]
+__all__ = ["SymplecticNetwork", "TaylorNetwork", "penalty_parts", "symplectic_penalty"]

@@ -4,6 +4,7 @@ from tmlattice.plots.history import plot_loss
 from tmlattice.plots.orbit import plot_orbit, plot_orbit_fit
 from tmlattice.plots.spectrum import plot_spectrum, plot_tune_fit_spectrum
 from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.study import plot_study
 from tmlattice.plots.weights import plot_weights
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "plot_orbit",
     "plot_orbit_fit",
     "plot_spectrum",
+    "plot_study",
     "plot_tune_fit_spectrum",
     "plot_weights",
 ]

@@ -1,0 +1,146 @@
+"""The study over many magnets as a user runs it: resumed, on a cluster, with cases that fail."""
+
+import json
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from tmlattice import TaylorNetwork, one_turn_optics
+from tmlattice.errors import TmlatticeError
+from tmlattice.fitting.study import (
+    UNSTABLE,
+    Case,
+    faults,
+    run_case,
+    study_tune_fit,
+    summarise,
+    turned_launches,
+)
+
+SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
+QUICK = {"launch": (1e-4, 0.0, 1e-4, 0.0), "change": -0.02, "noise": 1e-6}
+
+
+def test_study_prints_writes_and_goes_on(tmp_path):
+    command = [
+        sys.executable, "-m", "tmlattice", "study", "tune-fit", SMALL, "--magnets", "2",
+        "--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--noise", "1e-6", "--epochs", "20",
+        "--methods", "adam,map,sparse", "--json", "study.json", "--workers", "1",
+    ]  # fmt: skip
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300
+    )
+    result = json.loads((tmp_path / "study.json").read_text())
+    schema = (files("tmlattice") / "schemas" / "study-tune-fit.schema.json").read_text()
+    jsonschema.validate(result, json.loads(schema))
+    assert list(result["methods"]) == ["adam", "map", "sparse"]
+    assert result["cases"] == 2
+    assert result["methods"]["sparse"]["right"] == 1.0
+    assert result["methods"]["adam"]["right"] is None
+    assert "worst" in done.stdout
+    assert done.stderr == ""
+    folder = tmp_path / "study-tune-fit"
+    assert (folder / "study.png").read_bytes().startswith(b"\x89PNG")
+    kept = sorted((folder / "cases").iterdir())
+    assert len(kept) == 6
+    # Stopped after five: the sixth alone is done again.
+    kept[3].unlink()
+    times = {path: path.stat().st_mtime_ns for path in kept if path.exists()}
+    subprocess.run([*command, "--quiet"], cwd=tmp_path, check=True, timeout=300)
+    assert kept[3].exists()
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+    again = json.loads((tmp_path / "study.json").read_text())
+    assert [r["abs_dq"] for r in again["results"]] == [r["abs_dq"] for r in result["results"]]
+    with pytest.raises(TmlatticeError, match="other options"):
+        list(study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=folder))
+
+
+def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(monkeypatch):
+    from distributed import LocalCluster
+
+    from tmlattice.fitting import study
+
+    def broken(lattice, job, options):
+        if job[0] == "QF::1":
+            raise RuntimeError("the worker broke")
+        return work(lattice, job, options)
+
+    work = study._work
+    monkeypatch.setattr(study, "_work", broken)
+    monkeypatch.setattr(study, "faults", lambda *_: ["QF::0", "QF::1", "QF::2"])
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        cases = list(
+            study_tune_fit(
+                SMALL, ["sparse"], scheduler=cluster.scheduler_address, progress=False, **QUICK
+            )
+        )
+    assert len(cases) == 3
+    failed = [c for c in cases if c.problem]
+    assert [c.magnet for c in failed] == ["QF::1"]
+    assert "the worker broke" in failed[0].problem
+    summary = summarise(cases)
+    assert summary["methods"]["sparse"]["failed"] == 1
+    assert summary["methods"]["sparse"]["predicted"] == 2
+
+
+def test_no_scheduler_and_no_method_are_said(tmp_path):
+    with pytest.raises(TmlatticeError, match="no method 'magic'"):
+        list(study_tune_fit(SMALL, ["magic"]))
+
+
+def test_unstable_rings_are_counted_apart(small_ring):
+    case = run_case(small_ring, "QD::5", "sparse", change=-3.0)
+    assert case.problem == UNSTABLE
+    assert summarise([case])["unstable"] == 1
+    assert summarise([case])["methods"]["sparse"]["failed"] == 0
+
+
+def test_pairs_and_sextupoles(small_ring):
+    pair = faults(small_ring, 2, "pair")[0]
+    case = run_case(small_ring, pair, "sparse", shots=2, **QUICK)
+    assert case.right, case
+    name = faults(small_ring, 3, "sextupole")[1]
+    case = run_case(small_ring, name, "sparse", change=-0.5, shots=4, noise=1e-8,
+                    launch=(1e-3, 0.0, 1e-3, 0.0))  # fmt: skip
+    assert case.right, case
+
+
+def test_turned_launches_stay_on_their_ellipses(petra3_network, rng):
+    optics = one_turn_optics(petra3_network)
+    start = np.array([1e-3, 2e-5, -5e-4, 1e-5])
+    turned = turned_launches(optics, start, 2 * np.pi * rng.random((5, 2)))
+    area = [
+        (s[:, 0::2] ** 2 + (optics.alpha * s[:, 0::2] + optics.beta * s[:, 1::2]) ** 2)
+        for s in (turned, start[None])
+    ]
+    np.testing.assert_allclose(area[0], np.repeat(area[1], 5, 0), rtol=1e-12)
+    same = turned_launches(optics, start, np.zeros((1, 2)))
+    np.testing.assert_allclose(same[0], start, rtol=1e-13)
+
+
+def test_summary_counts_coverage_and_right_magnets():
+    def case(error, sigma, found):
+        return Case("a", 1.0, "sparse", 0, (0.1, 0.2), (error, 0.0), (0, 0), (sigma, 1.0),
+                    (1.0, 0.5), 1e-6, found)  # fmt: skip
+
+    cases = [case(1.0, 1.0, ("a",)), case(3.0, 1.0, ("a",)), case(0.1, 1.0, ("a", "b"))]
+    entry = summarise(cases)["methods"]["sparse"]
+    assert entry["coverage"]["x"] == pytest.approx(2 / 3)
+    assert entry["right"] == pytest.approx(2 / 3)
+    assert entry["abs_dq"]["x"]["worst"] == 3.0
+
+
+def test_design_network_is_made_for_each_ring(small_ring):
+    from tmlattice.fitting.study import _network_of
+
+    other = small_ring.with_changed("QD::5", k1=-0.85)
+    first, second = _network_of(small_ring), _network_of(other)
+    assert isinstance(first, TaylorNetwork)
+    assert np.abs(first.maps.W1 - second.maps.W1).max() > 1e-3

@@ -1,0 +1,52 @@
+"""`fine_tune`: one call, three methods."""
+
+from enum import StrEnum
+from typing import Any
+
+from tmlattice.fitting.adam import FitResult, fit_adam
+from tmlattice.fitting.prior import fit_map
+from tmlattice.fitting.sparse import fit_sparse
+from tmlattice.measurement import Measurement
+from tmlattice.network import SymplecticNetwork, TaylorNetwork
+
+
+class Method(StrEnum):
+    """How a network is fine-tuned."""
+
+    ADAM = "adam"
+    MAP = "map"
+    SPARSE = "sparse"
+
+
+def fine_tune(
+    network: TaylorNetwork | SymplecticNetwork,
+    measurement: Measurement,
+    *,
+    method: Method | str = "adam",
+    **options: Any,
+) -> FitResult:
+    """Fit a network to the first turn of a measurement; the given network is left as it is.
+
+    Args:
+        network: the design.
+        measurement: launches and readings.
+        method: "adam", every weight free and a symplectic penalty, the paper's recipe
+            (`fitting.adam.fit_adam`); "map", the most probable changes under a Gaussian prior
+            (`fitting.prior.fit_map`); "sparse", as few changed magnets as the evidence asks for
+            (`fitting.sparse.fit_sparse`). The last two state the error of their tunes.
+        options: of the method, see there.
+
+    Raises:
+        ValueError: an unknown method, or an option's value.
+        TmlatticeError: a measurement that cannot be fitted, see the methods.
+    """
+    chosen = Method(method)
+    if chosen is Method.ADAM:
+        return fit_adam(network, measurement, **options)
+    if chosen is Method.MAP:
+        return fit_map(network, measurement, **options)
+    if isinstance(network, SymplecticNetwork):
+        if network.ring is None:
+            raise ValueError("method 'sparse' needs a network made from a ring")
+        network = TaylorNetwork.from_ring(network.ring, network.dimension)
+    return fit_sparse(network, measurement, **options)

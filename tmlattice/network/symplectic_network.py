@@ -1,0 +1,235 @@
+"""The ring in layers that are symplectic by construction."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from tmlattice.maps import RingMaps
+from tmlattice.maps.taylor import second_derivatives, symplectic_form
+from tmlattice.network import flows, sweeps
+from tmlattice.network.autograd import check_alive, curved
+from tmlattice.network.generators import (
+    cubic_generator,
+    field,
+    field_matrix,
+    multipoles,
+    nearest_symplectic,
+    pull_field,
+)
+from tmlattice.network.network import LayerChain, TaylorNetwork, chain
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+class _FlowSweep(torch.autograd.Function):
+    """(launch [batch, n], W0, generator) -> readings [batch, monitor, 2]."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, launch: Tensor, W0: Tensor, generator: Tensor, W1: Array, maps: RingMaps
+    ) -> Tensor:
+        """Readings of one pass through all layers."""
+        batch, n = launch.shape
+        size = sweeps.size_of(n, batch)
+        start = sweeps.pack(launch.detach().numpy(), len(size[1]))
+        c, A, Q = field(generator.detach().numpy())
+        moves = _moves(c, A, Q)
+        states = np.empty((len(start), len(W1) + 1, n, len(size[1])))
+        states[:, 0] = start
+        middles = np.empty((len(start), len(W1), n, len(size[1])))
+        w0 = W0.detach().numpy()
+        sweeps.run(flows.forward, len(start), size, w0, W1, c, A, Q, moves, states, middles)
+        check_alive(states, maps, size, batch)
+        readings = np.empty((len(start), len(maps.at), 2, len(size[1])))
+        bent = curved(maps.R2)
+        sweeps.run(
+            sweeps.read, len(start), size, maps.R0, maps.R1, maps.R2, bent, maps.at, states,
+            readings,
+        )  # fmt: skip
+        ctx.kept = (maps, size, states, middles, W1, A, Q, moves, bent, batch)
+        return torch.from_numpy(sweeps.unpack(readings, batch))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, pulls: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        """Gradients with respect to the launch, the kicks W0 and all generators."""
+        maps, size, states, middles, W1, A, Q, moves, bent, batch = ctx.kept
+        packed = sweeps.pack(np.ascontiguousarray(pulls.numpy()), len(size[1]))
+        adjoint, inner = np.empty_like(states), np.empty_like(states)
+        sweeps.run(
+            flows.reverse, len(states), size, W1, A, Q, moves, np.zeros_like(moves), maps.R1,
+            maps.R2, bent, maps.start, states, middles, packed, adjoint, inner,
+        )  # fmt: skip
+        kicks = generators = None
+        if ctx.needs_input_grad[1]:
+            kicks = torch.from_numpy(adjoint[:, 1:].sum(axis=(0, 3)))
+        if ctx.needs_input_grad[2]:
+            pulled = np.zeros(W1.shape[:2]), np.zeros_like(A), np.zeros_like(Q)
+            sweeps.run(sweeps.weights, len(W1), size, middles, inner, *pulled)
+            generators = torch.from_numpy(pull_field(*pulled))
+        launch = torch.from_numpy(sweeps.unpack(adjoint[:, 0], batch))
+        return launch, kicks, generators, None, None
+
+
+def _moves(c: Array, A: Array, Q: Array) -> Flags:
+    return np.asarray(c.any(axis=1) | A.any(axis=(1, 2)) | Q.any(axis=(1, 2)))
+
+
+class SymplecticNetwork(LayerChain):
+    """A ring as a chain of symplectic layers: a matrix, then the flow of a generator.
+
+    Layer k sends x to W0[k] + the flow, by one implicit-midpoint step, of generator[k] from
+    W1[k] x. Any values of the parameters give a symplectic layer. The design's generators are
+    cubic; they agree with the second-order layers to second order, and every long-term tracking
+    keeps its action. What is added to a generator reads as the magnet's error (`multipoles`).
+
+    Args:
+        maps: names, places and read-outs.
+        W0: constant kicks, [layer, n].
+        W1: symplectic matrices, [layer, n, n]; fixed.
+        generator: [layer, coefficient], see `network.generators`.
+
+    Attributes:
+        W0, generator: parameters.
+        W1: a tensor that is not fitted: a generator's quadratic part does what a change of it does.
+        design: the generators as they were given, [layer, coefficient].
+    """
+
+    W1: Tensor
+    design: Tensor
+
+    def __init__(self, maps: RingMaps, W0: Array, W1: Array, generator: Array) -> None:
+        super().__init__()
+        self.maps = maps
+        self.W0 = torch.nn.Parameter(torch.from_numpy(W0.copy()))
+        self.generator = torch.nn.Parameter(torch.from_numpy(generator.copy()))
+        self.register_buffer("W1", torch.from_numpy(W1.copy()))
+        self.register_buffer("design", torch.from_numpy(generator.copy()))
+
+    @classmethod
+    def from_network(cls, network: TaylorNetwork) -> "SymplecticNetwork":
+        """Layers that agree with a network's to second order.
+
+        Args:
+            network: a design, or one that was fitted; its W1 are moved to the nearest symplectic
+                matrices (OCELOT's are symplectic to rounding), and of its W2 the part stays that a
+                generator can make.
+
+        Raises:
+            ValueError: a layer too far from symplectic.
+        """
+        W0, W1, W2 = network.weights()
+        W1 = nearest_symplectic(W1)
+        made = cls(network.maps, W0, W1, cubic_generator(W1, W2))
+        made.ring = network.ring
+        return made
+
+    def copy(self) -> "SymplecticNetwork":
+        """A network of its own with the same parameters and the same design."""
+        W1 = self.W1.numpy()
+        new = SymplecticNetwork(self.maps, self.W0.detach().numpy(), W1, self.design.numpy())
+        new.load_state_dict(self.state_dict())
+        new.ring = self.ring
+        return new
+
+    def symplectic(self) -> "SymplecticNetwork":
+        """Itself."""
+        return self
+
+    def correction(self) -> Array:
+        """What was added to the design's generators, [layer, coefficient]."""
+        return np.asarray((self.generator - self.design).detach().numpy())
+
+    def multipoles(self) -> dict[str, Array]:
+        """The correction of each layer as multipoles, see `network.generators.multipoles`."""
+        return multipoles(self.correction())
+
+    def forward(self, launch: ArrayLike | Tensor) -> Tensor:
+        """Readings of every monitor on one pass, [batch, monitor, 2], m; differentiable.
+
+        Raises:
+            BeamLostError: names the layer where a trajectory was lost, or whose generator is so
+                strong that its flow has no midpoint.
+        """
+        readings: Tensor = _FlowSweep.apply(  # type: ignore[no-untyped-call]
+            self._launch(launch), self.W0, self.generator, self.W1.numpy(), self.maps
+        )
+        return readings
+
+    def _fields(self) -> tuple[Array, Array, Array, Array, Array, Flags]:
+        c, A, Q = field(self.generator.detach().numpy())
+        return self.W0.detach().numpy(), self.W1.numpy(), c, A, Q, _moves(c, A, Q)
+
+    def _forward(self, size: sweeps.Size, states: Array) -> None:
+        middles = np.empty((len(states), states.shape[1] - 1, *states.shape[2:]))
+        sweeps.run(flows.forward, len(states), size, *self._fields(), states, middles)
+
+    def _one_turn_fields(self) -> tuple[Array, Array, Array, Array, Array, Flags]:
+        """The fields of all layers, and of the way to the ring's end as a last one."""
+        closing = [w[None] for w in self.maps.closing.coefficients]
+        W1 = nearest_symplectic(closing[1])
+        c, A, Q = field(cubic_generator(W1, closing[2]))
+        end = closing[0], W1, c, A, Q, _moves(c, A, Q)
+        both = zip(self._fields(), end, strict=True)
+        W0, W1, c, A, Q, moves = (np.concatenate(pair) for pair in both)
+        return W0, W1, c, A, Q, moves
+
+    def _track(self, size: sweeps.Size, history: Array) -> None:
+        W0, W1, c, A, Q, moves = self._one_turn_fields()
+        # Inside a turn nobody looks: matrices that follow each other are multiplied.
+        ends = np.flatnonzero(moves | W0.any(axis=1))
+        ends = np.unique([*ends, len(W1) - 1])
+        first = np.concatenate([[0], ends[:-1] + 1])
+        merged = np.stack([chain(W1[a : b + 1]) for a, b in zip(first, ends, strict=True)])
+        rest = (w[ends] for w in (c, A, Q, moves))
+        sweeps.run(flows.track, len(history), size, W0[ends], merged, *rest, history)
+
+    def jacobians(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
+        the layers and of the closing way there [layer + 1, n, n]."""
+        path, _, slopes, W1 = self._slopes(x)
+        half, one = 0.5 * slopes, np.eye(self.dimension)
+        return path, np.asarray(np.linalg.solve(one - half, (one + half) @ W1), dtype=float)
+
+    def _slopes(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """States [layer + 2, n], middles, the fields' slopes there and W1, [layer + 1, ...]."""
+        W0, W1, c, A, Q, moves = self._one_turn_fields()
+        size = sweeps.size_of(self.dimension, 1)
+        states = np.empty((1, len(W0) + 1, self.dimension, 1))
+        states[0, 0, :, 0] = x
+        middles = np.empty((1, len(W0), self.dimension, 1))
+        sweeps.run(flows.forward, 1, size, W0, W1, c, A, Q, moves, states, middles)
+        path, middle = states[0, :, :, 0], middles[0, :, :, 0]
+        slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middle)
+        return path, middle, slopes, W1
+
+    def signatures(self, x: Array) -> tuple[Array, Array, Array]:
+        """What a small change of every generator does on the trajectory from x [n].
+
+        Returns:
+            The exits' states [layer + 1, n]; M [layer + 1, n, n], the Jacobian of every exit by
+            the launch; D [layer, n, coefficient], the shift of the launch that does the same as
+            a change of the layer's generator. A reading R at exit a moves with layer k < a by
+            R M[a] D[k]: carried back by the symplectic inverse of M, forward by M.
+        """
+        path, middle, slopes, W1 = self._slopes(x)
+        layers = len(self.layers)
+        half, one = 0.5 * slopes[:layers], np.eye(self.dimension)
+        steps = np.linalg.solve(one - half, (one + half) @ W1[:layers])
+        M = np.empty((layers + 1, *one.shape))
+        M[0] = one
+        for k in range(layers):
+            M[k + 1] = steps[k] @ M[k]
+        i, j = np.triu_indices(self.dimension)
+        middle = middle[:layers]
+        monomials = np.concatenate(
+            [np.ones((layers, 1)), middle, middle[:, i] * middle[:, j]], axis=1
+        )
+        kicks = np.einsum("amc,km->kac", field_matrix(self.dimension), monomials)
+        S = symplectic_form(self.dimension)
+        back = S.T @ M[1:].swapaxes(1, 2) @ S
+        return path[: layers + 1], M, back @ np.linalg.solve(one - half, kicks)
