@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tmlattice.effects import CATALOGUE, Cause, find
+from tmlattice.effects import CATALOGUE, Cause, background_rms, find
 from tmlattice.errors import BeamLostError, EffectError, TmlatticeError
 from tmlattice.machine import (
     Machine,
     Simulation,
-    background_rms,
     draw_background,
     draw_shots,
     simulate,
