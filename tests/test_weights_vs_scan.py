@@ -279,7 +279,7 @@ def test_before_the_first_monitor_nothing_is_seen(small_ring, measurement, effec
     last = [m.name for m in small_ring.monitors[-1:]]
     alone = replace(measurement.select(monitors=last), launch_sigma=None)
     blind = read_gradient(small_ring, alone, effects=effects)
-    assert not blind.score.any()
+    assert np.abs(blind.score).max() < 1e-9  # but for rounding
     assert np.isinf(blind.sigma).all()
 
 

@@ -22,7 +22,7 @@ from tmlattice.diagnosis.model import Hypothesis, Model
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.noise import estimate, local_misfit
 from tmlattice.diagnosis.refine import Fit, Problem, fit
-from tmlattice.diagnosis.scan import look_elsewhere
+from tmlattice.diagnosis.scan import FreeScan, look_elsewhere
 from tmlattice.diagnosis.small_errors import SmallErrors, small_errors
 from tmlattice.diagnosis.whitening import Whitening
 from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
@@ -191,7 +191,7 @@ class Diagnosis:
             "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
             "fit": both(self.fit_before, self.fit_after),
             "heldout": heldout,
-            "closed": None if gap is None else gap.closed,
+            "closed": None if gap is None else gap.closed,  # null where nothing was put in
             "closed_interval": interval,
         }
 
@@ -325,36 +325,40 @@ def diagnose(
     freedom = _freedom(kept, result)
     p_value = float(stats.chi2.sf(result.chi2, freedom))
     verdict, standing = _verdict(explanation, findings, p_value, estimated, warnings)
-    if verdict == "distributed":
-        causes = ()
+    left = explanation.left
+    if verdict == "distributed":  # nothing is explained: what was found stands no longer
+        causes, result, left = (), before, explanation.first_kicks
+        kept = fitted
+        p_value = float(stats.chi2.sf(before.chi2, _freedom(fitted, before)))
+    fits = [before, result] if causes or result.kicks else [before]
+    estimates = [small.estimate(f) if small else [] for f in fits]
     gap = None
     if heldout is not None:
         other = of_measurement(ring, heldout).with_sigma(np.array(noise))
         other = _same_monitors(other, data, explanation)
         steps = [causes[:i] for i in range(len(causes) + 1)]
         there = [known] * len(steps)
-        if small is not None:  # the small errors, as each explanation leaves them
+        if small:  # the small errors too, as each explanation leaves them
             steps = [(), causes] if causes else [()]
-            fits = [before, result][: len(steps)]
-            there = [[*known, *small.estimate(f)] for f in fits]
+            there = [[*known, *estimate] for estimate in estimates[: len(steps)]]
         models = [Model(ring, other.settings, other.turns, k) for k in there]
         gap = held_out_gap(models, other, steps, seed)
     repaired = apply(ring, causes)
-    shown = result if causes == result.causes else before
-    active = data.active[:, None, None]
-    residuals = [
-        np.where(kept.valid & active, kept.readings - f.paths.readings, np.nan)
-        for f in (before, shown)
-    ]
+    there_now = kept.valid & data.active[:, None, None]
+    residuals = []
+    for f, estimate in zip(fits, estimates, strict=True):
+        made = small.made_by(estimate) if small else 0.0
+        difference = kept.readings - f.paths.readings - made
+        residuals.append(np.where(there_now, difference, np.nan))
     _say_about_shots(data, standing, warnings)
     return Diagnosis(
         verdict=verdict,
         findings=standing,
         fit_before=misfit(residuals[0], kept.sigma),
-        fit_after=misfit(residuals[1], kept.sigma),
+        fit_after=misfit(residuals[-1], kept.sigma),
         heldout=gap,
         heldout_shots=() if heldout is None else heldout.shots,
-        unexplained=_unexplained(model, explanation, p_value),
+        unexplained=_unexplained(model, left, p_value),
         tunes={"before": _tunes(ring), "after": _tunes(repaired)},
         next=_next(ring, data, explanation, known, seed),
         sensitivity=_sensitivity(explanation),
@@ -596,8 +600,8 @@ def _verdict(
     significant = found.p_value(left) < FALSE_ALARM
     if explanation.full and significant:
         warnings.append(
-            f"{len(findings)} findings do not explain the data: small errors everywhere; say "
-            "background=, or give a reference from before the fault"
+            f"as many as {len(findings)} causes do not explain the data: small errors everywhere; "
+            "state their rms as a background, or give a reference from before the fault"
         )
         return "distributed", ()
     if not findings:
@@ -620,9 +624,8 @@ def _same_monitors(other: Data, data: Data, explanation: Explanation) -> Data:
     return other.without(dropped)
 
 
-def _unexplained(model: Model, explanation: Explanation, p_value: float) -> dict[str, Any]:
+def _unexplained(model: Model, left: FreeScan, p_value: float) -> dict[str, Any]:
     """Whether what is left is noise, and where it sits if not."""
-    left = explanation.left
     places: list[dict[str, float]] = []
     s = [model.ring.magnets[int(k)].s for k in left.places]
     taken: list[float] = []

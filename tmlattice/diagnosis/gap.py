@@ -36,8 +36,8 @@ class Gap:
     Attributes:
         misfits: of each model, in the order asked for.
         residuals: readings less model, NaN where not scored, [model, shot, reading, 2], m.
-        closed: share of the first model's gap that the last one closes; None where the first has
-            no gap beyond the noise.
+        closed: share of the first model's gap that the last one closes; None where there is
+            one model only, or the first has no gap beyond the noise.
         interval: of `closed`, 95 %, by bootstrap over shots and monitors.
     """
 
@@ -73,7 +73,9 @@ def held_out_gap(
         residuals.append(np.where(scored, difference, np.nan))
     left = np.array(residuals)
     misfits = tuple(misfit(r, data.sigma) for r in left)
-    closed, interval = _closed(left[0], left[-1], data.sigma, seed)
+    closed, interval = None, None
+    if len(left) > 1:
+        closed, interval = _closed(left[0], left[-1], data.sigma, seed)
     return Gap(misfits, left, closed, interval)
 
 

@@ -119,8 +119,12 @@ def fit(
     causes, kicks = tuple(causes), dict(kicks or {})
     state = _evaluate(problem, causes, kicks, launches)
     if not np.isfinite(state.chi2):  # a first guess that loses the beam: start small
-        causes = tuple(replace(c, amount=0.1 * c.amount) for c in causes)
-        state = _evaluate(problem, causes, kicks, launches)
+        causes = tuple(
+            c if find(c.effect).discrete else replace(c, amount=0.1 * c.amount) for c in causes
+        )
+        state = _evaluate(problem, causes, {k: 0.1 * v for k, v in kicks.items()}, launches)
+    if not np.isfinite(state.chi2):
+        return replace(state, covariance=np.zeros((len(causes), len(causes))))
     converged = False
     rows = _slopes(problem, state)
     for step in range(steps):
@@ -243,8 +247,6 @@ def _finished(problem: Problem, state: Fit, rows: Array, converged: bool) -> Fit
     named = _continuous(state)
     covariance = np.zeros((len(state.causes), len(state.causes)))
     log_evidence = -0.5 * state.chi2
-    if not np.isfinite(state.chi2):
-        return replace(state, covariance=covariance)
     own = state.projection.out(rows)
     gram = own @ own.T
     for cause in state.causes:

@@ -51,6 +51,11 @@ class SmallErrors:
         clean = explained.projection.out(explained.residual)
         return _causes(self.hypotheses, self.rms, self.spread, whitening, clean)
 
+    def made_by(self, estimate: Sequence[Cause]) -> Array:
+        """What small errors make of the readings, linearly, [shot, reading, 2], m."""
+        amounts = np.array([cause.amount for cause in estimate]) / self.rms
+        return np.asarray(np.einsum("e,esrp->srp", amounts, self.spread, optimize=True))
+
 
 def _causes(
     hypotheses: Sequence[Hypothesis], rms: Array, spread: Array, whitening: Whitening, clean: Array

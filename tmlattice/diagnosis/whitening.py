@@ -105,12 +105,15 @@ class Whitening:
             [1, row, shot * column].
         """
         p = len(self.columns)
+        if p == 0:  # every launch is known exactly
+            blocks = 1 if self.dense else self.shots
+            return np.zeros((blocks, self.rows // blocks, 0))
         moved = np.moveaxis(slopes[..., self.columns], -1, 0)  # [column, shot, reading, 2]
         if not self.dense:
-            blocks = self.signature(moved).reshape(p, self.shots, -1)
+            parts = self.signature(moved).reshape(p, self.shots, -1)
             for i, column in enumerate(self.columns):
-                blocks[i, :, -5 + column] = self._prior[:, column]
-            return np.ascontiguousarray(np.moveaxis(blocks, 0, 2))
+                parts[i, :, -5 + column] = self._prior[:, column]
+            return np.ascontiguousarray(np.moveaxis(parts, 0, 2))
         alone = np.zeros((self.shots, p, *slopes.shape[:3]))
         for shot in range(self.shots):
             alone[shot, :, shot] = moved[:, shot]

@@ -66,7 +66,9 @@ class Effect(ABC):
             return
         if cause.element is None:
             raise EffectError(f"{self.name} needs an element: {self.sits_on_text}")
-        if cause.element not in set(places):
+        if cause.element not in places and cause.element.casefold() not in {
+            place.casefold() for place in places if place is not None
+        }:
             kind = ring[cause.element].kind
             raise EffectError(
                 f"{self.name} cannot sit on '{cause.element}', a {kind}; "

@@ -125,7 +125,12 @@ class FamilyGradient(_OnQuadrupole):
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
         """All quadrupoles of the family."""
-        return [i for i, e in enumerate(ring.elements) if e.family == place and self.sits_on(e)]
+        family = (place or "").casefold()
+        return [
+            i
+            for i, e in enumerate(ring.elements)
+            if e.family.casefold() == family and self.sits_on(e)
+        ]
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
         """k1 times 1 + amount."""
