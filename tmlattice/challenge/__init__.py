@@ -1,0 +1,12 @@
+"""The blind challenge: the diagnosis checked on data whose cause is withheld.
+
+>>> make("A", 300, 1, Path("blind"))
+>>> run(Path("blind"))                       # reads no truth
+>>> score(Path("blind"))
+"""
+
+from tmlattice.challenge.case import Case, Truth, read_case, read_truth
+from tmlattice.challenge.make import make
+from tmlattice.challenge.run import run
+
+__all__ = ["Case", "Truth", "make", "read_case", "read_truth", "run"]
