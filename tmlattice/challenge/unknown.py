@@ -41,9 +41,9 @@ class _WithOctupole(AtEngine):
         magnet = self._line[self._places[ring.index(element)].start]
         field = list(magnet.PolynomB) + [0.0] * (4 - len(magnet.PolynomB))
         field[3] += strength / magnet.Length / 6  # AT: k_n / n!
-        magnet.MaxOrder = 3
         magnet.PolynomA = np.zeros(4)
         magnet.PolynomB = np.array(field)
+        magnet.MaxOrder = 3
 
 
 class Unknown:
