@@ -67,9 +67,7 @@ def run_batch(
         raise OutputError(f"cannot write to '{folder}': {error.strerror or error}") from error
     done = {n: r for n, r in finished(folder).items() if n in cases and "error" not in r}
     todo = [name for name in cases if name not in done]
-    bar = tqdm(
-        total=len(cases), initial=len(done), unit="case", disable=None if progress else True
-    )
+    bar = tqdm(total=len(cases), initial=len(done), unit="case", disable=None if progress else True)
     with bar:
         for name, result in _results(work, cases, todo, jobs, scheduler):
             with output_file(folder / f"{name}.json") as path:
@@ -180,5 +178,3 @@ def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
         Client(cluster) as client,
     ):
         yield client, count
-
-

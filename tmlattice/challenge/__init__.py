@@ -8,5 +8,6 @@
 from tmlattice.challenge.case import Case, Truth, read_case, read_truth
 from tmlattice.challenge.make import make
 from tmlattice.challenge.run import run
+from tmlattice.challenge.score import score
 
-__all__ = ["Case", "Truth", "make", "read_case", "read_truth", "run"]
+__all__ = ["Case", "Truth", "make", "read_case", "read_truth", "run", "score"]

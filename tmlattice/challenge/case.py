@@ -1,12 +1,12 @@
 """A challenge on disk: what everybody may see, and, in a folder apart, what was really there.
 
-    DIR/challenge.json                   tier and lattice
-    DIR/cases/NAME/case.json             options that the diagnosis may know
-    DIR/cases/NAME/fit|heldout|reference measurement folders
-    DIR/truth/NAME.json, NAME.npz        causes, launches, readings without noise
-    DIR/truth/made.json                  seed, and what was drawn anew
-    DIR/results/NAME.json                the diagnosis
-    DIR/oracle/NAME.json                 what the data allow, and plain baselines
+DIR/challenge.json                   tier and lattice
+DIR/cases/NAME/case.json             options that the diagnosis may know
+DIR/cases/NAME/fit|heldout|reference measurement folders
+DIR/truth/NAME.json, NAME.npz        causes, launches, readings without noise
+DIR/truth/made.json                  seed, and what was drawn anew
+DIR/results/NAME.json                the diagnosis
+DIR/oracle/NAME.json                 what the data allow, and plain baselines
 """
 
 import json
@@ -173,7 +173,8 @@ def read_case(folder: Path, name: str) -> Case:
 def read_truth(folder: Path, name: str) -> Truth:
     """The secret part of a case: for `score` alone."""
     secret = _read(folder / "truth" / f"{name}.json", TRUTH)
-    launches, clean = {}, {}
+    launches: dict[str, Array] = {}
+    clean: dict[str, Array] = {}
     with np.load(folder / "truth" / f"{name}.npz") as arrays:
         for key in arrays:
             kind, part = key.split("_", 1)

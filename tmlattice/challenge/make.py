@@ -63,6 +63,7 @@ def make(
     shots: int = 4,
     effects: Sequence[str] | None = None,
     amount: float | None = None,
+    signal: tuple[float, float] = SIGNAL,
     progress: bool = True,
 ) -> dict[str, int]:
     """Make a challenge; cases that are there already are kept.
@@ -78,10 +79,11 @@ def make(
         shots: of the fit; two more are held out.
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a signal to noise that is drawn.
+        signal: smallest and largest signal to noise.
         progress: show a bar where there is a terminal.
 
     Returns:
-        How often each effect was drawn and could not reach a signal to noise of 5.
+        How often each effect was drawn and could not reach the smallest signal to noise.
 
     Raises:
         TmlatticeError: another tier, or a folder of another challenge.
@@ -101,6 +103,7 @@ def make(
         "shots": shots,
         "effects": None if effects is None else chosen,
         "amount": amount,
+        "signal": list(signal),
     }
     if (folder / "challenge.json").exists():
         if read_set(folder) != public:
@@ -115,7 +118,7 @@ def make(
         name = f"{number:04d}"
         if name in there:
             continue
-        draw = CaseDraw(ring, lattice, tier, seed, number, reference, shots, chosen, amount)
+        draw = CaseDraw(ring, lattice, tier, seed, number, reference, shots, chosen, amount, signal)
         case, truth = draw.make(name)
         write_case(folder, case, truth)
         unreachable.update(effect for effect, _, _ in draw.unreachable)
@@ -139,10 +142,11 @@ class CaseDraw:
         shots: int = 4,
         effects: Sequence[str] | None = None,
         amount: float | None = None,
+        signal: tuple[float, float] = SIGNAL,
     ) -> None:
         self.ring, self.lattice, self.tier = ring, lattice, tier
         self.effects = names(effects)
-        self.amount = amount
+        self.amount, self.signal = amount, signal
         self.fit_shots = shots
         self.number, self.set_seed = number, seed
         random = stream(seed, "challenge", tier, number)
@@ -219,7 +223,7 @@ class CaseDraw:
 
     # --- what is wrong --------------------------------------------------------------------------
     def _target(self) -> float:
-        return float(np.exp(self.random.uniform(*np.log(SIGNAL))))
+        return float(np.exp(self.random.uniform(*np.log(self.signal))))
 
     def _cause(self, ruler: Ruler, effects: Sequence[str]) -> Cause:
         """Effect, then place, uniformly; the amount for a signal to noise, up to its cap."""
@@ -241,13 +245,13 @@ class CaseDraw:
                 return Cause(name, place, sign * self.amount)
             cap = Cause(name, place, sign * effect.largest)
             most = ruler.of([cap])
-            if not most >= SIGNAL[0]:
+            if not most >= self.signal[0]:
                 self.unreachable.append((name, place, most))
                 continue
             if target >= most:
                 return cap
             return Cause(name, place, _solved(ruler, cap, most, target, effect.power))
-        raise TmlatticeError("no effect reaches a signal to noise of 5; take larger shots")
+        raise TmlatticeError("no effect reaches the smallest signal to noise; take larger shots")
 
     def _unknown_kind(self) -> str:
         """Unknowns and effects taken out share the cases half and half, each in turn."""
@@ -272,12 +276,12 @@ class CaseDraw:
                     amount = min(amount * target / max(size, 1e-9), LARGEST[kind])
             clean = fault.readings(amount)
             size = ruler.size((clean - healthy)[fit])
-            if np.isfinite(clean).all() and size >= SIGNAL[0]:
+            if np.isfinite(clean).all() and size >= self.signal[0]:
                 place = fault.element
                 known = {"kind": kind, "element": place.name, "s": place.s, "amount": amount}
                 return clean, known
             self.unreachable.append((kind, fault.element.name, size))
-        raise TmlatticeError(f"no {kind} reaches a signal to noise of 5; take larger shots")
+        raise TmlatticeError(f"no {kind} reaches the smallest signal to noise; take larger shots")
 
     def _readings(self, causes: Sequence[Cause]) -> Array:
         return clean_readings(Machine(self.ring, [*self.small, *causes]), self.shots)

@@ -30,7 +30,7 @@ CLASS = 9.0
 FALSE_ALARM = 0.005
 DRAWS = 200
 REFINED = 60
-LISTED = 40
+LISTED = 400
 CHUNK = 512
 
 
@@ -124,7 +124,9 @@ class Oracle:
         return float(stats.chi2.isf(-np.expm1(np.log1p(-FALSE_ALARM) / number), 1))
 
 
-def _best(inner: Array, norm: Array, cap: Array, discrete: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _best(
+    inner: Array, norm: Array, cap: Array, discrete: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     safe = np.where(norm > 1e-12, norm, np.inf)
     amount = np.clip(inner / safe, -cap, cap)
     amount = np.where(discrete, np.where(norm > 1e-12, 1.0, 0.0), amount)
@@ -240,9 +242,12 @@ def baselines(case: Case) -> dict[str, list[dict[str, Any]]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # nearly equal columns: that is what makes them baselines
         atoms = orthogonal_mp(unit, residual, n_nonzero_coefs=3)
-        alpha = np.sqrt(2 * np.log(len(seen))) / len(residual)  # the universal threshold
-        lasso = Lasso(alpha=alpha, fit_intercept=False, max_iter=300, tol=1e-3)
-        weights = lasso.fit(unit, residual).coef_
+        level = np.sqrt(2 * np.log(len(seen)))  # the universal threshold
+        weights = np.zeros(len(seen))
+        strong = np.flatnonzero(np.abs(unit.T @ residual) >= level)  # the others stay out at first
+        if len(strong):
+            lasso = Lasso(alpha=level / len(residual), fit_intercept=False, max_iter=100, tol=1e-3)
+            weights[strong] = lasso.fit(unit[:, strong], residual).coef_
     for name, values in (("omp", atoms), ("lasso", weights)):
         order = np.argsort(-np.abs(values))[:3]
         out[name] = guess([int(seen[i]) for i in order if values[i] != 0])

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.challenge.case import Truth
 from tmlattice.effects import Cause, find
 from tmlattice.lattice import Ring
 
@@ -38,7 +37,9 @@ class Places:
     def between(self, a: float, b: float) -> int:
         """Monitors strictly between two positions."""
         low, high = min(a, b), max(a, b)
-        return max(bisect_left(self.monitors, high - 1e-9) - bisect_right(self.monitors, low + 1e-9), 0)
+        return max(
+            bisect_left(self.monitors, high - 1e-9) - bisect_right(self.monitors, low + 1e-9), 0
+        )
 
     def near(self, true: str | None, found: Sequence[float]) -> bool:
         """Whether one of the positions is within one monitor gap of one of the element's."""
@@ -83,7 +84,7 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
         found, amount = float(finding["amount"]), cause.amount
         if find(cause.effect).power == 2:
             found, amount = abs(found), abs(amount)
-        pull = (found - amount) / sigma
+        pull = float((found - amount) / sigma)
     return {
         "place": place,
         "element_first": named and finding["element"] == cause.element,
@@ -156,7 +157,7 @@ def oracle_answer(judged: Mapping[str, Any], ranking: str) -> dict[str, Any]:
     finding = {
         **{key: first[key] for key in ("effect", "element", "amount", "probability")},
         "s": None,
-        "amount_sigma": abs(first["amount"]) / np.sqrt(max(first["statistic"], 1e-300)),
+        "amount_sigma": float(abs(first["amount"]) / np.sqrt(max(first["statistic"], 1e-300))),
         "credible_set": members,
         "mass": float(sum(m["probability"] for m in members)),
     }

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -281,7 +282,7 @@ def detection(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Share detected by signal to noise, tool and oracle."""
     edges = np.geomspace(5, 100, 8)
     out = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges.tolist()):
         some = [r for r in rows if low <= (r["signal_to_noise"] or 0) < high * (1 + 1e-9)]
         entry: dict[str, Any] = {"from": float(low), "to": float(high)}
         for name in ("tool", "oracle"):
@@ -305,8 +306,8 @@ def calibration(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Members of credible sets by their stated probability: its mean, and how many are true."""
     both = [pair for row in rows for pair in row["stated"]]
     out = []
-    for low, high in zip(PROBABILITIES[:-1], PROBABILITIES[1:], strict=True):
-        some = [pair for pair in both if low <= pair[0] < high or (high == 1.0 and pair[0] == 1.0)]
+    for low, high in pairwise(PROBABILITIES):
+        some = [pair for pair in both if low <= pair[0] < (high if high < 1 else 2)]
         mean = float(np.mean([p for p, _ in some])) if some else None
         out.append({"from": low, "to": high, "stated": mean, "true": rate([t for _, t in some])})
     return out

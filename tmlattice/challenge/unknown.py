@@ -120,5 +120,3 @@ def clean_readings(machine: Machine, shots: Shots) -> Array:
     """Readings without noise of one turn, [shot, monitor, 2], m."""
     beam = machine.beam(shots.launches, 1, shots.settings)
     return machine.monitors.read(beam)[:, 0]
-
-

@@ -8,6 +8,7 @@ from typing import NoReturn, TextIO
 import click
 
 from tmlattice import __version__
+from tmlattice.cli.challenge import challenge
 from tmlattice.cli.effects import effects
 from tmlattice.cli.info import info
 from tmlattice.cli.simulate import simulate
@@ -35,6 +36,7 @@ tmlattice.add_command(info)
 tmlattice.add_command(study)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
+tmlattice.add_command(challenge)
 
 
 def main() -> NoReturn:
