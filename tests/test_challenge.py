@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from importlib import resources
 
+import jsonschema
 import numpy as np
 import pytest
 from conftest import SMALL
@@ -110,6 +112,8 @@ def test_run_needs_no_truth_and_score_does(made, tmp_path):
     result = score(folder, jobs=1, progress=False)
     assert result["cases"] == 3
     assert not result["failed"]
+    schema = resources.files("tmlattice") / "schemas" / "challenge.schema.json"
+    jsonschema.validate(json.loads(json.dumps(result)), json.loads(schema.read_text()))
     assert {"tool", "oracle", "omp", "lasso", "svd_gradients"} <= set(result["rows"][0]["answers"])
 
 
@@ -199,9 +203,8 @@ def test_rates_by_hand(small_ring, quads):
     assert tool["element_first"] == 2 / 5
     assert tool["place"] == 2 / 5  # the last quadrupole is far from the first
     assert found["false_refusals"]["share"] == 1 / 5
-    assert found["coverage"]["holds_truth"] == pytest.approx(
-        {"share": 2 / 3, "cases": 3, "interval": found["coverage"]["holds_truth"]["interval"]}
-    )
+    assert found["coverage"]["holds_truth"]["share"] == 2 / 3
+    assert found["coverage"]["holds_truth"]["cases"] == 3
     assert found["coverage"]["mean_stated_mass"] == pytest.approx((1 + 1 + 0.9) / 3)
     assert found["clean_gap_closed"]["within_5_percent"]["share"] == 4 / 5
     assert found["verdicts"] == {"named": 2, "equivalent": 1, "located": 1, "nothing": 1}
@@ -229,7 +232,8 @@ def test_confusion_calibration_and_pulls_by_hand(small_ring, quads):
 
 def test_within_one_monitor_gap_counts_monitors_between(small_ring):
     places = Places(small_ring)
-    m = places.monitors
+    m = [s for i, s in enumerate(places.monitors) if i == 0 or s - places.monitors[i - 1] > 0.01]
+    places.monitors = m  # without pairs at one place
     assert places.between(m[0] + 0.001, m[1] - 0.001) == 0
     assert places.between(m[0], m[1]) == 0  # monitors next to each other
     assert places.between(m[0] - 0.001, m[0] + 0.001) == 1

@@ -256,6 +256,8 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["coverage"] = coverage(clear)
     out["pulls"] = pulls([row["answers"]["tool"]["pull"] for row in rows])
     out["clean_gap_closed"] = _closed(clear)
+    strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
+    out["clean_gap_closed_above_20"] = _closed(strong)
     out["false_refusals"] = rate([row["refused"] for row in clear])
     out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
     out["relative_to_oracle"] = _relative(clear)
@@ -350,16 +352,23 @@ def pulls(values: Sequence[float | None]) -> dict[str, Any]:
 
 
 def _closed(rows: Sequence[Row]) -> dict[str, Any]:
-    """Where something is to be seen: error on clean held-out readings at most 5 % of before."""
-    ratios = []
+    """Where something is to be seen: error on clean held-out readings at most 5 % of before.
+
+    An amount known to 1 / (signal to noise) leaves that share of the gap: nobody reaches 5 % at a
+    signal to noise of 10. `of_the_floor` is the share left in units of that.
+    """
+    ratios, floors = [], []
     for row in rows:
         oracle = row["answers"].get("oracle")
         if row["clean_before"] and (oracle is None or oracle["detected"]):
             ratios.append(row["clean_after"] / row["clean_before"])
+            if row["signal_to_noise"]:
+                floors.append(ratios[-1] * row["signal_to_noise"])
     return {
         "within_5_percent": rate([ratio <= 0.05 for ratio in ratios]),
         "within_10_percent": rate([ratio <= 0.10 for ratio in ratios]),
         "ratio": _quantiles(ratios),
+        "of_the_floor": _quantiles(floors),
         "chi2_per_dof": _quantiles([r["heldout_chi2_per_dof"] for r in rows if r["findings"]]),
     }
 

@@ -61,7 +61,7 @@ def plot_calibration(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
     ax.set(xlabel="stated probability", ylabel="share that is true", xlim=(-0.02, 1.02),
            ylim=(-0.02, 1.02))  # fmt: skip
     ax.grid(alpha=0.25)
-    ax.legend(fontsize="small", loc="upper left")
+    ax.legend(fontsize="small", loc="lower right")
     return ax
 
 
