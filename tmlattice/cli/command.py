@@ -8,6 +8,7 @@ from typing import NoReturn, TextIO
 import click
 
 from tmlattice import __version__
+from tmlattice.cli.challenge import challenge
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.info import info
@@ -39,6 +40,7 @@ tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
 tmlattice.add_command(diagnose)
 tmlattice.add_command(reproduce)
+tmlattice.add_command(challenge)
 
 
 def main() -> NoReturn:

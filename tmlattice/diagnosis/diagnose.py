@@ -340,14 +340,14 @@ def diagnose(
         there = [known] * len(steps)
         if small:  # the small errors too, as each explanation leaves them
             steps = [(), causes] if causes else [()]
-            there = [[*known, *estimate] for estimate in estimates[: len(steps)]]
+            there = [[*known, *errors] for errors in estimates[: len(steps)]]
         models = [Model(ring, other.settings, other.turns, k) for k in there]
         gap = held_out_gap(models, other, steps, seed)
     repaired = apply(ring, causes)
     there_now = kept.valid & data.active[:, None, None]
     residuals = []
-    for f, estimate in zip(fits, estimates, strict=True):
-        made = small.made_by(estimate) if small else 0.0
+    for f, errors in zip(fits, estimates, strict=True):
+        made = small.made_by(errors) if small else 0.0
         difference = kept.readings - f.paths.readings - made
         residuals.append(np.where(there_now, difference, np.nan))
     _say_about_shots(data, standing, warnings)

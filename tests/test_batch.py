@@ -1,0 +1,51 @@
+"""Batches: failures stay alone, finished cases are kept, local processes and a scheduler agree."""
+
+import json
+
+import pytest
+
+from tmlattice.batch import finished, run_batch
+from tmlattice.errors import TmlatticeError
+
+
+def cases(**values):
+    return {name: (lambda value=value: value) for name, value in values.items()}
+
+
+def test_a_failed_case_does_not_stop_the_rest_and_is_done_again(tmp_path):
+    first = run_batch(dict, cases(a={"n": 1}, b=5, c={"n": 3}), tmp_path, jobs=1, progress=False)
+    assert first["a"] == {"n": 1}
+    assert first["c"] == {"n": 3}
+    assert "TypeError" in first["b"]["error"]
+    again = run_batch(dict, cases(a={"n": 7}, b={"n": 2}, c=5), tmp_path, jobs=1, progress=False)
+    assert again == {"a": {"n": 1}, "b": {"n": 2}, "c": {"n": 3}}  # a and c were not done again
+    assert finished(tmp_path) == again
+
+
+def test_a_case_that_cannot_be_loaded_is_recorded(tmp_path):
+    def broken():
+        raise OSError("no such file")
+
+    found = run_batch(dict, {"a": broken}, tmp_path, jobs=1, progress=False)
+    assert "no such file" in found["a"]["error"]
+
+
+def test_two_processes_and_a_scheduler_by_its_address(tmp_path):
+    from distributed import LocalCluster
+
+    some = cases(**{f"c{i}": {"n": i} for i in range(5)}, bad=3)
+    local = run_batch(dict, some, tmp_path / "local", jobs=2, progress=False)
+    assert local["c4"] == {"n": 4}
+    assert "error" in local["bad"]
+    with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        remote = run_batch(dict, some, tmp_path / "remote", scheduler=address, progress=False)
+    assert {k: v for k, v in remote.items() if k != "bad"} == {
+        k: v for k, v in local.items() if k != "bad"
+    }
+    assert json.loads((tmp_path / "remote" / "c0.json").read_text()) == {"n": 0}
+
+
+def test_no_scheduler_is_one_sentence(tmp_path):
+    with pytest.raises(TmlatticeError, match="no Dask scheduler answers"):
+        run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)

@@ -1,0 +1,266 @@
+"""The challenge is blind, its signal to noise is what it says, and its scores are those by hand."""
+
+import json
+import shutil
+from importlib import resources
+
+import jsonschema
+import numpy as np
+import pytest
+from conftest import SMALL
+
+from tmlattice.challenge import make, read_case, read_truth, run, score
+from tmlattice.challenge.case import Truth
+from tmlattice.challenge.oracle import Oracle
+from tmlattice.challenge.record import Places, exact
+from tmlattice.challenge.score import calibration, confusion, pulls, row_of, summary
+from tmlattice.effects import Cause
+from tmlattice.errors import TmlatticeError
+from tmlattice.machine import Machine
+
+LATTICE = str(SMALL)
+EFFECTS = ["quadrupole_gradient", "quadrupole_offset_y", "monitor_gain_x", "corrector_calibration"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("challenge") / "A"
+    make("A", 3, 5, folder, lattice=LATTICE, effects=EFFECTS, progress=False)
+    return folder
+
+
+def public(folder):
+    files = [p for p in sorted((folder / "cases").rglob("*")) if p.is_file()]
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+def test_cases_are_those_of_the_seed_whatever_their_number(made, tmp_path):
+    make("A", 2, 5, tmp_path / "same", lattice=LATTICE, effects=EFFECTS, progress=False)
+    make("A", 1, 6, tmp_path / "other", lattice=LATTICE, effects=EFFECTS, progress=False)
+    first, same = public(made), public(tmp_path / "same")
+    assert same
+    assert all(first[name] == content for name, content in same.items())
+    other = public(tmp_path / "other")
+    assert other["cases/0000/fit/readings.csv"] != first["cases/0000/fit/readings.csv"]
+
+
+def test_the_public_part_holds_no_truth(made):
+    text = b"".join(public(made).values()).decode() + (made / "challenge.json").read_text()
+    for name in ("0000", "0001", "0002"):
+        truth = read_truth(made, name)
+        case = json.loads((made / "cases" / name / "case.json").read_text())
+        assert set(case) == {"format", "version", "lattice", "reference", "options"}
+        assert case["options"] == {}
+        assert repr(truth.causes[0].amount) not in text
+        assert str(truth.seed) not in text
+        for launch in truth.launches["fit"][:, :4].ravel():  # the beam's own, not what was asked
+            assert repr(float(launch)) not in text
+    assert "signal_to_noise" not in text
+    assert '"causes"' not in text
+
+
+def test_every_case_sets_correctors_so_that_settings_betray_nothing(made):
+    for name in ("0000", "0001", "0002"):
+        fit = read_case(made, name).fit
+        assert len({json.dumps(s, sort_keys=True) for s in fit.settings}) == 4
+        kicks = [abs(c["kick"]) for setting in fit.settings for c in setting.values()]
+        assert all(2e-5 <= kick <= 5e-5 for kick in kicks)
+
+
+@pytest.mark.parametrize("name", ["0000", "0001", "0002"])
+def test_signal_to_noise_by_brute_force_with_at(made, small_ring, name):
+    truth, case = read_truth(made, name), read_case(made, name)
+    sick, healthy = Machine(small_ring, truth.causes), Machine(small_ring)
+
+    def read(machine, launches):
+        state = np.zeros((len(launches), 6))
+        state[:, :4], state[:, 5] = launches[:, :4], launches[:, 4]
+        return machine.monitors.read(machine.beam(state, 1, case.fit.settings))[:, 0]
+
+    launches = truth.launches["fit"]
+    change = (read(sick, launches) - read(healthy, launches)).reshape(4, -1)
+    total = 0.0
+    for shot in range(4):
+        columns = []
+        for k in range(4):
+            step = np.zeros((4, 5))
+            step[:, k] = 1e-6
+            slope = read(healthy, launches + step) - read(healthy, launches - step)
+            columns.append(slope[shot].ravel() / 2e-6)
+        J = np.array(columns).T
+        left = change[shot] - J @ np.linalg.lstsq(J, change[shot], rcond=None)[0]
+        total += float(left @ left)
+    expected = np.sqrt(total) / truth.noise
+    # the launch's slopes are the model's there and AT's here
+    assert truth.signal_to_noise[0] == pytest.approx(expected, rel=5e-3)
+    assert 5 * 0.98 <= expected <= 100 * 1.02
+
+
+def test_run_needs_no_truth_and_score_does(made, tmp_path):
+    folder = tmp_path / "blind"
+    shutil.copytree(made, folder)
+    (folder / "truth").rename(tmp_path / "hidden")
+    results = run(folder, jobs=1, progress=False)
+    assert len(results) == 3
+    assert all("error" not in result for result in results.values())
+    written = {p.name: p.stat().st_mtime_ns for p in (folder / "results").iterdir()}
+    run(folder, jobs=1, progress=False)  # nothing is done twice
+    assert written == {p.name: p.stat().st_mtime_ns for p in (folder / "results").iterdir()}
+    with pytest.raises(TmlatticeError, match="truth"):
+        score(folder, progress=False)
+    (tmp_path / "hidden").rename(folder / "truth")
+    result = score(folder, jobs=1, progress=False)
+    assert result["cases"] == 3
+    assert not result["failed"]
+    schema = resources.files("tmlattice") / "schemas" / "challenge.schema.json"
+    jsonschema.validate(json.loads(json.dumps(result)), json.loads(schema.read_text()))
+    assert {"tool", "oracle", "omp", "lasso", "svd_gradients"} <= set(result["rows"][0]["answers"])
+
+
+def test_the_oracle_finds_something_in_noise_at_the_stated_rate(tmp_path):
+    make("E", 1, 3, tmp_path, lattice=LATTICE, progress=False)
+    oracle = Oracle(read_case(tmp_path, "0000"), read_truth(tmp_path, "0000"))
+    draws = np.random.default_rng(99).standard_normal((4000, oracle.whitening.rows))
+    found = sum(
+        oracle.statistics(clean)[0].max() > oracle.threshold
+        for clean in oracle.projection.out(draws)
+    )
+    assert 6 <= found <= 45  # 20 expected; Poisson, and N known to 15 %
+
+
+def test_unknowns_and_a_reduced_catalogue_share_tier_d(tmp_path):
+    make("D", 2, 1, tmp_path, lattice=LATTICE, progress=False)
+    first, second = (read_truth(tmp_path, name) for name in ("0000", "0001"))
+    assert first.causes == ()
+    assert first.unknown["kind"] != "taken_out"
+    assert second.unknown == {"kind": "taken_out"}
+    assert second.causes[0].effect not in read_case(tmp_path, "0001").options["effects"]
+    assert read_case(tmp_path, "0000").options == {}
+
+
+# --- scores by hand ---
+def truth_of(*causes, snr=30.0):
+    return Truth("x", "A", causes, None, tuple(snr for _ in causes), snr, {}, 1e-3, 2e-5, 0, {}, {})
+
+
+def finding(*members, amount=0.1, sigma=0.01, s=None):
+    effect, element, probability = members[0]
+    return {
+        "effect": effect,
+        "element": element,
+        "s": s,
+        "amount": amount,
+        "amount_sigma": sigma,
+        "probability": probability,
+        "credible_set": [{"effect": e, "element": n, "probability": p} for e, n, p in members],
+        "mass": sum(p for _, _, p in members),
+    }
+
+
+def result_of(*findings, verdict="named"):
+    gap = {"closed": None, "heldout": None}
+    return {"verdict": verdict, "findings": list(findings), "gap": gap, "seconds": 1.0}
+
+
+@pytest.fixture
+def quads(small_ring):
+    return [e for e in small_ring.elements if e.kind == "quadrupole" and e.k1 != 0]
+
+
+def rows_by_hand(small_ring, quads):
+    """One right, one equivalent, one refused, one with nothing found."""
+    places = Places(small_ring)
+    name, other = quads[0].name, quads[-1].name
+    truth = truth_of(Cause("quadrupole_gradient", name, 0.08))
+    results = [
+        result_of(finding(("quadrupole_gradient", name, 1.0))),
+        result_of(
+            finding(("quadrupole_roll", name, 0.6), ("quadrupole_gradient", name, 0.4)),
+            verdict="equivalent",
+        ),
+        result_of(
+            {**finding((None, None, 1.0), s=quads[-1].s), "credible_set": [], "mass": 0.0},
+            verdict="located",
+        ),
+        result_of(verdict="nothing"),
+        result_of(finding(("quadrupole_gradient", other, 0.9))),
+    ]
+    rows = [row_of(result, truth, None, places) for result in results]
+    for row in rows:
+        row |= {"clean_before": 1.0, "clean_after": 0.04}
+    rows[3]["clean_after"] = 1.0
+    return rows
+
+
+def test_rates_by_hand(small_ring, quads):
+    found = summary(rows_by_hand(small_ring, quads), "A")
+    tool = {key: value["share"] for key, value in found["methods"]["tool"].items()}
+    assert tool["detected"] == 4 / 5
+    assert tool["first"] == 1 / 5
+    assert tool["in_set"] == 2 / 5
+    assert tool["effect_first"] == 2 / 5
+    assert tool["effect_in_set"] == 3 / 5
+    assert tool["element_first"] == 2 / 5
+    assert tool["place"] == 2 / 5  # the last quadrupole is far from the first
+    assert found["false_refusals"]["share"] == 1 / 5
+    assert found["coverage"]["holds_truth"]["share"] == 2 / 3
+    assert found["coverage"]["holds_truth"]["cases"] == 3
+    assert found["coverage"]["mean_stated_mass"] == pytest.approx((1 + 1 + 0.9) / 3)
+    assert found["clean_gap_closed"]["within_5_percent"]["share"] == 4 / 5
+    assert found["verdicts"] == {"named": 2, "equivalent": 1, "located": 1, "nothing": 1}
+
+
+def test_confusion_calibration_and_pulls_by_hand(small_ring, quads):
+    rows = rows_by_hand(small_ring, quads)
+    assert confusion(rows) == {
+        "quadrupole_gradient": {
+            "quadrupole_gradient": 2,
+            "equivalent": 1,
+            "unknown": 1,
+            "nothing": 1,
+        }
+    }
+    bins = {b["from"]: b for b in calibration(rows)}
+    assert bins[0.95]["true"]["share"] == 1.0
+    assert bins[0.4]["true"]["share"] == 1.0
+    assert bins[0.6]["true"]["share"] == 0.0
+    assert bins[0.9]["stated"] == pytest.approx(0.9)
+    assert rows[0]["answers"]["tool"]["pull"] == pytest.approx((0.1 - 0.08) / 0.01)
+    found = pulls([-1.0, 1.0, None, 3.0])
+    assert (found["cases"], found["mean"], found["width"]) == (3, 1.0, 2.0)
+
+
+def test_within_one_monitor_gap_counts_monitors_between(small_ring):
+    places = Places(small_ring)
+    m = [s for i, s in enumerate(places.monitors) if i == 0 or s - places.monitors[i - 1] > 0.01]
+    places.monitors = m  # without pairs at one place
+    assert places.between(m[0] + 0.001, m[1] - 0.001) == 0
+    assert places.between(m[0], m[1]) == 0  # monitors next to each other
+    assert places.between(m[0] - 0.001, m[0] + 0.001) == 1
+    assert places.between(m[2] + 0.001, m[0] - 0.001) == 3
+
+
+def test_several_causes_need_a_finding_each():
+    a, b = Cause("quadrupole_roll", "q1", 1.0), Cause("dipole_field", "b1", 1.0)
+    fa = finding(("quadrupole_roll", "q1", 0.5), ("dipole_field", "b1", 0.5))
+    fb = finding(("dipole_field", "b1", 1.0))
+    assert exact(result_of(fa, fb), (a, b))
+    assert exact(result_of(fb, fa), (a, b))
+    assert not exact(result_of(fa), (a, b))
+    assert not exact(result_of(fb, fb), (a, b))
+    assert not exact(result_of(fa, fb, fb), (a, b))
+
+
+@pytest.mark.slow
+def test_a_fixed_set_on_petra3_keeps_its_rates(tmp_path):
+    make("A", 24, 20, tmp_path, signal=(20.0, 100.0), progress=False)
+    run(tmp_path, jobs=1, progress=False)
+    found = score(tmp_path, oracle=False, progress=False)
+    tool = {key: value["share"] for key, value in found["bands"]["above 20"]["tool"].items()}
+    assert not found["failed"]
+    assert tool["detected"] == 1.0
+    assert tool["place"] >= 0.9
+    assert tool["element_in_set"] >= 0.9
+    assert tool["effect_in_set"] >= 0.9
+    assert found["coverage"]["median_elements"] <= 3
+    assert abs(found["pulls"]["mean"]) < 0.8

@@ -1,0 +1,180 @@
+"""One function over many cases: on local processes or on a cluster, and resumable.
+
+Every case has a JSON file of its own, which appears when the case is done. A second run does what
+is missing, and what has failed, again.
+"""
+
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tqdm.auto import tqdm
+
+from tmlattice.errors import TmlatticeError
+from tmlattice.files import OutputError, output_file, write_json
+
+log = logging.getLogger(__name__)
+
+Work = Callable[[Any], dict[str, Any]]
+
+
+def finished(folder: Path) -> dict[str, dict[str, Any]]:
+    """The results that are there, by case; failed ones have a key "error"."""
+    results = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            results[path.stem] = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # another program's, or cut off: done again
+            log.warning("%s is no result; it is left aside", path)
+    return results
+
+
+def run_batch(
+    work: Work,
+    cases: Mapping[str, Callable[[], Any]],
+    folder: Path,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> dict[str, dict[str, Any]]:
+    """The result of every case.
+
+    Args:
+        work: takes what a case needs and returns its result; importable by other processes.
+        cases: by name, which is the file's: a function that loads what the case needs. It is
+            called here, shortly before the case runs: the workers need no files of ours.
+        folder: of the results.
+        jobs: local processes, one thread each; 1: this process; None: one a core.
+        scheduler: address of a Dask scheduler, instead of local processes.
+        progress: show a bar where there is a terminal.
+
+    Returns:
+        By case; a failed one has only "error" and "seconds".
+
+    Raises:
+        OutputError: the folder cannot be written.
+        TmlatticeError: no scheduler answers.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+    done = {n: r for n, r in finished(folder).items() if n in cases and "error" not in r}
+    todo = [name for name in cases if name not in done]
+    bar = tqdm(total=len(cases), initial=len(done), unit="case", disable=None if progress else True)
+    with bar:
+        for name, result in _results(work, cases, todo, jobs, scheduler):
+            with output_file(folder / f"{name}.json") as path:
+                write_json(path, result)
+            done[name] = result
+            bar.update()
+    return {name: done[name] for name in cases}
+
+
+def _results(
+    work: Work,
+    cases: Mapping[str, Callable[[], Any]],
+    todo: list[str],
+    jobs: int | None,
+    scheduler: str | None,
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    count = min(jobs or os.cpu_count() or 1, max(len(todo), 1))
+    if not todo:
+        return
+    if scheduler is None and count == 1:
+        for name in todo:
+            yield name, _loaded(work, cases[name])
+        return
+    with _client(count, scheduler) as (client, workers):
+        from distributed import as_completed
+
+        waiting = iter(todo)
+        names: dict[Any, str] = {}
+        running = as_completed()
+
+        def feed() -> None:
+            for name in waiting:
+                try:
+                    argument = cases[name]()
+                except Exception as error:
+                    failed[name] = _error(error, 0.0)
+                    continue
+                future = client.submit(guarded, work, argument, pure=False)
+                names[future.key] = name
+                running.add(future)
+                return
+
+        failed: dict[str, dict[str, Any]] = {}
+        for _ in range(2 * workers):  # no more in flight than the workers need
+            feed()
+        for future in running:
+            name = names.pop(future.key)
+            try:
+                result = future.result()
+            except Exception as error:  # the worker itself was lost
+                result = _error(error, 0.0)
+            feed()
+            yield name, result
+        yield from failed.items()
+
+
+def guarded(work: Work, argument: Any) -> dict[str, Any]:
+    """The result, or what went wrong: one failed case does not stop the rest."""
+    begun = time.perf_counter()
+    try:
+        return work(argument)
+    except Exception as error:
+        log.warning("a case failed", exc_info=True)
+        return _error(error, time.perf_counter() - begun)
+
+
+def _loaded(work: Work, load: Callable[[], Any]) -> dict[str, Any]:
+    try:
+        argument = load()
+    except Exception as error:
+        return _error(error, 0.0)
+    return guarded(work, argument)
+
+
+def _error(error: Exception, seconds: float) -> dict[str, Any]:
+    return {"error": f"{type(error).__name__}: {error}", "seconds": seconds}
+
+
+@contextmanager
+def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
+    """A Dask client and its number of workers."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout="20s")
+        except (OSError, ValueError, TimeoutError) as error:
+            raise TmlatticeError(
+                f"no Dask scheduler answers at '{scheduler}'; start one with `dask scheduler`, or "
+                "leave the address out"
+            ) from error
+        with client:
+            client.wait_for_workers(1, timeout=60)
+            yield client, sum(client.nthreads().values())
+        return
+    # one thread a process: compiled kernels must not be entered twice, and cores are shared out
+    environment = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    settings = {
+        "distributed.worker.multiprocessing-method": "spawn",
+        "distributed.nanny.pre-spawn-environ": environment,
+    }
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            count, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client, count

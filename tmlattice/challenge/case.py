@@ -1,0 +1,213 @@
+"""A challenge on disk: what everybody may see, and, in a folder apart, what was really there.
+
+DIR/challenge.json                   tier and lattice
+DIR/cases/NAME/case.json             options that the diagnosis may know
+DIR/cases/NAME/fit|heldout|reference measurement folders
+DIR/truth/NAME.json, NAME.npz        causes, launches, readings without noise
+DIR/truth/made.json                  seed, and what was drawn anew
+DIR/results/NAME.json                the diagnosis
+DIR/oracle/NAME.json                 what the data allow, and plain baselines
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import Cause
+from tmlattice.errors import TmlatticeError
+from tmlattice.files import output_file, write_json
+from tmlattice.lattice import Ring, load_ring
+from tmlattice.measurement import Measurement, read_measurement, write_measurement
+
+Array = NDArray[np.float64]
+
+SET = "tmlattice-challenge-set"
+PUBLIC = "tmlattice-challenge-case"
+TRUTH = "tmlattice-challenge-truth"
+
+TIERS = ("A", "B", "C", "D", "E")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a diagnosis may know.
+
+    Attributes:
+        name: of the case.
+        lattice: what `load_ring` takes.
+        fit, heldout: the measurement, and shots for the gap.
+        reference: before the fault, or None.
+        options: of `diagnose`: background, effects.
+    """
+
+    name: str
+    lattice: str
+    fit: Measurement
+    heldout: Measurement
+    reference: Measurement | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was really there.
+
+    Attributes:
+        name, tier: of the case.
+        causes: of the catalogue; () for an unknown and for no effect.
+        unknown: what is not in the catalogue: kind, element, s, amount; or None. For an effect
+            that was taken out of the catalogue the kind is "taken_out" and the effect stands in
+            `causes`.
+        signal_to_noise: of each cause alone, or of the unknown; NaN for what has no signal.
+        total: signal to noise of all together.
+        background: rms of small errors, by effect.
+        amplitude, noise: m.
+        seed: of the case.
+        launches: true ones by part (fit, heldout, reference), [shot, 5].
+        clean: readings without noise by part, and "before": those of the fit without the fault,
+            [shot, monitor, 2], m.
+    """
+
+    name: str
+    tier: str
+    causes: tuple[Cause, ...]
+    unknown: Mapping[str, Any] | None
+    signal_to_noise: tuple[float, ...]
+    total: float
+    background: Mapping[str, float]
+    amplitude: float
+    noise: float
+    seed: int
+    launches: Mapping[str, Array]
+    clean: Mapping[str, Array]
+
+
+@lru_cache(maxsize=2)
+def ring_of(lattice: str) -> Ring:
+    """The design, loaded once in a process."""
+    return load_ring(lattice)
+
+
+def write_case(folder: Path, case: Case, truth: Truth) -> None:
+    """Public and secret part; the public one is whole when its `case.json` is there."""
+    own = folder / "cases" / case.name
+    for name in ("fit", "heldout", "reference"):
+        measurement = getattr(case, name)
+        if measurement is not None:
+            write_measurement(own / name, measurement)
+    _write_truth(folder / "truth", truth)
+    document = {
+        "format": PUBLIC,
+        "version": 1,
+        "lattice": case.lattice,
+        "reference": case.reference is not None,
+        "options": dict(case.options),
+    }
+    with output_file(own / "case.json") as path:
+        write_json(path, document)
+
+
+def _write_truth(folder: Path, truth: Truth) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {f"launches_{k}": v for k, v in truth.launches.items()}
+    arrays |= {f"clean_{k}": v for k, v in truth.clean.items()}
+    with output_file(folder / f"{truth.name}.npz") as path, path.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    document = {
+        "format": TRUTH,
+        "version": 1,
+        "tier": truth.tier,
+        "causes": [vars(cause) for cause in truth.causes],
+        "unknown": None if truth.unknown is None else dict(truth.unknown),
+        "signal_to_noise": list(truth.signal_to_noise),
+        "total": truth.total,
+        "background": dict(truth.background),
+        "amplitude": truth.amplitude,
+        "noise": truth.noise,
+        "seed": truth.seed,
+    }
+    with output_file(folder / f"{truth.name}.json") as path:
+        write_json(path, document)
+
+
+def read_set(folder: Path) -> dict[str, Any]:
+    """The public description of a challenge.
+
+    Raises:
+        TmlatticeError: the folder is none.
+    """
+    return _read(folder / "challenge.json", SET)
+
+
+def case_names(folder: Path) -> list[str]:
+    """All whole cases, in order."""
+    return sorted(path.parent.name for path in (folder / "cases").glob("*/case.json"))
+
+
+def read_case(folder: Path, name: str) -> Case:
+    """The public part of a case."""
+    own = folder / "cases" / name
+    public = _read(own / "case.json", PUBLIC)
+
+    def part(which: str) -> Measurement:
+        measurement = read_measurement(own / which)
+        assert isinstance(measurement, Measurement)
+        return measurement
+
+    return Case(
+        name,
+        public["lattice"],
+        part("fit"),
+        part("heldout"),
+        part("reference") if public["reference"] else None,
+        public["options"],
+    )
+
+
+def read_truth(folder: Path, name: str) -> Truth:
+    """The secret part of a case: for `score` alone."""
+    secret = _read(folder / "truth" / f"{name}.json", TRUTH)
+    launches: dict[str, Array] = {}
+    clean: dict[str, Array] = {}
+    with np.load(folder / "truth" / f"{name}.npz") as arrays:
+        for key in arrays:
+            kind, part = key.split("_", 1)
+            (launches if kind == "launches" else clean)[part] = arrays[key]
+
+    def number(value: Any) -> float:
+        return float("nan") if value is None else float(value)
+
+    return Truth(
+        name,
+        secret["tier"],
+        tuple(Cause(**cause) for cause in secret["causes"]),
+        secret["unknown"],
+        tuple(number(v) for v in secret["signal_to_noise"]),
+        number(secret["total"]),
+        secret["background"],
+        secret["amplitude"],
+        secret["noise"],
+        secret["seed"],
+        launches,
+        clean,
+    )
+
+
+def _read(path: Path, kind: str) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise TmlatticeError(
+            f"{path}: {error.strerror}; name a folder that `tmlattice challenge make` made"
+        ) from error
+    except ValueError as error:
+        raise TmlatticeError(f"{path} is no JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != kind:
+        raise TmlatticeError(f"{path} is not of the format '{kind}'; make the challenge anew")
+    return document

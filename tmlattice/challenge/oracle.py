@@ -1,0 +1,254 @@
+"""What the data allow, and what plain methods make of them.
+
+The oracle knows the statistics exactly: the true launches (the point about which it is linear; what
+is known of launches beforehand it takes as everybody else), the true noise and background, and the
+largest fault. It weighs every hypothesis by its likelihood ratio, the leading ones by the finite
+change of the readings. Its class is every hypothesis within a chi-square of 9 of the best.
+
+The baselines know the design and fit the launches first.
+"""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.challenge.case import Case, Truth, ring_of
+from tmlattice.challenge.ruler import background_signatures
+from tmlattice.diagnosis.data import Data, joined, of_measurement
+from tmlattice.diagnosis.model import Hypothesis, Model
+from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.effects import Cause, find, names
+
+Array = NDArray[np.float64]
+
+CLASS = 9.0
+"""Chi-square within which the oracle cannot tell hypotheses apart."""
+
+FALSE_ALARM = 0.005
+DRAWS = 200
+REFINED = 60
+LISTED = 400
+CHUNK = 512
+
+
+class Oracle:
+    """Every hypothesis about one case, linear about the true launches.
+
+    Args:
+        case, truth: both parts of it.
+        seed: of the simulated null.
+    """
+
+    def __init__(self, case: Case, truth: Truth, seed: int = 0) -> None:
+        ring = ring_of(case.lattice)
+        data = of_measurement(ring, case.fit)
+        launches = truth.launches["fit"]
+        if case.reference is not None:
+            data = joined(of_measurement(ring, case.reference, reference=True), data)
+            launches = np.concatenate([truth.launches["reference"], launches])
+        self.data = _without_dead(data, truth, [m.name for m in ring.monitors])
+        self.launches = launches
+        self.model = Model(ring, data.settings, active=data.active)
+        self.paths = self.model.paths(launches)
+        spread = background_signatures(self.model, launches, truth.background, self.paths)
+        self.whitening = Whitening(self.data, spread)
+        self.projection = Projection(self.whitening.launch(self.paths.launch))
+        chosen = names(case.options.get("effects"))
+        self.hypotheses = self.model.hypotheses([n for n in chosen if n != "monitor_dead"])
+        self.rows = self._signatures()
+        self.norm = np.einsum("hr,hr->h", self.rows, self.rows)
+        self.cap = np.array([find(n).largest ** find(n).power for n, _ in self.hypotheses])
+        self.discrete = np.array([find(n).discrete for n, _ in self.hypotheses])
+        self.threshold = self._threshold(seed)
+
+    def residual(self, readings: Array) -> Array:
+        """Whitened rows of the readings of the fit, with those of a reference as they are."""
+        whole = self.data.readings.copy()
+        whole[self.data.active] = np.nan_to_num(readings)
+        difference = np.where(self.data.valid, whole - self.paths.readings, 0.0)
+        return self.projection.out(self.whitening.residual(difference, self.launches))
+
+    def statistics(self, clean: Array) -> tuple[Array, Array]:
+        """Fall of chi-square, and the best amount ** power within the largest fault."""
+        inner = self.rows @ clean
+        return _best(inner, self.norm, self.cap, self.discrete)
+
+    def refined(self, clean: Array) -> tuple[Array, Array]:
+        """The same, of the leading ones by their finite changes."""
+        statistic, amount = self.statistics(clean)
+        base = self.model.readings(self.launches)
+        for h in np.argsort(-statistic)[:REFINED]:
+            if statistic[h] <= 0 or self.discrete[h]:
+                continue
+            name, place = self.hypotheses[h]
+            power = find(name).power
+            for _ in range(2):
+                size = amount[h] if power == 1 else np.sqrt(max(amount[h], 1e-300))
+                if not abs(size) > 0:
+                    break
+                change = self.model.readings(self.launches, [Cause(name, place, float(size))])
+                row = self.whitening.signature(np.nan_to_num(change - base) / amount[h])
+                row = self.projection.out(row)
+                found = _best(
+                    np.array([row @ clean]),
+                    np.array([row @ row]),
+                    self.cap[h : h + 1],
+                    self.discrete[h : h + 1],
+                )
+                statistic[h], amount[h] = found[0][0], found[1][0]
+        return statistic, amount
+
+    def _signatures(self) -> Array:
+        rows = np.empty((len(self.hypotheses), self.whitening.rows))
+        active = self.data.active[:, None, None]
+        for start in range(0, len(rows), CHUNK):
+            some = self.hypotheses[start : start + CHUNK]
+            change = np.nan_to_num(self.model.signatures(self.paths, some, self.launches)) * active
+            rows[start : start + CHUNK] = self.projection.out(self.whitening.signature(change))
+        return rows
+
+    def _threshold(self, seed: int) -> float:
+        """The largest statistic that noise reaches in 0.5 % of data sets: its simulated tail.
+
+        The largest of N independent chi-squares of one degree; N by maximum likelihood.
+        """
+        from scipy import stats
+
+        draws = np.random.default_rng([seed, 7]).standard_normal((DRAWS, self.whitening.rows))
+        inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
+        largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
+        number = max(DRAWS / -np.log1p(-stats.chi2.sf(largest, 1)).sum(), 1.0)
+        return float(stats.chi2.isf(-np.expm1(np.log1p(-FALSE_ALARM) / number), 1))
+
+
+def _best(
+    inner: Array, norm: Array, cap: Array, discrete: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    safe = np.where(norm > 1e-12, norm, np.inf)
+    amount = np.clip(inner / safe, -cap, cap)
+    amount = np.where(discrete, np.where(norm > 1e-12, 1.0, 0.0), amount)
+    return 2 * amount * inner - amount**2 * norm, amount
+
+
+def _without_dead(data: Data, truth: Truth, monitors: Sequence[str]) -> Data:
+    dropped = np.zeros(data.valid.shape, dtype=bool)
+    for cause in truth.causes:
+        if cause.effect == "monitor_dead":
+            dropped[:, monitors.index(str(cause.element))] = True
+    return data.without(dropped)
+
+
+def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
+    """What the oracle and the baselines say of a case, as JSON."""
+    case, truth = argument
+    oracle = Oracle(case, truth)
+    clean = oracle.residual(case.fit.in_order_of(oracle.model.maps.monitors).readings[:, 0])
+    statistic, amount = oracle.refined(clean)
+    quiet = oracle.residual(truth.clean["fit"])
+    if case.reference is not None:  # the reference's noise is in it: only the change counts
+        quiet = quiet - oracle.residual(truth.clean["before"])
+    left = None
+    if truth.unknown is not None:
+        best = oracle.refined(quiet)[0].max()
+        left = float(np.sqrt(max(float(quiet @ quiet) - best, 0.0)))
+    weight = statistic / 2 + np.array(_priors(oracle.hypotheses))
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    order = np.argsort(-weight)[:LISTED]
+    by_likelihood = np.argsort(-statistic)[:LISTED]
+
+    def listed(some: NDArray[np.intp]) -> list[dict[str, Any]]:
+        return [
+            {
+                "effect": oracle.hypotheses[h][0],
+                "element": oracle.hypotheses[h][1],
+                "statistic": float(statistic[h]),
+                "amount": float(np.sign(amount[h]) * abs(amount[h]) ** _root(oracle, h)),
+                "probability": float(weight[h]),
+            }
+            for h in some
+        ]
+
+    top = float(statistic.max())
+    return {
+        "oracle": {
+            "statistic": top,
+            "threshold": oracle.threshold,
+            "detected": bool(top > oracle.threshold),
+            "class_size": int((statistic > top - CLASS).sum()),
+            "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
+            "posterior": listed(order),
+        },
+        "residual": left,
+        "baselines": baselines(case),
+    }
+
+
+def _root(oracle: Oracle, h: np.intp) -> float:
+    return 1 / find(oracle.hypotheses[int(h)][0]).power
+
+
+def _priors(hypotheses: Sequence[Hypothesis]) -> list[float]:
+    """Effects are drawn evenly, then places."""
+    count: dict[str, int] = {}
+    for name, _ in hypotheses:
+        count[name] = count.get(name, 0) + 1
+    return [-float(np.log(len(count) * count[name])) for name, _ in hypotheses]
+
+
+# --- plain methods --------------------------------------------------------------------------------
+def baselines(case: Case) -> dict[str, list[dict[str, Any]]]:
+    """First guesses (three at most) of the SVD over all gradients, of OMP and of the LASSO."""
+    from sklearn.linear_model import Lasso, orthogonal_mp
+
+    ring = ring_of(case.lattice)
+    data = of_measurement(ring, case.fit)
+    model = Model(ring, data.settings)
+    whitening = Whitening(data)
+    launches = data.launches
+    for _ in range(4):
+        paths = model.paths(launches)
+        difference = np.where(data.valid, data.readings - paths.readings, 0.0)
+        residual = whitening.residual(difference, launches)
+        projection = Projection(whitening.launch(paths.launch))
+        moved = projection.coordinates(residual).reshape(data.shots, -1)
+        launches = launches.copy()
+        launches[:, whitening.columns] += moved
+    residual = projection.out(residual)
+    chosen = names(case.options.get("effects"))
+    hypotheses = model.hypotheses([n for n in chosen if n != "monitor_dead"])
+    parts = []
+    for start in range(0, len(hypotheses), CHUNK):
+        some = hypotheses[start : start + CHUNK]
+        change = np.nan_to_num(model.signatures(paths, some, launches))
+        parts.append(whitening.signature(change))
+    rows = np.concatenate(parts)
+    size = np.sqrt(np.einsum("hr,hr->h", rows, rows))
+    seen = np.flatnonzero(size > 0)
+    unit = (rows[seen] / size[seen, None]).T
+
+    def guess(order: Sequence[int]) -> list[dict[str, Any]]:
+        found = [hypotheses[i] for i in order]
+        return [{"effect": effect, "element": element} for effect, element in found]
+
+    out = {}
+    gradients = [i for i, (name, _) in enumerate(hypotheses) if name == "quadrupole_gradient"]
+    if gradients:
+        solved = np.linalg.pinv(rows[gradients].T, rcond=1e-2) @ residual
+        out["svd_gradients"] = guess([gradients[i] for i in np.argsort(-np.abs(solved))[:3]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # nearly equal columns: that is what makes them baselines
+        atoms = orthogonal_mp(unit, residual, n_nonzero_coefs=3)
+        level = np.sqrt(2 * np.log(len(seen)))  # the universal threshold
+        weights = np.zeros(len(seen))
+        strong = np.flatnonzero(np.abs(unit.T @ residual) >= level)  # the others stay out at first
+        if len(strong):
+            lasso = Lasso(alpha=level / len(residual), fit_intercept=False, max_iter=100, tol=1e-3)
+            weights[strong] = lasso.fit(unit[:, strong], residual).coef_
+    for name, values in (("omp", atoms), ("lasso", weights)):
+        order = np.argsort(-np.abs(values))[:3]
+        out[name] = guess([int(seen[i]) for i in order if values[i] != 0])
+    return out

@@ -1,0 +1,173 @@
+"""One case judged: an answer held against the truth, as one flat row of plain values.
+
+An answer is what the diagnosis, the oracle or a baseline said, in the diagnosis' own JSON.
+Places: two elements are within one monitor gap where at most one monitor stands between them.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tmlattice.effects import Cause, find
+from tmlattice.lattice import Ring
+
+Pair = tuple[str | None, str | None]
+
+ALIASED = 10.0
+"""An unknown whose residual after the best catalogue member is below this is aliased, in sigma."""
+
+REFUSED = ("located", "distributed")
+
+
+class Places:
+    """Where elements, families and monitors stand."""
+
+    def __init__(self, ring: Ring) -> None:
+        self.monitors = sorted(monitor.s for monitor in ring.monitors)
+        self.s: dict[str, list[float]] = {}
+        for element in ring.elements:
+            self.s.setdefault(element.name, []).append(element.s)
+        for element in ring.elements:
+            if element.kind == "quadrupole" and element.family not in self.s:
+                members = [e.s for e in ring.elements if e.family == element.family]
+                self.s[element.family] = members
+
+    def between(self, a: float, b: float) -> int:
+        """Monitors strictly between two positions."""
+        low, high = min(a, b), max(a, b)
+        return max(
+            bisect_left(self.monitors, high - 1e-9) - bisect_right(self.monitors, low + 1e-9), 0
+        )
+
+    def near(self, true: str | None, found: Sequence[float]) -> bool:
+        """Whether one of the positions is within one monitor gap of one of the element's."""
+        if true is None:
+            return False
+        return any(self.between(a, b) <= 1 for a in self.s[true] for b in found)
+
+    def of(self, element: str | None, s: float | None) -> list[float]:
+        """Positions of a finding."""
+        if element is not None and element in self.s:
+            return self.s[element]
+        return [] if s is None else [s]
+
+
+def pairs(finding: Mapping[str, Any]) -> list[Pair]:
+    """The credible set of a finding, likeliest first."""
+    return [(m["effect"], m["element"]) for m in finding["credible_set"]]
+
+
+def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places) -> dict[str, Any]:
+    """How one finding fits one true cause."""
+    true = (cause.effect, cause.element)
+    if finding is None:
+        keys = (
+            "place", "element_first", "element_in_three", "element_in_set", "effect_first",
+            "effect_in_set", "first", "in_set",
+        )  # fmt: skip
+        empty = {"elements": 0, "members": 0, "mass": None, "probability": None, "pull": None}
+        return dict.fromkeys(keys, False) | empty
+    members = pairs(finding)
+    elements = list(dict.fromkeys(element for _, element in members))
+    effects = list(dict.fromkeys(effect for effect, _ in members))
+    first = (finding["effect"], finding["element"])
+    if cause.element is None:
+        place = first == true  # the beam has no other place than its name
+    else:
+        place = places.near(cause.element, places.of(finding["element"], finding["s"]))
+    named = finding["effect"] is not None
+    pull = None
+    sigma = finding.get("amount_sigma")
+    if first == true and sigma and not find(cause.effect).discrete:
+        found, amount = float(finding["amount"]), cause.amount
+        if find(cause.effect).power == 2:
+            found, amount = abs(found), abs(amount)
+        pull = float((found - amount) / sigma)
+    return {
+        "place": place,
+        "element_first": named and finding["element"] == cause.element,
+        "element_in_three": named and cause.element in elements[:3],
+        "element_in_set": named and cause.element in elements,
+        "effect_first": finding["effect"] == cause.effect,
+        "effect_in_set": cause.effect in effects,
+        "first": first == true,
+        "in_set": true in members,
+        "elements": len(elements),
+        "members": len(members),
+        "mass": finding.get("mass"),
+        "probability": finding.get("probability"),
+        "pull": pull,
+    }
+
+
+def column(result: Mapping[str, Any], cause: Cause) -> str:
+    """The column of the confusion table."""
+    if not result["findings"]:
+        return "unknown" if result["verdict"] == "distributed" else "nothing"
+    finding = result["findings"][0]
+    if finding["effect"] is None:
+        return "unknown"
+    if finding["effect"] == cause.effect:
+        return cause.effect
+    if cause.effect in {effect for effect, _ in pairs(finding)}:
+        return "equivalent"
+    return str(finding["effect"])
+
+
+def stated(result: Mapping[str, Any], causes: Sequence[Cause]) -> list[tuple[float, bool]]:
+    """Every stated probability of a member of a credible set, and whether the member is true."""
+    true = {(cause.effect, cause.element) for cause in causes}
+    return [
+        (float(m["probability"]), (m["effect"], m["element"]) in true)
+        for finding in result["findings"]
+        for m in finding["credible_set"]
+    ]
+
+
+def exact(result: Mapping[str, Any], causes: Sequence[Cause]) -> bool:
+    """Every cause in the credible set of a finding of its own, and no finding without one."""
+    findings = list(result["findings"])
+    if len(findings) != len(causes):
+        return False
+    wanted = [{(c.effect, c.element)} for c in causes]
+    fits = np.array([[bool(w & set(pairs(f))) for f in findings] for w in wanted])
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(~fits)
+    return bool(fits[rows, columns].all())
+
+
+def oracle_answer(judged: Mapping[str, Any], ranking: str) -> dict[str, Any]:
+    """The oracle in the words of a diagnosis.
+
+    Args:
+        judged: see `judge`.
+        ranking: "class", all within a chi-square of 9, or "posterior", a 95 % credible set.
+    """
+    oracle = judged["oracle"]
+    members = list(oracle[ranking])
+    if ranking == "posterior":
+        total = np.cumsum([m["probability"] for m in members])
+        members = members[: int(np.searchsorted(total, 0.95)) + 1]
+    if not oracle["detected"]:
+        return {"verdict": "nothing", "findings": []}
+    first = members[0]
+    finding = {
+        **{key: first[key] for key in ("effect", "element", "amount", "probability")},
+        "s": None,
+        "amount_sigma": float(abs(first["amount"]) / np.sqrt(max(first["statistic"], 1e-300))),
+        "credible_set": members,
+        "mass": float(sum(m["probability"] for m in members)),
+    }
+    return {"verdict": "named" if len(members) == 1 else "equivalent", "findings": [finding]}
+
+
+def baseline_answer(guesses: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A baseline in the words of a diagnosis; it always finds something."""
+    if not guesses:
+        return {"verdict": "nothing", "findings": []}
+    members = [{**g, "probability": 1 / len(guesses)} for g in guesses]
+    finding = {**guesses[0], "s": None, "amount": None, "credible_set": members}
+    return {"verdict": "named", "findings": [finding]}

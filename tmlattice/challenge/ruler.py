@@ -1,0 +1,90 @@
+"""Signal to noise: the finite change of all fit readings over their noise, launches projected out.
+
+The noise is that of a reading, and on a machine with small errors everywhere that background too:
+then the change is measured in units of both (Mahalanobis), with a reference jointly with it.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.data import Data
+from tmlattice.diagnosis.model import Model
+from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.effects import Cause, Settings
+from tmlattice.lattice import Ring
+
+Array = NDArray[np.float64]
+
+UNKNOWN_LAUNCH = (np.inf, np.inf, np.inf, np.inf, 0.0)
+
+
+def background_signatures(
+    model: Model, launches: Array, rms: Mapping[str, float], paths: object = None
+) -> Array | None:
+    """tau_h s_h of every small error along these trajectories, [error, shot, reading, 2], m."""
+    found = paths or model.paths(launches)
+    parts = []
+    for name, size in rms.items():
+        hypotheses = model.hypotheses([name])
+        if hypotheses:
+            rows = model.signatures(found, hypotheses, launches)  # type: ignore[arg-type]
+            parts.append(size * np.nan_to_num(rows))
+    return np.concatenate(parts) if parts else None
+
+
+class Ruler:
+    """Measures changes of readings.
+
+    Args:
+        ring: the design.
+        launches: true ones, those of a reference first, [shot, 5].
+        settings: of each shot.
+        noise: rms of a reading, m.
+        background: rms of small errors, by effect.
+        reference: how many of the shots are from before the fault.
+    """
+
+    def __init__(
+        self,
+        ring: Ring,
+        launches: Array,
+        settings: Sequence[Settings],
+        noise: float,
+        background: Mapping[str, float] | None = None,
+        reference: int = 0,
+    ) -> None:
+        active = np.arange(len(launches)) >= reference
+        self.model = Model(ring, settings, active=active)
+        self.launches = launches
+        paths = self.model.paths(launches)
+        shape = paths.readings.shape
+        spread = background_signatures(self.model, launches, background or {}, paths)
+        data = Data(
+            np.zeros(shape),
+            np.ones(shape, dtype=bool),
+            np.full(shape, noise),
+            launches,
+            np.tile(UNKNOWN_LAUNCH, (len(launches), 1)),
+            tuple(settings),
+            1,
+            active,
+        )
+        self._whitening = Whitening(data, spread)
+        self._projection = Projection(self._whitening.launch(paths.launch))
+        self._base = self.model.readings(launches)
+        self._shape = shape
+        self._reference = reference
+
+    def size(self, change: Array) -> float:
+        """Signal to noise of a change of the readings after the fault, [shot, monitor, 2], m."""
+        whole = np.zeros(self._shape)
+        whole[self._reference :] = np.nan_to_num(change)
+        rows = self._projection.out(self._whitening.signature(whole))
+        return float(np.linalg.norm(rows))
+
+    def of(self, causes: Sequence[Cause]) -> float:
+        """Signal to noise of causes by the model: quick, and good for finding amounts."""
+        change = self.model.readings(self.launches, causes) - self._base
+        return self.size(change[self._reference :])

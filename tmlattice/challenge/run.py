@@ -1,0 +1,59 @@
+"""The diagnosis of every case, which knows the public part and nothing else."""
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+from tmlattice.batch import run_batch
+from tmlattice.challenge.case import Case, case_names, read_case, read_set, ring_of
+from tmlattice.diagnosis import diagnose
+
+log = logging.getLogger(__name__)
+
+
+def diagnose_case(case: Case) -> dict[str, Any]:
+    """The diagnosis of one case as JSON, and the seconds it took."""
+    ring = ring_of(case.lattice)
+    begun = time.perf_counter()
+    found = diagnose(
+        ring,
+        case.fit,
+        heldout=case.heldout,
+        reference=case.reference,
+        background=case.options.get("background"),
+        effects=case.options.get("effects"),
+    )
+    return {**found.as_json(), "seconds": time.perf_counter() - begun}
+
+
+def run(
+    folder: Path,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> dict[str, dict[str, Any]]:
+    """Diagnose every case of a challenge that has no result yet.
+
+    Args:
+        folder: of the challenge; its truth is not read and may be absent.
+        jobs, scheduler, progress: see `run_batch`.
+
+    Returns:
+        Results by case; a failed one has "error".
+    """
+    read_set(folder)
+
+    def load(name: str) -> Any:
+        return lambda: read_case(folder, name)
+
+    cases = {name: load(name) for name in case_names(folder)}
+    return run_batch(
+        diagnose_case,
+        cases,
+        folder / "results",
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )

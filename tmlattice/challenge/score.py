@@ -1,0 +1,410 @@
+"""The figures of merit of a challenge: the diagnosis beside the oracle and plain baselines."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from tmlattice.batch import finished, run_batch
+from tmlattice.challenge.case import (
+    Case,
+    Truth,
+    case_names,
+    read_case,
+    read_set,
+    read_truth,
+    ring_of,
+)
+from tmlattice.challenge.oracle import judge
+from tmlattice.challenge.record import (
+    ALIASED,
+    REFUSED,
+    Places,
+    baseline_answer,
+    column,
+    exact,
+    finding_row,
+    oracle_answer,
+    stated,
+)
+from tmlattice.diagnosis.data import of_measurement
+from tmlattice.diagnosis.gap import held_out_gap
+from tmlattice.diagnosis.model import Model
+from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.errors import TmlatticeError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement
+
+FORMAT = "tmlattice-challenge"
+
+BANDS = ((5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, 100.0001))
+
+RATES = (
+    "detected", "place", "element_first", "element_in_three", "element_in_set", "effect_first",
+    "effect_in_set", "first", "in_set",
+)  # fmt: skip
+"""Shares of cases, of all that were asked for: what was not detected is not right."""
+
+PROBABILITIES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
+
+Row = dict[str, Any]
+
+
+def score(
+    folder: Path,
+    *,
+    oracle: bool = True,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """All metrics of a challenge, in the format `tmlattice-challenge`.
+
+    Args:
+        folder: of the challenge, with results and truth.
+        oracle: with oracle and baselines, which take some seconds a case the first time.
+        jobs, scheduler, progress: of the oracle, see `run_batch`.
+
+    Raises:
+        TmlatticeError: no results.
+    """
+    from tmlattice import __version__
+
+    described = read_set(folder)
+    results = finished(folder / "results")
+    names = [name for name in case_names(folder) if name in results]
+    if not names:
+        raise TmlatticeError(f"'{folder}' has no results; `tmlattice challenge run` makes them")
+    truths = {name: read_truth(folder, name) for name in names}
+    judged: dict[str, dict[str, Any]] = {}
+    if oracle:
+
+        def load(name: str) -> Callable[[], tuple[Case, Truth]]:
+            return lambda: (read_case(folder, name), truths[name])
+
+        todo = {name: load(name) for name in names if described["tier"] != "C"}
+        judged = run_batch(
+            judge,
+            todo,
+            folder / "oracle",
+            jobs=jobs,
+            scheduler=scheduler,
+            progress=progress,
+        )
+    ring = ring_of(described["lattice"])
+    places = Places(ring)
+    rows = []
+    for name in names:
+        if "error" in results[name]:
+            continue
+        row = row_of(results[name], truths[name], judged.get(name), places)
+        row |= clean_gap(ring, read_case(folder, name).heldout, truths[name], results[name])
+        rows.append(row)
+    failed = {n: results[n]["error"] for n in names if "error" in results[n]}
+    failed |= {f"oracle {n}": r["error"] for n, r in judged.items() if "error" in r}
+    return {
+        "format": FORMAT,
+        "version": 1,
+        "package": __version__,
+        **{key: described[key] for key in ("tier", "lattice", "reference", "shots", "amount")},
+        "cases": len(names),
+        "failed": failed,
+        **summary(rows, described["tier"]),
+        "rows": rows,
+    }
+
+
+# --- a case ---------------------------------------------------------------------------------------
+def row_of(
+    result: Mapping[str, Any],
+    truth: Truth,
+    judged: Mapping[str, Any] | None,
+    places: Places,
+) -> Row:
+    """One case: what was there, what the diagnosis said, and oracle and baselines likewise."""
+    causes, unknown = truth.causes, truth.unknown
+    snr = truth.total if len(truth.signal_to_noise) != 1 else truth.signal_to_noise[0]
+    row: Row = {
+        "case": truth.name,
+        "causes": [vars(cause) for cause in causes],
+        "unknown": None if unknown is None else dict(unknown),
+        "signal_to_noise": snr if np.isfinite(snr) else None,
+        "verdict": result["verdict"],
+        "findings": len(result["findings"]),
+        "seconds": result.get("seconds"),
+        "closed": result["gap"]["closed"],
+        "heldout_chi2_per_dof": _after(result),
+        "stated": stated(result, causes),
+        "refused": _refused(result),
+    }
+    answers: dict[str, Mapping[str, Any]] = {"tool": result}
+    if judged is not None and "error" not in judged:
+        for ranking, name in (("class", "oracle"), ("posterior", "bayes_oracle")):
+            answers[name] = oracle_answer(judged, ranking)
+        for name, guesses in judged["baselines"].items():
+            answers[name] = baseline_answer(guesses)
+        row["residual"] = judged["residual"]
+        if unknown is not None and judged["residual"] is not None:
+            row["aliased"] = bool(judged["residual"] < ALIASED)
+    row["answers"] = {name: _answer(answer, truth, places) for name, answer in answers.items()}
+    if len(causes) == 1:
+        row["column"] = column(result, causes[0])
+    if len(causes) > 1:
+        row["exact"] = exact(result, causes)
+    return row
+
+
+def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
+    findings = list(answer["findings"])
+    first = findings[0] if findings else None
+    row: Row = {"detected": bool(findings) or answer["verdict"] == "distributed"}
+    if len(truth.causes) == 1:
+        return row | finding_row(first, truth.causes[0], places)
+    if truth.unknown is not None and truth.unknown.get("element"):
+        at = [] if first is None else places.of(first["element"], first["s"])
+        row["place"] = places.near(truth.unknown["element"], at)
+    return row
+
+
+def _refused(result: Mapping[str, Any]) -> bool:
+    """Whether something is there and the catalogue is said not to hold it."""
+    unnamed = any(finding["effect"] is None for finding in result["findings"])
+    return result["verdict"] in REFUSED or unnamed
+
+
+def _after(result: Mapping[str, Any]) -> float | None:
+    heldout = result["gap"]["heldout"]
+    return None if heldout is None else heldout["after"]["chi2_per_dof"]
+
+
+def clean_gap(
+    ring: Ring, heldout: Measurement, truth: Truth, result: Mapping[str, Any]
+) -> dict[str, float | None]:
+    """rms error on held-out readings without noise, design and with the findings in it, m.
+
+    In each shot the launch is fitted to one half of the monitors, the other half is scored.
+    """
+    if truth.background or not (truth.causes or truth.unknown):
+        return {"clean_before": None, "clean_after": None}
+    findings = [f for f in result["findings"] if f["effect"] is not None]
+    causes = [
+        Cause(f["effect"], f["element"], f["amount"])
+        for f in findings
+        if f["effect"] != "monitor_dead"
+    ]
+    data = of_measurement(ring, heldout)
+    clean = np.nan_to_num(truth.clean["heldout"])
+    dropped = np.zeros(data.valid.shape, dtype=bool)
+    monitors = [monitor.name for monitor in ring.monitors]
+    for cause in truth.causes:
+        if cause.effect == "monitor_dead":
+            dropped[:, monitors.index(str(cause.element))] = True
+    data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
+    gap = held_out_gap([Model(ring, data.settings)] * 2, data, [(), causes])
+    return {"clean_before": gap.misfits[0].rms, "clean_after": gap.misfits[-1].rms}
+
+
+# --- all cases ------------------------------------------------------------------------------------
+def rate(flags: Sequence[bool]) -> dict[str, Any]:
+    """A share with its 95 % interval (Wilson)."""
+    k, n = int(sum(flags)), len(flags)
+    if not n:
+        return {"share": None, "cases": 0, "interval": None}
+    interval = stats.binomtest(k, n).proportion_ci(0.95, "wilson")
+    return {"share": k / n, "cases": n, "interval": [float(interval.low), float(interval.high)]}
+
+
+def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
+    """All metrics of the rows."""
+    seconds = [row["seconds"] for row in rows if row["seconds"] is not None]
+    out: dict[str, Any] = {
+        "seconds": _quantiles(seconds),
+        "verdicts": dict(Counter(row["verdict"] for row in rows)),
+    }
+    if tier == "E":
+        out["false_alarms"] = rate([row["verdict"] != "nothing" for row in rows])
+        out["oracle_false_alarms"] = rate(
+            [row["answers"]["oracle"]["detected"] for row in rows if "oracle" in row["answers"]]
+        )
+        return out
+    out["detection"] = detection(rows)
+    if tier == "C":
+        out["exact"] = rate([bool(row["exact"]) for row in rows])
+        out["clean_gap_closed"] = _closed(rows)
+        return out
+    if tier == "D":
+        return out | _unknowns(rows)
+    clear = [row for row in rows if (row["signal_to_noise"] or np.inf) >= 10]
+    out["methods"] = methods(clear)
+    out["bands"] = {
+        f"{low:g}-{round(high):g}": methods(
+            [r for r in rows if low <= (r["signal_to_noise"] or 0) < high]
+        )
+        for low, high in BANDS
+    }
+    out["bands"]["above 20"] = methods([r for r in rows if (r["signal_to_noise"] or 0) >= 20])
+    effects = [name for name in CATALOGUE if any(_effect(row) == name for row in rows)]
+    out["effects"] = {
+        name: methods([row for row in clear if _effect(row) == name]) for name in effects
+    }
+    out["confusion"] = confusion(rows)
+    out["calibration"] = calibration(rows)
+    out["coverage"] = coverage(clear)
+    out["pulls"] = pulls([row["answers"]["tool"]["pull"] for row in rows])
+    out["clean_gap_closed"] = _closed(clear)
+    strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
+    out["clean_gap_closed_above_20"] = _closed(strong)
+    out["false_refusals"] = rate([row["refused"] for row in clear])
+    out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
+    out["relative_to_oracle"] = _relative(clear)
+    return out
+
+
+def _effect(row: Row) -> str | None:
+    return row["causes"][0]["effect"] if len(row["causes"]) == 1 else None
+
+
+def methods(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Every rate, by method."""
+    found = dict.fromkeys(name for row in rows for name in row["answers"])
+    return {
+        name: {
+            key: rate([row["answers"][name][key] for row in rows if name in row["answers"]])
+            for key in RATES
+        }
+        for name in found
+    }
+
+
+def detection(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Share detected by signal to noise, tool and oracle."""
+    edges = np.geomspace(5, 100, 8)
+    out = []
+    for low, high in pairwise(edges.tolist()):
+        some = [r for r in rows if low <= (r["signal_to_noise"] or 0) < high * (1 + 1e-9)]
+        entry: dict[str, Any] = {"from": float(low), "to": float(high)}
+        for name in ("tool", "oracle"):
+            flags = [r["answers"][name]["detected"] for r in some if name in r["answers"]]
+            entry[name] = rate(flags)
+        out.append(entry)
+    return out
+
+
+def confusion(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
+    """True effect -> column -> cases; beside the effects stand equivalent, unknown, nothing."""
+    table: dict[str, Counter[str]] = {}
+    for row in rows:
+        name = _effect(row)
+        if name is not None:
+            table.setdefault(name, Counter())[row["column"]] += 1
+    return {name: dict(table[name]) for name in CATALOGUE if name in table}
+
+
+def calibration(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Members of credible sets by their stated probability: its mean, and how many are true."""
+    both = [pair for row in rows for pair in row["stated"]]
+    out = []
+    for low, high in pairwise(PROBABILITIES):
+        some = [pair for pair in both if low <= pair[0] < (high if high < 1 else 2)]
+        mean = float(np.mean([p for p, _ in some])) if some else None
+        out.append({"from": low, "to": high, "stated": mean, "true": rate([t for _, t in some])})
+    return out
+
+
+def coverage(rows: Sequence[Row]) -> dict[str, Any]:
+    """Credible sets of named findings: how many hold the truth, beside their stated mass."""
+    named = [r["answers"]["tool"] for r in rows if r["answers"]["tool"]["mass"]]
+    strong = [
+        r["answers"]["tool"]
+        for r in rows
+        if r["answers"]["tool"]["mass"] and (r["signal_to_noise"] or 0) >= 20
+    ]
+    oracle = [
+        (r["answers"]["tool"]["members"], r["answers"]["oracle"]["members"])
+        for r in rows
+        if "oracle" in r["answers"] and r["answers"]["tool"]["members"]
+    ]
+    return {
+        "holds_truth": rate([a["in_set"] for a in named]),
+        "mean_stated_mass": float(np.mean([a["mass"] for a in named])) if named else None,
+        "median_elements": float(np.median([a["elements"] for a in strong])) if strong else None,
+        "median_members": float(np.median([a["members"] for a in strong])) if strong else None,
+        "no_larger_than_oracle": rate([tool <= own for tool, own in oracle]),
+    }
+
+
+def pulls(values: Sequence[float | None]) -> dict[str, Any]:
+    """Mean and width of (amount - true) / error; the width also without the outer 5 %."""
+    there = np.array([v for v in values if v is not None])
+    if len(there) < 2:
+        return {"cases": len(there), "mean": None, "width": None, "robust_width": None}
+    low, high = np.quantile(there, [0.15865, 0.84135])
+    return {
+        "cases": len(there),
+        "mean": float(there.mean()),
+        "width": float(there.std(ddof=1)),
+        "robust_width": float(high - low) / 2,
+    }
+
+
+def _closed(rows: Sequence[Row]) -> dict[str, Any]:
+    """Where something is to be seen: error on clean held-out readings at most 5 % of before.
+
+    An amount known to 1 / (signal to noise) leaves that share of the gap: nobody reaches 5 % at a
+    signal to noise of 10. `of_the_floor` is the share left in units of that.
+    """
+    ratios, floors = [], []
+    for row in rows:
+        oracle = row["answers"].get("oracle")
+        if row["clean_before"] and (oracle is None or oracle["detected"]):
+            ratios.append(row["clean_after"] / row["clean_before"])
+            if row["signal_to_noise"]:
+                floors.append(ratios[-1] * row["signal_to_noise"])
+    return {
+        "within_5_percent": rate([ratio <= 0.05 for ratio in ratios]),
+        "within_10_percent": rate([ratio <= 0.10 for ratio in ratios]),
+        "ratio": _quantiles(ratios),
+        "of_the_floor": _quantiles(floors),
+        "chi2_per_dof": _quantiles([r["heldout_chi2_per_dof"] for r in rows if r["findings"]]),
+    }
+
+
+def _unknowns(rows: Sequence[Row]) -> dict[str, Any]:
+    def kind(row: Row) -> str:
+        name = str(row["unknown"]["kind"])
+        return f"without {row['causes'][0]['effect']}" if name == "taken_out" else name
+
+    def both(some: Sequence[Row]) -> dict[str, Any]:
+        clear = [row for row in some if not row.get("aliased", False)]
+        return {
+            "refused": rate([row["refused"] for row in clear]),
+            "place": rate([row["answers"]["tool"].get("place", False) for row in clear]),
+            "aliased": rate([bool(row.get("aliased", False)) for row in some]),
+        }
+
+    kinds = dict.fromkeys(kind(row) for row in rows)
+    return {
+        "unknown": both(rows),
+        "kinds": {name: both([row for row in rows if kind(row) == name]) for name in kinds},
+    }
+
+
+def _relative(rows: Sequence[Row]) -> dict[str, Any]:
+    """Of the cases in which the oracle is right first, those in which the tool is too."""
+    out = {}
+    for key in ("element_first", "effect_first", "first"):
+        own = [r for r in rows if "oracle" in r["answers"] and r["answers"]["oracle"][key]]
+        out[key] = rate([row["answers"]["tool"][key] for row in own])
+    return out
+
+
+def _quantiles(values: Sequence[float | None]) -> dict[str, float | None]:
+    there = [v for v in values if v is not None and np.isfinite(v)]
+    if not there:
+        return {"median": None, "p90": None, "p95": None, "largest": None}
+    cuts = np.quantile(there, [0.5, 0.9, 0.95, 1.0])
+    return dict(zip(("median", "p90", "p95", "largest"), map(float, cuts), strict=True))

@@ -1,0 +1,236 @@
+"""`tmlattice challenge`: the diagnosis checked on data whose cause is withheld."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tmlattice.cli.options import FILE, console, json_option, quiet_option, table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+METHODS = {
+    "tool": "diagnose",
+    "oracle": "oracle",
+    "bayes_oracle": "oracle, with prior",
+    "svd_gradients": "SVD, gradients",
+    "omp": "matching pursuit",
+    "lasso": "LASSO",
+}
+
+
+@click.group("challenge")
+def challenge() -> None:
+    """Check the diagnosis on data whose cause is withheld: make cases, run, score."""
+
+
+def _cluster_options(function: Any) -> Any:
+    for decorate in (
+        click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler instead."),
+        click.option("--jobs", type=click.IntRange(1), help="Local processes; else one a core."),
+    ):
+        function = decorate(function)
+    return function
+
+
+@challenge.command("make")
+@click.argument("tier", type=click.Choice(["A", "B", "C", "D", "E"], case_sensitive=False))
+@click.option("--cases", type=click.IntRange(1), default=300, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
+@click.option("--lattice", default="petra3", show_default=True)
+@click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
+@click.option(
+    "--shots",
+    type=click.IntRange(1),
+    default=4,
+    show_default=True,
+    help="Of the fit; two more are held out.",
+)
+@click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
+@click.option(
+    "--signal",
+    type=float,
+    nargs=2,
+    default=(5.0, 100.0),
+    show_default=True,
+    help="Smallest and largest signal to noise, log-uniform.",
+)
+@click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
+@quiet_option
+def make(tier: str, folder: Path, quiet: bool, effects: tuple[str, ...], **options: Any) -> None:
+    """Make cases of a TIER: A one effect, B one among small errors everywhere, C two or three,
+    D one that the catalogue does not hold, E none.
+
+    AT is the real machine. The truth goes to the folder's `truth`, which only `score` opens.
+    """  # fmt: skip
+    from tmlattice.challenge import make as make_cases
+
+    lost = make_cases(
+        tier.upper(), folder=folder, effects=effects or None, progress=not quiet, **options
+    )
+    if not quiet:
+        screen = console()
+        screen.print(f"{options['cases']} cases of tier {tier.upper()} in {folder}")
+        if lost:
+            rows = ", ".join(f"{name} {count}" for name, count in sorted(lost.items()))
+            screen.print(f"drawn anew, for they cannot reach the smallest signal to noise: {rows}")
+
+
+@challenge.command("run")
+@click.argument("folder", type=FILE)
+@_cluster_options
+@quiet_option
+def run(folder: Path, jobs: int | None, scheduler: str | None, quiet: bool) -> None:
+    """Diagnose every case in FOLDER that has no result yet; the truth is not read."""
+    from tmlattice.challenge import run as run_cases
+
+    results = run_cases(folder, jobs=jobs, scheduler=scheduler, progress=not quiet)
+    failed = {name: result["error"] for name, result in results.items() if "error" in result}
+    if not quiet:
+        screen = console()
+        screen.print(f"{len(results) - len(failed)} of {len(results)} cases diagnosed")
+        for name, error in failed.items():
+            screen.print(f"case {name}: {error}")
+
+
+@challenge.command("score")
+@click.argument("folder", type=FILE)
+@click.option("--out", type=FILE, metavar="DIR", help="Figures: confusion, calibration, detection.")
+@click.option(
+    "--oracle/--no-oracle",
+    default=True,
+    show_default=True,
+    help="With the oracle and plain baselines, some seconds a case the first time.",
+)
+@_cluster_options
+@json_option
+@quiet_option
+def score(
+    folder: Path,
+    out: Path | None,
+    oracle: bool,
+    jobs: int | None,
+    scheduler: str | None,
+    json_file: Path | None,
+    quiet: bool,
+) -> None:
+    """Hold the results in FOLDER against the truth, beside oracle and baselines."""
+    from tmlattice.challenge import score as score_cases
+    from tmlattice.files import output_file, output_folder, write_json
+
+    with (
+        output_file(json_file) if json_file else nullcontext() as path,
+        output_folder(out) if out else nullcontext() as figures,
+    ):
+        result = score_cases(
+            folder, oracle=oracle, jobs=jobs, scheduler=scheduler, progress=not quiet
+        )
+        if path:
+            write_json(path, result)
+        if figures:
+            from tmlattice.plots.challenge import save_challenge
+
+            save_challenge(result, figures)
+    if not quiet:
+        print_score(console(), result)
+
+
+def _share(rate: dict[str, Any] | None) -> str:
+    if not rate or rate["share"] is None:
+        return "-"
+    low, high = rate["interval"]
+    return f"{rate['share']:.1%} ({low:.0%}-{high:.0%})"
+
+
+def _number(value: float | None, form: str = "{:.3g}") -> str:
+    return "-" if value is None else form.format(value)
+
+
+def print_score(screen: "Console", result: dict[str, Any]) -> None:
+    """The tables."""
+    more = " with a reference" if result["reference"] else ""
+    screen.print(f"tier {result['tier']}{more}: {result['cases']} cases, "
+                 f"{len(result['failed'])} failed; median "
+                 f"{_number(result['seconds']['median'])} s a case")  # fmt: skip
+    verdicts = ", ".join(f"{name} {count}" for name, count in result["verdicts"].items())
+    screen.print(f"verdicts: {verdicts}")
+    for key, title in (
+        ("false_alarms", "false alarms"),
+        ("oracle_false_alarms", "false alarms of the oracle"),
+        ("exact", "all causes found, up to equivalence"),
+        ("false_refusals", "false refusals"),
+        ("more_than_one_finding", "more than one finding"),
+    ):
+        if key in result:
+            screen.print(f"{title}: {_share(result[key])} of {result[key]['cases']}")
+    for title, methods in _method_tables(result):
+        _print_methods(screen, title, methods)
+    if "detection" in result:
+        shown = table("signal to noise", "detected", "oracle", "cases")
+        for entry in result["detection"]:
+            span = f"{entry['from']:.0f} to {entry['to']:.0f}"
+            shown.add_row(span, _share(entry["tool"]), _share(entry["oracle"]),
+                          str(entry["tool"]["cases"]))  # fmt: skip
+        screen.print(shown)
+    if "effects" in result:
+        keys = ("place", "element_first", "element_in_set", "effect_first", "effect_in_set")
+        shown = table("effect, signal to noise >= 10", *(key.replace("_", " ") for key in keys))
+        for name, methods in result["effects"].items():
+            if "tool" in methods:
+                shown.add_row(name, *(_plain(methods["tool"][key]) for key in keys))
+        screen.print(shown)
+    if "coverage" in result:
+        _print_sets(screen, result)
+    if "kinds" in result:
+        shown = table("unknown, not aliased", "refused", "place", "aliased", "cases")
+        for name, entry in {"all": result["unknown"], **result["kinds"]}.items():
+            shown.add_row(name, _share(entry["refused"]), _share(entry["place"]),
+                          _plain(entry["aliased"]), str(entry["aliased"]["cases"]))  # fmt: skip
+        screen.print(shown)
+
+
+def _plain(rate: dict[str, Any]) -> str:
+    return "-" if rate["share"] is None else f"{rate['share']:.0%} of {rate['cases']}"
+
+
+def _method_tables(result: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    if "methods" not in result:
+        return []
+    bands = [(f"signal to noise {name}", entry) for name, entry in result["bands"].items()]
+    return [("signal to noise >= 10", result["methods"]), *bands]
+
+
+def _print_methods(screen: "Console", title: str, methods: dict[str, Any]) -> None:
+    if not methods:
+        return
+    names = [name for name in METHODS if name in methods]
+    shown = table(title, *(METHODS[name] for name in names))
+    for key in methods[names[0]]:
+        shown.add_row(
+            key.replace("_", " "), *(_number(methods[n][key]["share"], "{:.1%}") for n in names)
+        )
+    screen.print(shown)
+
+
+def _print_sets(screen: "Console", result: dict[str, Any]) -> None:
+    coverage, pulls, closed = result["coverage"], result["pulls"], result["clean_gap_closed"]
+    screen.print(
+        f"credible sets hold the truth in {_share(coverage['holds_truth'])}, stated "
+        f"{_number(coverage['mean_stated_mass'], '{:.1%}')}; median "
+        f"{_number(coverage['median_elements'])} elements at signal to noise >= 20; no larger than "
+        f"the oracle's class in {_share(coverage['no_larger_than_oracle'])}"
+    )
+    screen.print(
+        f"pulls of {pulls['cases']} amounts: mean {_number(pulls['mean'], '{:+.2f}')}, width "
+        f"{_number(pulls['width'], '{:.2f}')} (central 68 %: "
+        f"{_number(pulls['robust_width'], '{:.2f}')})"
+    )
+    screen.print(
+        f"error on held-out readings without noise: median {_number(closed['ratio']['median'])} of "
+        f"that before; at most 5 % in {_share(closed['within_5_percent'])}"
+    )
+    own = result["relative_to_oracle"]["element_first"]
+    screen.print(f"element first where the oracle has it first: {_share(own)}")
