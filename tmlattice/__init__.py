@@ -24,6 +24,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from tmlattice.effects import CATALOGUE as CATALOGUE
     from tmlattice.effects import Cause as Cause
+    from tmlattice.diagnosis import Diagnosis as Diagnosis
+    from tmlattice.diagnosis import diagnose as diagnose
     from tmlattice.errors import TmlatticeError as TmlatticeError
     from tmlattice.fitting import FitResult as FitResult
     from tmlattice.fitting import TuneFit as TuneFit
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
     from tmlattice.optics import twiss as twiss
 
 _HOME = {
+    "diagnosis": ["Diagnosis", "diagnose"],
     "effects": ["CATALOGUE", "Cause"],
     "errors": ["TmlatticeError"],
     "harmonics": ["Tunes", "tunes"],
