@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from tmlattice.effects import CATALOGUE as CATALOGUE
-    from tmlattice.effects import Cause as Cause
     from tmlattice.diagnosis import Diagnosis as Diagnosis
     from tmlattice.diagnosis import diagnose as diagnose
+    from tmlattice.effects import CATALOGUE as CATALOGUE
+    from tmlattice.effects import Cause as Cause
     from tmlattice.errors import TmlatticeError as TmlatticeError
     from tmlattice.fitting import FitResult as FitResult
     from tmlattice.fitting import TuneFit as TuneFit
