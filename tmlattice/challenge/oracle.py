@@ -20,7 +20,8 @@ from tmlattice.challenge.ruler import background_signatures
 from tmlattice.diagnosis.data import Data, joined, of_measurement
 from tmlattice.diagnosis.model import Hypothesis, Model
 from tmlattice.diagnosis.whitening import Projection, Whitening
-from tmlattice.effects import Cause, find, names
+from tmlattice.effects import Cause, RingEffect, find, names
+from tmlattice.machine import draw_background
 
 Array = NDArray[np.float64]
 
@@ -51,9 +52,27 @@ class Oracle:
             launches = np.concatenate([truth.launches["reference"], launches])
         self.data = _without_dead(data, truth, [m.name for m in ring.monitors])
         self.launches = launches
-        self.model = Model(ring, data.settings, active=data.active)
-        self.paths = self.model.paths(launches)
+        # Small errors make an orbit of millimetres: a gradient kicks by that orbit, not by the
+        # design's. The oracle is linear about the machine as it was before the fault; its data are
+        # those of the linear model of the small errors.
+        small = draw_background(ring, truth.background, truth.seed)
+        set_there = {name for setting in data.settings for name in setting}
+        known, self.small = [], []  # in the ring for good, and with every reading
+        for cause in small:
+            if cause.effect == "corrector_calibration":  # acts on what a shot has set
+                self.small += [cause] * (cause.element in set_there)
+            elif isinstance(find(cause.effect), RingEffect):
+                known.append(cause)
+            else:
+                self.small.append(cause)
+        self.model = Model(ring, data.settings, known=known)
+        self.paths = self.model.paths(launches, self.small)
         spread = background_signatures(self.model, launches, truth.background, self.paths)
+        self.linear = np.zeros(self.paths.readings.shape)
+        if spread is not None:
+            rms = np.array([truth.background[cause.effect] for cause in small])
+            amounts = np.array([cause.amount for cause in small])
+            self.linear = np.einsum("h,hsrp->srp", amounts / rms, spread)
         self.whitening = Whitening(self.data, spread)
         self.projection = Projection(self.whitening.launch(self.paths.launch))
         chosen = names(case.options.get("effects"))
@@ -68,7 +87,7 @@ class Oracle:
         """Whitened rows of the readings of the fit, with those of a reference as they are."""
         whole = self.data.readings.copy()
         whole[self.data.active] = np.nan_to_num(readings)
-        difference = np.where(self.data.valid, whole - self.paths.readings, 0.0)
+        difference = np.where(self.data.valid, whole - self.paths.readings + self.linear, 0.0)
         return self.projection.out(self.whitening.residual(difference, self.launches))
 
     def statistics(self, clean: Array) -> tuple[Array, Array]:
@@ -79,7 +98,8 @@ class Oracle:
     def refined(self, clean: Array) -> tuple[Array, Array]:
         """The same, of the leading ones by their finite changes."""
         statistic, amount = self.statistics(clean)
-        base = self.model.readings(self.launches)
+        base = self.model.readings(self.launches, self.small)
+        active = self.data.active[:, None, None]
         for h in np.argsort(-statistic)[:REFINED]:
             if statistic[h] <= 0 or self.discrete[h]:
                 continue
@@ -89,8 +109,9 @@ class Oracle:
                 size = amount[h] if power == 1 else np.sqrt(max(amount[h], 1e-300))
                 if not abs(size) > 0:
                     break
-                change = self.model.readings(self.launches, [Cause(name, place, float(size))])
-                row = self.whitening.signature(np.nan_to_num(change - base) / amount[h])
+                causes = [*self.small, Cause(name, place, float(size))]
+                change = (self.model.readings(self.launches, causes) - base) * active
+                row = self.whitening.signature(np.nan_to_num(change) / amount[h])
                 row = self.projection.out(row)
                 found = _best(
                     np.array([row @ clean]),
