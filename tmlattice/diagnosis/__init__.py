@@ -6,6 +6,6 @@
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 
-from tmlattice.diagnosis.diagnose import Diagnosis, Finding, Member, diagnose
+from tmlattice.diagnosis.procedure import Diagnosis, Finding, Member, diagnose
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose"]
