@@ -108,7 +108,8 @@ def test_an_effect_leaves_the_given_ring_unchanged(petra3, name):
     before = ring_matrix(petra3)
     errors = [element.errors for element in petra3.elements]
     k1 = [element.k1 for element in petra3.elements]
-    apply(petra3, [Cause(name, PLACES[name][0], 0.3 * CATALOGUE[name].largest)], SETTINGS)
+    amount = 1.0 if CATALOGUE[name].discrete else 0.3 * CATALOGUE[name].largest
+    apply(petra3, [Cause(name, PLACES[name][0], amount)], SETTINGS)
     assert np.array_equal(ring_matrix(petra3), before)
     assert [element.errors for element in petra3.elements] == errors
     assert [element.k1 for element in petra3.elements] == k1
@@ -258,6 +259,7 @@ def test_energy_spread_is_a_gaussian_average():
         (Cause("energy_offset", "qd::12", 0.1), EffectError, "leave 'qd::12' out"),
         (Cause("monitor_gain_x", "qd::12", 0.1), EffectError, "monitors"),
         (Cause("quadrupole_gradient", "qd::12", float("nan")), EffectError, "give a number"),
+        (Cause("monitor_swap", "bpm_a4_3", 0.3), EffectError, "there or not"),
     ],
 )
 def test_impossible_causes_are_refused_with_the_mend(petra3, cause, error, says):
