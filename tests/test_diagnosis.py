@@ -207,7 +207,7 @@ def test_evidence_vs_integration(small_ring):
 
 
 def test_held_out_gap_vs_noise_free_truth(petra3):
-    """What the repaired model predicts of held-out shots is the truth's, to a third of the noise."""
+    """What the repaired ring predicts of held-out shots is the truth's to a third of the noise."""
     fault = Cause("quadrupole_gradient", "qd::12", -0.2)
     noisy = simulate(petra3, [fault], shots=6, seed=5)
     quiet = simulate(petra3, [fault], shots=6, seed=5, noise=1e-12).measurement()
