@@ -71,7 +71,7 @@ def test_tune_fit_prints_the_table_and_writes_three_figures(outcome):
                   "rms [µm]", "noise", "seconds"):  # fmt: skip
         assert words in done.stdout
     assert sorted(p.name for p in (folder / "figures").iterdir()) == [
-        "loss.png", "orbit.png", "spectrum.png", "tune-fit.json"
+        "loss.png", "network.pt", "orbit.png", "spectrum.png", "tune-fit.json"
     ]  # fmt: skip
     for name in ("loss", "orbit", "spectrum"):
         assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -357,3 +357,28 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
     assert heights == pytest.approx([1e6 * m.rms for m in diagnosis.heldout.misfits])
     assert ax.lines[0].get_ydata()[0] == pytest.approx(2.0)
     plt.close(ax.figure)
+
+
+def test_a_fine_tuned_network_is_read_as_physics(folders, tmp_path):
+    fitted = subprocess.run(
+        [sys.executable, "-m", "tmlattice", "tune-fit", SMALL, "--measurement", folders / "weak",
+         "--epochs", "50", "--out", "fit"],
+        cwd=tmp_path, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert "network.pt" in fitted.stdout
+    for network, code, words in (
+        ("fit/network.pt", 0, "the network's weights changed most at"),
+        ("fit/tune-fit.json", 2, "does not hold the weights of a network"),
+        ("nowhere.pt", 2, "nowhere.pt"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "tmlattice", "diagnose", SMALL, folders / "weak",
+             "--network", network, "--out", f"out-{code}"],
+            cwd=tmp_path, check=False, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == code, done.stderr
+        assert words in done.stdout + done.stderr
+    reading = json.loads((tmp_path / "out-0" / "weights.json").read_text())
+    assert reading
+    assert (tmp_path / "out-0" / "weights.png").read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "out-2").exists()

@@ -19,6 +19,8 @@ from tmlattice.cli.options import (
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
+    from tmlattice.diagnosis.weights import WeightReading
+    from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
 
 
@@ -54,6 +56,12 @@ if TYPE_CHECKING:
     type=NameList(),
     help="Look for these alone; else for the whole catalogue (`tmlattice effects`).",
 )
+@click.option(
+    "--network",
+    type=FILE,
+    metavar="FILE",
+    help="network.pt of `tune-fit`: read what its weights changed as physics.",
+)
 @click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
 @click.option(
     "--seed",
@@ -78,6 +86,7 @@ def diagnose(
     reference: Path | None,
     background: tuple[tuple[str, float | None], ...],
     effects: tuple[str, ...] | None,
+    network: Path | None,
     json_file: Path | None,
     out: Path | None,
     quiet: bool,
@@ -109,6 +118,10 @@ def diagnose(
                 ring, data, before, measurement, reference,
                 background=dict(background) or None, effects=effects, progress=progress, **options,
             )  # fmt: skip
+            reading = None
+            if network:
+                progress("network")
+                reading = _weights(ring, network, data)
             document = result.as_json()
             provenance = {**document["provenance"], "measurement": str(measurement)}
             document["provenance"] = provenance
@@ -116,10 +129,46 @@ def diagnose(
                 progress("figures")
                 _write_folder(result, folder, provenance)
                 write_json(folder / "diagnosis.json", document)
+                if reading:
+                    _write_weights(reading, folder)
             if extra:
                 write_json(extra, document)
     if not quiet:
         _print(result, out, json_file)
+        if reading:
+            _print_weights(ring, reading)
+
+
+def _weights(ring: "Ring", path: Path, data: "Measurement") -> "WeightReading":
+    from tmlattice.diagnosis.weights import read_network
+    from tmlattice.network import load_network
+
+    return read_network(ring, load_network(ring, path), data)
+
+
+def _write_weights(reading: "WeightReading", folder: Path) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from tmlattice.files import write_json
+    from tmlattice.plots import plot_weights
+
+    figure = plot_weights(reading)
+    figure.savefig(folder / "weights.png", dpi=150)
+    plt.close(figure)
+    write_json(folder / "weights.json", reading.as_json())
+
+
+def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
+    magnets = ring.magnets
+    raw, score = (magnets[int(reading.places(by)[0])] for by in ("raw", "score"))
+    console().print(
+        f"\nthe network's weights changed most at {raw.name} (s = {raw.s:.2f} m); in units of "
+        f"their error, at {score.name} (s = {score.s:.2f} m)",
+        soft_wrap=True,
+    )
 
 
 def _trajectories(path: Path) -> "Measurement":

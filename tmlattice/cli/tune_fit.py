@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     default="tune-fit",
     show_default=True,
     metavar="DIR",
-    help="Folder for the three figures and tune-fit.json.",
+    help="Folder for the three figures, tune-fit.json and network.pt.",
 )
 @recipe_options
 @json_option
@@ -81,6 +81,7 @@ def tune_fit(
         extra = files.enter_context(output_file(json_file)) if json_file else None
         from tmlattice.fitting import tune_fit as run
         from tmlattice.lattice import load_ring
+        from tmlattice.network import save_network
 
         if measurement is None:
             ring = load_ring(lattice, sequence, energy)
@@ -91,6 +92,7 @@ def tune_fit(
             outcome = _fit(ring, data, measurement, quiet, options)
         _draw(outcome, folder)
         result = outcome.as_json()
+        save_network(outcome.fit.network, folder / "network.pt")
         for path in (folder / "tune-fit.json", extra):
             if path:
                 write_json(path, result)
@@ -213,5 +215,5 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
         f"{fit.options['regularization_rate']:g}, learning rate {fit.options['learning_rate']:g}, "
         f"seed {outcome.seed}"
     )
-    written = f"{out}/: orbit.png, spectrum.png, loss.png, tune-fit.json"
+    written = f"{out}/: orbit.png, spectrum.png, loss.png, tune-fit.json, network.pt"
     screen.print(f"written: {written}" + (f"; {json_file}" if json_file else ""))

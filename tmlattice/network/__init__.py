@@ -7,7 +7,15 @@
 """
 
 from tmlattice.network.network import TaylorNetwork
+from tmlattice.network.stored import load_network, save_network
 from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
 from tmlattice.network.symplectic_network import SymplecticNetwork
 
-__all__ = ["SymplecticNetwork", "TaylorNetwork", "penalty_parts", "symplectic_penalty"]
+__all__ = [
+    "SymplecticNetwork",
+    "TaylorNetwork",
+    "load_network",
+    "penalty_parts",
+    "save_network",
+    "symplectic_penalty",
+]

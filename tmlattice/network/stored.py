@@ -1,0 +1,35 @@
+"""A network's weights as a file."""
+
+from pathlib import Path
+
+import torch
+
+from tmlattice.errors import TmlatticeError
+from tmlattice.lattice.ring import Ring
+from tmlattice.network.network import TaylorNetwork
+
+
+def save_network(network: torch.nn.Module, path: Path) -> None:
+    """Write the parameters (W0, W1, W2) with torch; the lattice is not among them."""
+    torch.save(network.state_dict(), path)
+
+
+def load_network(ring: Ring, path: Path) -> TaylorNetwork:
+    """The network of a ring with the weights of a file (tensors alone: nothing in it is run).
+
+    Raises:
+        TmlatticeError: no such file, no network's, or one of a ring of other magnets.
+    """
+    try:
+        weights = torch.load(path, weights_only=True)
+        dimension = int(weights["W0"].shape[1])
+        network = TaylorNetwork.from_ring(ring, dimension)
+        network.load_state_dict(weights)
+    except OSError:
+        raise
+    except Exception as error:
+        raise TmlatticeError(
+            f"'{path}' does not hold the weights of a network of '{ring.name}'; name the "
+            "network.pt that `tmlattice tune-fit` wrote for this lattice"
+        ) from error
+    return network
