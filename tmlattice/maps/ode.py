@@ -299,7 +299,9 @@ def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
         so_far = taylor_map_of_ode(terms, degree, time).coefficients[degree]
         # d W_k / dt = A W_k + P_k x^[k](t), and x^[k] moves with `derivation`
         derivation = _derivation(A, degree)
-        generator = np.kron(np.eye(n), derivation.T) - np.kron(A, np.eye(b - a))
+        generator = np.asarray(
+            np.kron(np.eye(n), derivation.T) - np.kron(A, np.eye(b - a)), dtype=np.float64
+        )
         propagate = np.kron(expm(A * time), np.eye(b - a)) @ _phi(generator, time)
         if np.linalg.cond(propagate) > 1e13:
             raise OdeError(

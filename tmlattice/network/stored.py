@@ -25,8 +25,8 @@ def load_network(ring: Ring, path: Path) -> TaylorNetwork:
         dimension = int(weights["W0"].shape[1])
         network = TaylorNetwork.from_ring(ring, dimension)
         network.load_state_dict(weights)
-    except OSError:
-        raise
+    except OSError as error:
+        raise TmlatticeError(f"cannot read '{path}': {error.strerror or error}") from error
     except Exception as error:
         raise TmlatticeError(
             f"'{path}' does not hold the weights of a network of '{ring.name}'; name the "
