@@ -2,7 +2,7 @@
 
 - the scan of all magnets, monitors and effects, by number of shots and by size of the ring;
 - the whole diagnosis of one fault;
-- the alternative: every hypothesis refitted by OCELOT's own tracking of the whole ring, one bunch of
+- the alternative: every hypothesis refitted by OCELOT's own tracking of the ring, one bunch of
   as many particles as there are shots, four turns a hypothesis (extrapolated from one turn).
 """
 
