@@ -1,7 +1,8 @@
 """How far the gap between model and machine shrinks, judged on shots that the fit never saw.
 
 In each held-out shot only the launch is refitted, on one half of the monitors; the readings of the
-other half are predicted. closed = 1 - (r_after^2 - sigma^2) / (r_before^2 - sigma^2).
+other half are predicted. closed = 1 - (r_after^2 - sigma^2) / (r_before^2 - sigma^2), where sigma^2
+is the variance of a reading and of what the refitted launch predicts for it.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.data import Data
 from tmlattice.diagnosis.model import Model
-from tmlattice.diagnosis.refine import Problem, fit
+from tmlattice.diagnosis.refine import Fit, Problem, fit
 from tmlattice.diagnosis.whitening import Whitening
 from tmlattice.effects import Cause
 
@@ -66,17 +67,26 @@ def held_out_gap(
     fitted = data.without(np.broadcast_to(odd[None, :, None], data.valid.shape))
     whitening = Whitening(fitted)
     scored = data.valid & odd[None, :, None]
-    residuals = []
+    residuals, sigmas = [], []
     for model, causes in zip(models, steps, strict=True):
         launches = fit(Problem(model, fitted, whitening, {}, tuple(causes)), (), data.launches)
         difference = data.readings - launches.paths.readings
         residuals.append(np.where(scored, difference, np.nan))
+        sigmas.append(_sigma(data, launches, whitening))
     left = np.array(residuals)
-    misfits = tuple(misfit(r, data.sigma) for r in left)
+    misfits = tuple(misfit(r, s) for r, s in zip(left, sigmas, strict=True))
     closed, interval = None, None
     if len(left) > 1:
-        closed, interval = _closed(left[0], left[-1], data.sigma, seed)
+        closed, interval = _closed(left[0], left[-1], sigmas[0], sigmas[-1], seed)
     return Gap(misfits, left, closed, interval)
+
+
+def _sigma(data: Data, launches: Fit, whitening: Whitening) -> Array:
+    """rms of a reading less its prediction from a launch that was fitted to other readings."""
+    slopes = launches.paths.launch[..., whitening.columns]
+    covariance = launches.projection.covariance()  # [shot, column, column]
+    predicted = np.einsum("srpi,sij,srpj->srp", slopes, covariance, slopes, optimize=True)
+    return np.asarray(np.sqrt(data.sigma**2 + predicted))
 
 
 def misfit(residual: Array, sigma: Array) -> Misfit:
@@ -89,14 +99,15 @@ def misfit(residual: Array, sigma: Array) -> Misfit:
 
 
 def _closed(
-    before: Array, after: Array, sigma: Array, seed: int
+    before: Array, after: Array, sigma_before: Array, sigma_after: Array, seed: int
 ) -> tuple[float | None, tuple[float, float] | None]:
     valid = np.isfinite(before) & np.isfinite(after)
     squares = [
-        np.where(valid, np.nan_to_num(r) ** 2 - sigma**2, 0.0).sum(axis=2) for r in (before, after)
+        np.where(valid, np.nan_to_num(r) ** 2 - s**2, 0.0).sum(axis=2)
+        for r, s in ((before, sigma_before), (after, sigma_after))
     ]  # [shot, reading]
     counts = valid.sum(axis=2)
-    spread = np.where(valid, 2 * sigma**4, 0.0).sum()
+    spread = np.where(valid, 2 * sigma_before**4, 0.0).sum()
     total = squares[0].sum()
     if total < 5 * np.sqrt(spread):
         return None, None

@@ -143,6 +143,11 @@ class Projection:
             kept[:, b] = part - (part @ Q) @ Q.T
         return kept.reshape(rows.shape)
 
+    def covariance(self) -> Array:
+        """Of the launch coordinates, by block, [block, column, column]; 0 for what is not seen."""
+        inverse = np.linalg.pinv(self._R)
+        return np.asarray(inverse @ np.swapaxes(inverse, 1, 2))
+
     def inside(self, rows: Array) -> Array:
         """The square of what launches explain of rows [..., row], [...]."""
         blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
