@@ -280,7 +280,7 @@ def test_before_the_first_monitor_nothing_is_seen(small_ring, measurement, effec
     alone = replace(measurement.select(monitors=last), launch_sigma=None)
     blind = read_gradient(small_ring, alone, effects=effects)
     assert np.abs(blind.score).max() < 1e-9  # but for rounding
-    assert np.isinf(blind.sigma).all()
+    assert (blind.sigma > 1e3).all()  # infinite, but for rounding
 
 
 def test_fine_tuned_network_of_all_layers(small_ring, small_network, measurement, gradient):

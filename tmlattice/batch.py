@@ -173,7 +173,7 @@ def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
     with (
         dask.config.set(settings),
         LocalCluster(
-            count, threads_per_worker=1, processes=True, dashboard_address=None
+            count, threads_per_worker=1, processes=True, dashboard_address=":0"
         ) as cluster,
         Client(cluster) as client,
     ):

@@ -238,6 +238,7 @@ class _Search:
     # --- the search -----------------------------------------------------------------------------
     def run(self, before: Fit) -> Explanation:
         state = _State(before, [], {})
+        seen: set[frozenset[object]] = set()
         steps = 0
         first: tuple[Scan, FreeScan] | None = None
         while True:
@@ -245,9 +246,10 @@ class _Search:
             kicks = self.scan_kicks(state.fit)
             first = first or (found, kicks)
             full = len(state.fit.causes) + len(state.fit.kicks) + len(self.monitors) >= self.most
-            options = (
-                [] if full or len(self.spikes) > 40 else self._options(state.fit, found, kicks)
-            )
+            over = full or len(self.spikes) > SPIKES
+            options = [] if over else self._options(state.fit, found, kicks)
+            options = [option for option in options if option.gain > 0]
+            seen.add(_names(state.fit))
             if not options:
                 break
             steps += 1
@@ -257,6 +259,8 @@ class _Search:
             state = self._take(state, best, kicks)
             if len(state.fit.causes) + len(state.fit.kicks) > 1:
                 state = self._revised(state)
+            if best.kind in ("named", "kick") and _names(state.fit) in seen:
+                break  # what was added went again
         return Explanation(
             fit=state.fit,
             before=before,
@@ -388,6 +392,10 @@ class _Search:
             )
         named.append(Named(state.named[k].detection, rivals))
         return _State(rivals[0].fit, named, state.kicks)
+
+
+def _names(fit_: Fit) -> frozenset[object]:
+    return frozenset([*((c.effect, c.element) for c in fit_.causes), *fit_.kicks])
 
 
 @dataclass(frozen=True)
