@@ -4,12 +4,15 @@ With TMLATTICE_SMALL=1 in the environment they take their small settings; the te
 nothing.
 """
 
+import base64
+import io
 import os
 import sys
 from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
+from PIL import Image
 
 FOLDER = Path(__file__).parent
 TIMEOUT = 300  # s, of one cell
@@ -33,6 +36,19 @@ def execute(path: Path) -> nbformat.NotebookNode:
     return client.execute(env={**os.environ, "PYTHONWARNINGS": "ignore:IProgress not found"})
 
 
+def shrink(notebook: nbformat.NotebookNode) -> None:
+    """Pictures with a palette of 64 colours: a third of the size, in place."""
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            if "image/png" in output.get("data", {}):
+                picture = Image.open(io.BytesIO(base64.b64decode(output.data["image/png"])))
+                smaller = io.BytesIO()
+                picture.convert("RGB").quantize(64, dither=Image.Dither.NONE).save(
+                    smaller, "PNG", optimize=True
+                )
+                output.data["image/png"] = base64.b64encode(smaller.getvalue()).decode()
+
+
 def main(names: list[str]) -> None:
     """Execute those whose names begin so, or all."""
     for path in sorted(FOLDER.glob("*.ipynb")):
@@ -40,6 +56,7 @@ def main(names: list[str]) -> None:
             continue
         notebook = execute(path)
         notebook.metadata["language_info"] = {"name": "python"}  # not the version that ran it
+        shrink(notebook)
         nbformat.write(notebook, path)
         print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
 
