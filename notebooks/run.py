@@ -1,7 +1,7 @@
 """Execute notebooks and keep their outputs: `python notebooks/run.py [NAME ...]`.
 
-With TMLATTICE_SMALL=1 in the environment they take their small settings; the tests do that, and keep
-nothing.
+With TMLATTICE_SMALL=1 in the environment they take their small settings; the tests do that, and
+keep nothing.
 """
 
 import base64
