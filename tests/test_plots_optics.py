@@ -18,9 +18,7 @@ def test_phase_space_ellipse_goes_through_tracked_states(small_network, plane):
     dots, ellipse = (np.array(line.get_data()).T for line in ax.get_lines())
     scale = np.abs(dots).max(axis=0)
     apart = np.linalg.norm(dots[:, None] / scale - ellipse[None] / scale, axis=2).min(axis=1)
-    assert (
-        apart.max() < 0.026
-    )  # half of the way between two of its 181 points: 2 pi / 180 / sqrt(2)
+    assert apart.max() < 0.026  # half of the way between two of its 181 points
     assert np.array(ax.get_lines()[0].get_data()).shape == (2, 301)
 
 
