@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: run test test-all check bench clean
+.PHONY: run test test-all check bench docs notebooks clean
 
 run: $(VENV)/installed
 	$(BIN)/tmlattice tune-fit
@@ -25,10 +25,16 @@ bench: $(VENV)/installed
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/diagnosis.py
 
+docs: $(VENV)/installed
+	$(BIN)/mkdocs build --strict
+
+notebooks: $(VENV)/installed
+	$(BIN)/python notebooks/run.py
+
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,73 @@
+"""The documentation is built, with warnings as errors, and holds what it promises."""
+
+import inspect
+import os
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import pytest
+
+import tmlattice
+from tmlattice.cli.command import tmlattice as command
+from tmlattice.effects import CATALOGUE
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    pytest.importorskip("mkdocstrings", reason="mkdocs is not installed: pip install '.[docs]'")
+    pytest.importorskip("mkdocs_click", reason="mkdocs is not installed: pip install '.[docs]'")
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return folder
+
+
+def text(site, page):
+    return (site / page / "index.html").read_text(encoding="utf-8")
+
+
+def test_every_public_name_is_in_the_reference(site):
+    inventory = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
+    lines = zlib.decompress(inventory).decode().splitlines()
+    listed = {line.split(" ")[0].rsplit(".", 1)[-1] for line in lines if " py:" in line}
+    missing = [name for name in tmlattice.__all__ if name not in {*listed, "__version__"}]
+    assert not missing
+
+
+def test_every_effect_is_in_the_table(site):
+    page = text(site, "effects")
+    assert [name for name in CATALOGUE if f"<code>{name}</code>" not in page] == []
+    assert page.count("<tr>") == len(CATALOGUE) + 1
+
+
+def test_every_command_and_option_is_on_the_page(site):
+    page = text(site, "command_line")
+    for name, sub in command.commands.items():
+        for one in [sub, *getattr(sub, "commands", {}).values()]:
+            for parameter in one.params:
+                for option in getattr(parameter, "secondary_opts", []) + parameter.opts:
+                    assert not option.startswith("--") or option in page, f"{name} {option}"
+
+
+def test_no_mark_is_left_and_shots_are_in_the_format(site):
+    page = text(site, "formats")
+    assert "<!-- schema" not in page
+    for field in ("shots[].launch_sigma.px", "columns[].kick", "findings[].credible_set[].effect"):
+        assert f"<code>{field}</code>" in page, field
+
+
+def test_quoted_example_is_a_registered_effect():
+    page = (ROOT / "docs" / "new_effect.md").read_text(encoding="utf-8")
+    assert "tmlattice/effects/sextupoles.py" in page
+    assert inspect.getsourcefile(type(CATALOGUE["sextupole_strength"])).endswith("sextupoles.py")
