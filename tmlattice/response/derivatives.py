@@ -71,7 +71,7 @@ class _Pass:
         self.after = np.vstack([after, np.zeros((1, after.shape[1]), dtype=bool)])[:, :, None]
         self.exits = np.append(columns.layer + 1, 0)
         # the closing way of the ring is its last layer
-        bends = np.concatenate([maps.W2, model.maps.closing.weights[2][None]])
+        bends = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])
         self.bends = second_derivatives(bends)
         self.curved = np.flatnonzero(bends.any(axis=(1, 2)))
         self.read_bends = second_derivatives(maps.R2)
