@@ -23,6 +23,7 @@ from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 from tmlattice.maps.taylor import second_derivatives
 from tmlattice.network.network import TaylorNetwork
+from tmlattice.response.kernels import settle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -105,10 +106,8 @@ class ResponseModel:
         self._solve = self._solver(self.tangents[-1])
 
         at, maps = self.maps.at, self.maps
-        curved = second_derivatives(maps.R2)
-        here = self.path[at]
-        bent = np.einsum("maij,mj->mai", curved, here)
-        self.readings = maps.R0 + np.einsum("mai,mi->ma", maps.R1 + bent / 2, here)
+        bent = np.einsum("maij,mj->mai", second_derivatives(maps.R2), self.path[at])
+        self.readings = self._read(self.path[at])
         self.reading_slopes = (maps.R1 + bent) @ self.tangents[at]
 
     @property
@@ -197,6 +196,46 @@ class ResponseModel:
     def downstream(self, columns: Columns) -> NDArray[np.bool_]:
         """Whether a monitor reads behind the corrector, [column, monitor]."""
         return np.asarray(self.maps.at[None] > columns.layer[:, None])
+
+    def closed_orbits(self, correctors: Sequence[str], kicks: Sequence[float] | Array) -> Array:
+        """The closed orbit with one corrector stepped, not linearised, m, [orbit, monitor, 2].
+
+        Second order in every layer, as the maps are; `response` is its derivative.
+
+        Args:
+            correctors: one for each orbit; a name may stand many times.
+            kicks: added to the corrector's own, rad, [orbit].
+
+        Raises:
+            UnknownNameError: no such element.
+            UnstableRingError: no closed orbit within reach.
+        """
+        n, ring = self.dimension, self.layers.ring
+        W0, W1, W2 = self._network.one_turn_weights()
+        layer = np.empty(len(correctors), dtype=np.int64)
+        replaced = []
+        paths = np.empty((len(correctors), len(W0) + 1, n))
+        paths[:, 0] = self.state
+        for row, (name, kick) in enumerate(zip(correctors, kicks, strict=True)):
+            i = ring.index(name)
+            layer[row] = self.layers.layer_of[i]
+            element = ring.elements[i]
+            changed = element.changed(angle=element.angle + float(kick))
+            replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
+        V0, V1, V2 = (np.stack(v) for v in zip(*replaced, strict=True))
+        good = settle(
+            W0, W1, W2, W2.any(axis=(1, 2)), layer, V0, V1, V2, self._solve, self._turn, 1e-14,
+            paths,
+        )  # fmt: skip
+        if not all(good):
+            raise UnstableRingError(_NO_ORBIT)
+        return self._read(paths[:, self.maps.at])
+
+    def _read(self, here: Array) -> Array:
+        """Readings [..., monitor, 2] of the states at the exits that the monitors hang on."""
+        maps = self.maps
+        bent = np.einsum("maij,...mj->...mai", second_derivatives(maps.R2), here)
+        return np.asarray(maps.R0 + np.einsum("...mai,...mi->...ma", maps.R1 + bent / 2, here))
 
     def rf_response(self) -> Array:
         """d (closed orbit) / d (relative RF frequency), m, [monitor, 2]."""
