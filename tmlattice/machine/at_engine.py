@@ -78,7 +78,7 @@ _SWAPPED = [0, 1, 2, 3, 5, 4]
 
 
 _NO_ORBIT = (
-    "no closed orbit: Newton's method does not settle; the ring is at an integer resonance, or its "
+    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
     "kicks are too large"
 )
 
@@ -225,7 +225,7 @@ class AtEngine:
 
         The turn lasts a harmonic number of the RF's periods, and the energy is what makes it so:
         a corrector where the dispersion is not zero shifts it. What the ring loses is given back
-        at its end. The Jacobian of Newton's method is the unset ring's.
+        at its end. Broyden's method starts from the unset ring's Jacobian.
 
         Args:
             settings: one mapping an orbit, as in `track`.
@@ -269,16 +269,22 @@ class AtEngine:
     def _settle(
         self, line: list[Any], start: Array, solve: Array, late: float, tolerance: float = 2e-12
     ) -> tuple[Array, Array]:
-        """Newton's method with a given Jacobian: the state [6] and its readings [monitor, 2]."""
-        state = start.copy()
-        for _ in range(60):
+        """Broyden's method from a given Jacobian: the state [6] and its readings [monitor, 2]."""
+        state, change, before = start.copy(), np.zeros(6), np.zeros(6)
+        for step in range(60):
             beam = np.array(state[:, None], order="F")
             readings = self._pass(line, beam)
             miss = beam[:, 0] - state
             miss[5] -= late
             if not np.isfinite(readings).all() or not np.isfinite(miss).all():
                 break
-            change = solve @ miss
+            if step:  # Broyden: the Jacobian's inverse learns from what the last change did
+                learned = solve @ (before - miss)
+                weight = change @ solve
+                below = weight @ (before - miss)
+                if below:
+                    solve = solve + np.outer(change - learned, weight) / below
+            change, before = solve @ miss, miss
             if np.abs(change).max() < tolerance:
                 return state, readings
             state += change

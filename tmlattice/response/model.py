@@ -285,7 +285,7 @@ class ResponseModel:
 
 
 _NO_ORBIT = (
-    "no closed orbit: Newton's method does not settle; the ring is at an integer resonance or its "
+    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
     "kicks are too large"
 )
 
