@@ -1,6 +1,7 @@
 """Orbit responses against AT's closed orbits, finite differences, and the measured PETRA III."""
 
 import os
+import re
 from pathlib import Path
 
 import at
@@ -77,7 +78,7 @@ def test_finite_steps_settle_to_the_derivative(model):
 
 
 def test_without_energy_a_horizontal_kick_moves_less(petra3, model):
-    """Four coordinates have no energy shift: -eta_m eta_c / (alpha C), what the longer path takes."""
+    """Without energy shift lacks -eta_m eta_c / (alpha C): what the longer path takes."""
     from tmlattice import TaylorNetwork, off_momentum
 
     flat = ResponseModel(petra3, dimension=4)
@@ -95,7 +96,7 @@ def test_without_energy_a_horizontal_kick_moves_less(petra3, model):
 # h of the finite differences: their own error is its square
 CASES = {
     "quadrupole_gradient": ("quadrupole", 1e-5),
-    "gradient_absolute": ("marker", 1e-6),
+    "gradient_absolute": ("sextupole", 1e-6),
     "skew_gradient": ("quadrupole", 1e-6),
     "quadrupole_roll": ("quadrupole", 1e-5),
     "quadrupole_offset_x": ("quadrupole", 1e-6),
@@ -145,6 +146,20 @@ def test_derivative_vs_finite_difference(bent, effect):
     for own, other in ((mine[:-1], theirs), (mine[-1], rf)):
         assert_allclose(own, other, atol=3e-5 * np.abs(other).max() + 1e-6)
     assert np.abs(theirs).max() > 0
+
+
+def test_gradient_at_a_marker_moves_the_monitors_behind_it(petra3, model):
+    """No magnet stands between: the read-outs themselves change."""
+    kinds = "".join(
+        {"marker": "m", "monitor": "b", "drift": "d"}.get(e.kind, "-") for e in petra3.elements
+    )
+    place = petra3.elements[re.search("m[d]*b", kinds).start()].name
+    (mine,) = derivatives(model, [("gradient_absolute", place)])
+    up, down = (
+        ResponseModel(apply(petra3, [Cause("gradient_absolute", place, a)])) for a in (1e-5, -1e-5)
+    )
+    theirs = (up.response() - down.response()) / 2e-5
+    assert_allclose(mine[:-1], theirs, atol=1e-5 * np.abs(theirs).max())
 
 
 def test_derivative_by_calibration_is_the_response(bent):

@@ -182,6 +182,7 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
 @click.pass_context
 def simulate(
     context: click.Context,
+    /,
     lattice: str,
     sequence: str | None,
     energy: float | None,

@@ -135,7 +135,7 @@ class ResponseModel:
     def closing(self) -> Array:
         """dz for a kick w at the start, [n, n]: see the module."""
         rows = np.arange(len(self.free))
-        return self._solve @ self.tangents[-1][rows]
+        return np.asarray(self._solve @ self.tangents[-1][rows])
 
     @cached_property
     def rf_start(self) -> Array:
@@ -191,7 +191,7 @@ class ResponseModel:
         columns = self.columns(correctors)
         before = np.einsum("mai,ci->cma", self.reading_slopes, columns.start)
         after = np.einsum("mai,ci->cma", self.reading_slopes, columns.pulled)
-        return before + self.downstream(columns)[:, :, None] * after
+        return np.asarray(before + self.downstream(columns)[:, :, None] * after)
 
     def downstream(self, columns: Columns) -> NDArray[np.bool_]:
         """Whether a monitor reads behind the corrector, [column, monitor]."""
