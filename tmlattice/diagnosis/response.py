@@ -21,6 +21,7 @@ from tmlattice.measurement import OrbitResponse
 from tmlattice.response import ResponseModel, derivatives
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ GAIN, CALIBRATION = 0.05, 0.05  # rms of the priors: twice the catalogue's gain,
 CROSS, ROLL = 0.01, 0.01
 GRADIENT, SKEW = 5e-3, 1e-3
 """Where the search for the scale of the gradients' priors starts: relative, and 1/m."""
+COUPLING_ROUNDS = 3
 ROUNDS = 5
 """Of Gauss and Newton, while monitors are dropped and the weights follow the residual."""
 
@@ -134,7 +136,9 @@ class _Run:
         self.gain = np.zeros((monitors, 2))
         self.calibration = np.zeros(columns)
         self.quadrupoles = [e.name for e in ring.elements if e.kind == "quadrupole" and e.k1 != 0]
-        self.extra = 5e-6
+        self.skew: list[Cause] = []
+        self.gradients = np.zeros(len(self.quadrupoles))
+        self.lacking = self.extra = 5e-6
         """What the model still lacks, m: it lessens the weight of readings, as noise does."""
 
     def run(self) -> ResponseDiagnosis:
@@ -154,12 +158,13 @@ class _Run:
             found, gradients = self._gauss_newton(gradients)
         scores.append(("quadrupole_gradient", len(gradients), self._state()))
         self.progress("coupling")
-        causes, errors = self._causes(found, gradients)
+        self.gradients = gradients
         for name, skew in (("monitor_roll, monitor_coupling, corrector_roll", False),
                            ("skew_gradient", True)):  # fmt: skip
-            own, coupled, cross = self._coupling(skew)
+            own, state = self._coupling(skew)
             count = len(own.ring) if skew else 2 * monitors + columns - 1
-            scores.append((name, count, (*self._state()[:2], coupled, cross)))
+            scores.append((name, count, state))
+        causes, errors = self._causes(found, self.gradients)
         more, more_errors = self._coupling_causes(own)
         steps = [Step(name, count, *self._score(*state)) for name, count, state in scores]
         bad = tuple(self.m.monitors[i] for i in np.flatnonzero(~self.good))
@@ -173,18 +178,18 @@ class _Run:
         whole = np.concatenate([response, self.model.rf_response()[None]])[:, self.at]
         self.beam = whole * self.kicks[:, None, None]
 
-    def _pick(self, values: Array, plane: Array) -> Array:
+    def _pick(self, values: Array, plane: Indices) -> Array:
         """One plane of [column, monitor, 2] for each column."""
         return np.asarray(np.take_along_axis(values, plane[:, None, None], 2)[..., 0])
 
-    def _weight(self, plane: Array, fitted_rf: bool = True) -> Array:
+    def _weight(self, plane: Indices, fitted_rf: bool = True) -> Array:
         data = self._pick(self.data, plane)
         use = np.isfinite(data) & self.good & ~self.held[:, None]
         use[-1] &= self.half[-1] & fitted_rf
         variance = self.noise[:, plane].T ** 2 + self.extra**2
         return np.where(use, 1 / variance, 0.0)
 
-    def _errors(self, effect: str, plane: Array) -> Array:
+    def _errors(self, effect: str, plane: Indices) -> Array:
         """What the readings in `plane` do for each gradient, [error, column, monitor]."""
         places = [(effect, q) for q in self.quadrupoles]
         scale = ((1 + self.calibration) * self.kicks)[:, None]
@@ -253,11 +258,12 @@ class _Run:
             values = before + share * (goal - before)
             self.gain, self.calibration = values[:m].reshape(-1, 2), values[m : m + c]
             gradients = values[m + c :]
-            self._set(apply(self.ring, self._gradient_causes(gradients)))
+            self._set(apply(self.ring, [*self._gradient_causes(gradients), *self.skew]))
             if cost(values) <= old or share < 0.1:
                 break
             share /= 2
         self._look(drop=True)
+        self.lacking = self.extra
         log.info("share %.3g of a step, scale %.2e, lacking %.2e m", share, found.scale, self.extra)
         return found, gradients
 
@@ -267,46 +273,68 @@ class _Run:
             for q, a in zip(self.quadrupoles, gradients, strict=True)
         ]
 
-    def _coupling(self, skew: bool) -> tuple[Fit, Array, Array]:
-        """Fit of the readings in the other plane; the ring's coupled orbits, the monitors' part."""
+    def _coupling(self, skew: bool) -> tuple[Fit, tuple[Any, ...]]:
+        """Fit of the readings in the other plane, and what the score needs of it."""
         own, other = self.plane, 1 - self.plane
-        scale = 1 + self.calibration[:, None]
-        gain = 1 + self.gain[:, other].T
-        straight = scale * gain * self._pick(self.beam, own)
-        by_column = np.zeros_like(straight)
-        for c, name in enumerate(self.m.correctors):
-            slope = next(derivatives(self.model, [("corrector_roll", name)], [name]))
-            by_column[c] = slope[0, self.at, other[c]] * self.kicks[c]
-        by_column *= scale * gain
-        slopes = self._errors("skew_gradient", other) if skew else np.zeros((0, *gain.shape))
-        residual = self._pick(self.data, other) - scale * gain * self._pick(self.beam, other)
-        found = fit(
-            residual, self._weight(other), other, straight, by_column, slopes, CROSS, ROLL, SKEW
-        )
-        coupled = np.tensordot(found.ring, slopes, 1) if skew else np.zeros_like(straight)
-        return found, coupled, found.monitor
+        scale, gain = 1 + self.calibration[:, None], 1 + self.gain[:, other].T
+        m, c = self.gain.size, len(own)
+        known = np.zeros(m + c + (len(self.quadrupoles) if skew else 0))
+        gradients = self.gradients
+        for again in range(COUPLING_ROUNDS if skew else 1):
+            if again:  # what couples the planes moves the tunes, to second order
+                self.extra = self.lacking
+                _, gradients = self._gauss_newton(gradients)
+                scale, gain = 1 + self.calibration[:, None], 1 + self.gain[:, other].T
+            cross, roll = known[:m].reshape(-1, 2), known[m : m + c]
+            straight = scale * gain * self._pick(self.beam, own)
+            by_column = np.zeros_like(straight)
+            for i, name in enumerate(self.m.correctors):
+                slope = next(derivatives(self.model, [("corrector_roll", name)], [name]))
+                by_column[i] = slope[0, self.at, other[i]] * self.kicks[i]
+            by_column *= scale * gain
+            slopes: Array | Sequence[Array]
+            slopes = self._errors("skew_gradient", other) if skew else []
+            read = scale * gain * self._pick(self.beam, other)
+            read = read + cross[:, other].T * straight + roll[:, None] * by_column
+            residual = self._pick(self.data, other) - read
+            weight = self._weight(other)
+            self.extra = float(np.nanmedian(np.abs(residual[weight > 0]))) / 0.6745
+            weight = self._weight(other)
+            found = fit(
+                residual, weight, other, straight, by_column, slopes, CROSS, ROLL, SKEW, start=known
+            )
+            known = np.concatenate([found.monitor.ravel(), found.column, found.ring])
+            if skew:
+                self.skew = [
+                    Cause("skew_gradient", q, float(a))
+                    for q, a in zip(self.quadrupoles, found.ring, strict=True)
+                ]
+                self._set(apply(self.ring, [*self._gradient_causes(gradients), *self.skew]))
+        if skew:
+            self.extra = self.lacking
+            _, self.gradients = self._gauss_newton(gradients)
+        return found, (self.beam, self.gain, found.monitor)
 
     def _state(self) -> tuple[Any, ...]:
-        return self.beam, self.gain, None, None
+        return self.beam, self.gain, None
 
     def _score(
-        self, beam: Array, gain: Array, coupled: Array | None, cross: Array | None
+        self, beam: Array, gain: Array, cross: Array | None
     ) -> tuple[float, float, float, float]:
         """In-plane and coupling rms, chi2 per reading, dispersion rms: over the good monitors."""
         own, other = self.plane, 1 - self.plane
         read = (1 + gain) * beam
         straight, across = self._pick(read, own), self._pick(read, other)
         data, data_across = self._pick(self.data, own), self._pick(self.data, other)
-        if cross is not None and coupled is not None:
-            shared = cross[:, other].T * (1 + gain[:, other].T) * self._pick(beam, own)
-            across = across + shared + coupled
+        if cross is not None:
+            across = across + cross[:, other].T * (1 + gain[:, other].T) * self._pick(beam, own)
         variance = self.noise[:, own].T ** 2
         inside, outside, chi2 = [], [], []
         for c in np.flatnonzero(self.held):
             seen = np.isfinite(data[c]) & self.good
             near, far = seen & self.half[c], seen & ~self.half[c]
-            w, u = 1 / variance[c, near], straight[c, near]
-            kick = (w * u * data[c, near]).sum() / (w * u * u).sum()
+            u = straight[c, near]  # all alike: what the model lacks is not the readings' noise
+            kick = (u * data[c, near]).sum() / (u * u).sum()
             miss = data[c, far] - kick * straight[c, far]
             inside.append(miss)
             chi2.append(miss**2 / variance[c, far])

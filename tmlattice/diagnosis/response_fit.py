@@ -112,6 +112,6 @@ def fit(
     if errors:
         explained = explained + np.tensordot(step[m + c :], J, 1)
     return Fit(
-        found[:m].reshape(monitors, 2), found[m : m + c], found[m + c :], prior * np.sqrt(variance), scale,
-        residual - explained,
+        found[:m].reshape(monitors, 2), found[m : m + c], found[m + c :],
+        prior * np.sqrt(variance), scale, residual - explained,
     )  # fmt: skip
