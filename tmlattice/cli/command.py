@@ -12,6 +12,7 @@ from tmlattice.cli.challenge import challenge
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.info import info
+from tmlattice.cli.predict import predict
 from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
@@ -39,6 +40,7 @@ tmlattice.add_command(study)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
 tmlattice.add_command(diagnose)
+tmlattice.add_command(predict)
 tmlattice.add_command(reproduce)
 tmlattice.add_command(challenge)
 

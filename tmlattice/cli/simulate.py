@@ -80,6 +80,13 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
     help="Random small errors everywhere, with this rms or the catalogue's; "
     "`all`, or `all=SCALE`, for every usual one.",
 )
+@click.option(
+    "--kind",
+    type=click.Choice(["trajectory", "orbit-response"]),
+    default="trajectory",
+    show_default=True,
+    help="First turns, or the stored beam's orbit for steps of the correctors and of the RF.",
+)
 @click.option("--shots", type=click.IntRange(1), default=6, show_default=True)
 @click.option(
     "--turns", type=click.IntRange(1), default=1, show_default=True, help="Read in each shot."
@@ -94,9 +101,7 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--noise",
     type=click.FloatRange(0),
-    default=2e-5,
-    show_default=True,
-    help="Rms of one reading, m.",
+    help="Rms of one reading, m; else 2e-5, and of an orbit change 2e-6 in x and 1.2e-6 in y.",
 )
 @click.option(
     "--engine",
@@ -140,6 +145,32 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
     help="Of the background; the same machine has the same one. Else the seed.",
 )
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option(
+    "--corrector",
+    "correctors",
+    multiple=True,
+    metavar="NAME",
+    help="Orbit response: step this one; repeat for more. Else all.",
+)
+@click.option(
+    "--kick",
+    type=click.FloatRange(0, min_open=True),
+    default=1e-4,
+    show_default=True,
+    help="Orbit response: the step of each corrector, rad.",
+)
+@click.option(
+    "--rf-step",
+    type=float,
+    default=-3000.0,
+    show_default=True,
+    help="Orbit response: the step of the RF, Hz; 0 for none.",
+)
+@click.option(
+    "--one-sided",
+    is_flag=True,
+    help="Orbit response: step from the setting, not from half below it to half above.",
+)
 @click.option("--out", type=FILE, required=True, metavar="DIR", help="The measurement folder.")
 @click.option(
     "--truth",
@@ -148,14 +179,23 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
     help="Write the causes there; never inside a measurement folder.",
 )
 @quiet_option
+@click.pass_context
 def simulate(
+    context: click.Context,
+    /,
     lattice: str,
     sequence: str | None,
     energy: float | None,
     effects: tuple[tuple[str, str | None, float], ...],
     background: tuple[tuple[str, float | None], ...],
+    kind: str,
     settings_file: Path | None,
     jobs: int,
+    noise: float | None,
+    correctors: tuple[str, ...],
+    kick: float,
+    rf_step: float,
+    one_sided: bool,
     out: Path,
     truth: Path | None,
     quiet: bool,
@@ -165,7 +205,8 @@ def simulate(
 
     The virtual machine is LATTICE with effects of the catalogue in it, tracked by
     accelerator-toolbox (or by OCELOT's maps). Each shot has a launch of its own, with random
-    betatron phases; monitors read with noise. The folder holds no truth.
+    betatron phases; monitors read with noise. With `--kind orbit-response` the stored beam's
+    closed orbit is read for a step of every corrector and of the RF. The folder holds no truth.
     """
     from tmlattice.effects import Cause, find
     from tmlattice.files import output_file
@@ -175,9 +216,19 @@ def simulate(
 
     if truth is not None:
         _check_apart(truth, out)
+    _check_options(context, kind)
     ring = load_ring(lattice, sequence, energy)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
+    if kind == "orbit-response":
+        _response(
+            ring, causes, out, truth, quiet,
+            background=dict(background), correctors=correctors or None, kick=kick, rf_step=rf_step,
+            one_sided=one_sided, engine=options["engine"], seed=options["seed"],
+            machine_seed=options["machine_seed"], **({} if noise is None else {"noise": noise}),
+        )  # fmt: skip
+        return
+    options["noise"] = 2e-5 if noise is None else noise
     simulation = run(
         ring,
         causes,
@@ -197,21 +248,79 @@ def simulate(
         f"{len(ring.monitors)} monitors, {1e3 * options['amplitude']:g} mm rms, noise "
         f"{1e6 * options['noise']:g} µm, engine {options['engine']}, seed {options['seed']}"
     )
-    if causes:
-        shown = table("effect", "element", "s [m]", "amount", "unit")
-        places = {element.name: f"{element.s:.2f}" for element in ring.elements}
-        for cause in causes:
-            effect = find(cause.effect)
-            place = cause.element or "-"
-            shown.add_row(
-                cause.effect, place, places.get(place, "-"), f"{cause.amount:g}", effect.unit
-            )
-        screen.print(shown)
-    for name, rms in simulation.background.items():
-        screen.print(f"background {name}: rms {rms:g} {find(name).unit}")
+    _print_causes(ring, causes)
+    _print_background(simulation.background)
     screen.print(
         f"written: {out}/: measurement.json, readings.csv" + (f"; {truth}" if truth else "")
     )
+
+
+_OF_TRAJECTORIES = (
+    "shots", "turns", "amplitude", "radiation", "launch_sigma", "kicks", "settings_file", "jobs",
+)  # fmt: skip
+_OF_RESPONSES = ("correctors", "kick", "rf_step", "one_sided")
+
+
+def _check_options(context: click.Context, kind: str) -> None:
+    """Refuse what the other kind of measurement has."""
+    response = kind == "orbit-response"
+    for option in context.command.params:
+        given = context.get_parameter_source(option.name or "")
+        others = _OF_TRAJECTORIES if response else _OF_RESPONSES
+        if option.name in others and given == click.core.ParameterSource.COMMANDLINE:
+            mend = "take it out" if response else "add --kind orbit-response"
+            raise click.UsageError(f"{option.opts[0]} has no meaning for --kind {kind}; {mend}")
+
+
+def _response(
+    ring: Any, causes: list[Any], out: Path, truth: Path | None, quiet: bool, **options: Any
+) -> None:
+    from tmlattice.files import output_file
+    from tmlattice.machine.response import simulate_response
+    from tmlattice.measurement import write_measurement, write_truth
+
+    with ExitStack() as both:
+        file = None if truth is None else both.enter_context(output_file(truth))
+        simulation = simulate_response(ring, causes, progress=not quiet, **options)
+        if file is not None:
+            write_truth(file, **simulation.truth())
+        write_measurement(out, simulation.measured)
+    if quiet:
+        return
+    measured, screen = simulation.measured, console()
+    rf = f", RF step {options['rf_step']:g} Hz" if options["rf_step"] else ""
+    sides = "one-sided" if options["one_sided"] else "two-sided"
+    screen.print(
+        f"{ring.name}: {len(measured.correctors)} correctors, {len(measured.monitors)} monitors, "
+        f"{sides} steps of {1e6 * options['kick']:g} µrad{rf}, engine {options['engine']}, seed "
+        f"{options['seed']}"
+    )
+    _print_causes(ring, causes)
+    _print_background(simulation.background)
+    screen.print(
+        f"written: {out}/: measurement.json, response.csv" + (f"; {truth}" if truth else "")
+    )
+
+
+def _print_causes(ring: Any, causes: list[Any]) -> None:
+    from tmlattice.effects import find
+
+    if not causes:
+        return
+    shown = table("effect", "element", "s [m]", "amount", "unit")
+    places = {element.name: f"{element.s:.2f}" for element in ring.elements}
+    for cause in causes:
+        place = cause.element or "-"
+        unit = find(cause.effect).unit
+        shown.add_row(cause.effect, place, places.get(place, "-"), f"{cause.amount:g}", unit)
+    console().print(shown)
+
+
+def _print_background(background: Any) -> None:
+    from tmlattice.effects import find
+
+    for name, rms in background.items():
+        console().print(f"background {name}: rms {rms:g} {find(name).unit}")
 
 
 def _check_apart(truth: Path, out: Path) -> None:

@@ -26,7 +26,7 @@ from scipy.constants import physical_constants
 from scipy.linalg import sqrtm
 
 from tmlattice.effects.cause import Cause
-from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.errors import LatticeError, UnstableRingError, unknown_name
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -75,6 +75,12 @@ SET_ON: Mapping[str, frozenset[str]] = {
     "k2_relative": frozenset({"sextupole"}),
 }
 _SWAPPED = [0, 1, 2, 3, 5, 4]
+
+
+_NO_ORBIT = (
+    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
+    "kicks are too large"
+)
 
 
 class AtEngine:
@@ -214,6 +220,80 @@ class AtEngine:
             readings[shots] = self._track_line(line, state[shots], turns)
         return readings
 
+    def closed_orbits(self, settings: Sequence[Settings]) -> Array:
+        """The stored beam at every monitor, the RF frequency fixed or set.
+
+        The turn lasts a harmonic number of the RF's periods, and the energy is what makes it so:
+        a corrector where the dispersion is not zero shifts it. What the ring loses is given back
+        at its end. Broyden's method starts from the unset ring's Jacobian.
+
+        Args:
+            settings: one mapping an orbit, as in `track`.
+
+        Returns:
+            (x, y) in m, [orbit, monitor, 2].
+
+        Raises:
+            LatticeError, UnknownNameError: see `track`.
+            UnstableRingError: no closed orbit within reach.
+        """
+        start, solve = self._stored()
+        readings = np.empty((len(settings), len(self._monitors), 2))
+        for orbits, changed, frequency in self._groups(settings):
+            line = self._line.copy()
+            for i, setting in changed.items():
+                errors = self._errors.get(i, {})
+                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], errors, setting)
+            late = -self.ring.length * frequency / (1 + frequency)
+            readings[orbits] = self._settle(line, start, solve, late)[1]
+        return readings
+
+    def _stored(self) -> tuple[Array, Array]:
+        """The unset ring's closed orbit [6] and what makes good a miss of the turn, [6, 6]."""
+        steps = np.diag([3e-6, 3e-6, 3e-6, 3e-6, 1e-5, 1.0])[:5]  # bends round x to 3e-14 m
+        start = np.zeros(6)
+        for _ in range(3):
+            beam = np.asfortranarray(np.vstack([start + steps, start - steps]).T)
+            self._pass(self._line, beam)
+            ends = beam.T
+            slopes = (ends[:5] - ends[5:]).T / (2 * steps[range(5), range(5)])
+            rows = [0, 1, 2, 3, 5]
+            solve = np.zeros((6, 6))
+            try:
+                solve[:5, rows] = np.linalg.inv((np.eye(6)[:, :5] - slopes)[rows])
+            except np.linalg.LinAlgError:
+                raise UnstableRingError(_NO_ORBIT) from None
+            start = self._settle(self._line, start, solve, 0.0, 1e-6)[0]
+        return self._settle(self._line, start, solve, 0.0)[0], solve
+
+    def _settle(
+        self, line: list[Any], start: Array, solve: Array, late: float, tolerance: float = 2e-12
+    ) -> tuple[Array, Array]:
+        """Broyden's method from a given Jacobian: the state [6] and its readings [monitor, 2]."""
+        state, change, before = start.copy(), np.zeros(6), np.zeros(6)
+        for step in range(60):
+            beam = np.array(state[:, None], order="F")
+            readings = self._pass(line, beam)
+            miss = beam[:, 0] - state
+            miss[5] -= late
+            if not np.isfinite(readings).all() or not np.isfinite(miss).all():
+                break
+            if step:  # Broyden: the Jacobian's inverse learns from what the last change did
+                learned = solve @ (before - miss)
+                weight = change @ solve
+                below = weight @ (before - miss)
+                if below:
+                    solve = solve + np.outer(change - learned, weight) / below
+            change, before = solve @ miss, miss
+            if np.abs(change).max() < tolerance:
+                return state, readings
+            state += change
+        raise UnstableRingError(_NO_ORBIT)
+
+    def _pass(self, line: list[Any], beam: Array) -> Array:
+        """Readings of the first of the states [6, shot], which move to the line's end."""
+        return np.asarray(self._track_line(line, beam.T, 1, beam)[0, 0])
+
     def lattice(self) -> Any:
         """The line as an AT lattice of its own, without RF, for AT's tools (`at.get_optics`).
 
@@ -271,9 +351,14 @@ class AtEngine:
         scale = self._bends if self._bends > 0 else 1.0
         return self.ring.energy * 1e9 * float(np.cbrt(scale))
 
-    def _track_line(self, line: list[Any], state: Array, turns: int) -> Array:
-        """Readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2]."""
-        beam = np.asfortranarray(state.T)
+    def _track_line(
+        self, line: list[Any], state: Array, turns: int, beam: Array | None = None
+    ) -> Array:
+        """Readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2].
+
+        A given `beam`, the states as AT wants them, [6, shot], is left at the line's end.
+        """
+        beam = np.asfortranarray(state.T) if beam is None else beam
         readings = np.empty((len(state), turns, len(self._monitors), 2))
         block = max(TURNS_AT_ONCE // max(len(state) * len(self._monitors), 1), 1)
         for turn in range(0, turns, block):

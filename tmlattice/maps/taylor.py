@@ -30,8 +30,8 @@ def kronecker_exponents(n: int, degree: int) -> list[tuple[int, ...]]:
 
 
 def second_derivatives(W2: Array) -> Array:
-    """d2 (image) / d x_i d x_j [..., n, n, n] of second-order coefficients W2 [..., n, pairs]."""
-    n = W2.shape[-2]
+    """d2 (image) / d x_i d x_j [..., m, n, n] of second-order coefficients W2 [..., m, pairs]."""
+    n = round((8 * W2.shape[-1] + 1) ** 0.5 - 1) // 2
     i, j = np.triu_indices(n)
     pair = np.empty((n, n), dtype=np.intp)
     pair[i, j] = pair[j, i] = np.arange(len(i))

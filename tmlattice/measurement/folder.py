@@ -255,13 +255,29 @@ def _write_response(folder: Path, response: OrbitResponse) -> None:
             orbits.append((RF, response.rf.orbit))
     with output_folder(folder) as temporary:
         write_json(temporary / "measurement.json", document)
-        with (temporary / "response.csv").open("w", encoding="utf-8", newline="") as file:
-            write = csv.writer(file, lineterminator="\n").writerow
-            write(RESPONSE)
-            for name, orbit in orbits:
-                _check_size(orbit, response.monitors)
-                for monitor, xy in zip(response.monitors, orbit.tolist(), strict=True):
-                    write((name, monitor, *_fields(xy)))
+        write_response_table(temporary / "response.csv", response.monitors, orbits)
+
+
+def write_response_table(
+    path: Path, monitors: Sequence[str], orbits: Sequence[tuple[str, Array]]
+) -> None:
+    """Write orbit changes as the table of an orbit response's folder.
+
+    Args:
+        path: the file.
+        monitors: names.
+        orbits: a corrector's name, or "rf", and its orbit change, m, [monitor, 2].
+
+    Raises:
+        MeasurementError: an orbit change that no reader would take (above 0.2 m).
+    """
+    with path.open("w", encoding="utf-8", newline="") as file:
+        write = csv.writer(file, lineterminator="\n").writerow
+        write(RESPONSE)
+        for name, orbit in orbits:
+            _check_size(orbit, monitors)
+            for monitor, xy in zip(monitors, orbit.tolist(), strict=True):
+                write((name, monitor, *_fields(xy)))
 
 
 def _header(kind: str, monitors: Sequence[str], source: Any) -> dict[str, Any]:

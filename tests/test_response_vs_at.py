@@ -1,0 +1,194 @@
+"""Orbit responses against AT's closed orbits, finite differences, and the measured PETRA III."""
+
+import os
+import re
+from pathlib import Path
+
+import at
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause, read_measurement
+from tmlattice.effects import CATALOGUE, RingEffect, apply
+from tmlattice.errors import EffectError, MeasurementError, UnknownNameError
+from tmlattice.machine.at_engine import AtEngine
+from tmlattice.response import ResponseModel, derivatives, predict
+
+REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
+real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no PETRA III response")
+
+
+@pytest.fixture(scope="module")
+def model(petra3):
+    return ResponseModel(petra3)
+
+
+@pytest.fixture(scope="module")
+def engine(petra3):
+    return AtEngine(petra3)
+
+
+SOME = [0, 5, 100, 300, 498]
+
+
+def test_response_of_correctors_vs_at(model, engine):
+    names = [model.correctors[i] for i in SOME]
+    step = 1e-6  # rad: both sides cancel the second order, the third is below 1e-9 m
+    settings = [{name: {"kick": side * step}} for name in names for side in (1, -1)]
+    orbits = engine.closed_orbits(settings).reshape(len(names), 2, -1, 2)
+    theirs = (orbits[:, 0] - orbits[:, 1]) / 2
+    assert np.abs(theirs).max() > 4e-5
+    assert_allclose(step * model.response(names), theirs, atol=1e-9)  # 3.7e-10 was measured
+
+
+def test_rf_response_vs_at(model, engine):
+    step = 1e-8  # relative: delta is 1e-5
+    up, down = engine.closed_orbits([{"rf": {"frequency_relative": s}} for s in (step, -step)])
+    assert_allclose(step * model.rf_response(), (up - down) / 2, atol=1e-9)
+    assert np.abs(up).max() > 4e-6
+
+
+def test_engine_vs_ats_own_search(petra3, engine):
+    name = next(e.name for e in petra3.elements if e.kind == "hcorrector")
+    lattice = engine.lattice()
+    (place,) = [i for i, e in enumerate(lattice) if e.FamName == name]
+    lattice[place].KickAngle = [1e-5, 0.0]
+    monitors = [i for i, e in enumerate(lattice) if isinstance(e, at.Monitor)]
+    _, theirs = at.find_sync_orbit(lattice, dct=0.0, refpts=monitors)
+    mine = engine.closed_orbits([{name: {"kick": 1e-5}}])[0]
+    assert_allclose(mine, theirs[:, [0, 2]], atol=1e-9)
+
+
+def test_finite_steps_vs_at(model, engine):
+    """The second order of a step of 100 microradians, that a linear response lacks."""
+    names = [model.correctors[i] for i in SOME[:3]]
+    mine = model.closed_orbits(names, [1e-4] * 3)
+    theirs = engine.closed_orbits([{name: {"kick": 1e-4}} for name in names])
+    rms = np.sqrt(np.mean((mine - theirs) ** 2))
+    assert rms < 1e-6  # third order and slicing, at orbits of millimetres
+    assert np.sqrt(np.mean((theirs - 1e-4 * model.response(names)) ** 2)) > 10 * rms
+
+
+def test_finite_steps_settle_to_the_derivative(model):
+    names = [model.correctors[i] for i in SOME]
+    up, down = (model.closed_orbits(names, np.full(len(names), h)) for h in (1e-6, -1e-6))
+    scale = np.abs(model.response(names)).max()
+    assert_allclose((up - down) / 2e-6, model.response(names), atol=1e-5 * scale)
+
+
+def test_without_energy_a_horizontal_kick_moves_less(petra3, model):
+    """Without energy shift lacks -eta_m eta_c / (alpha C): what the longer path takes."""
+    from tmlattice import TaylorNetwork, off_momentum
+
+    flat = ResponseModel(petra3, dimension=4)
+    name = max(model.correctors, key=lambda c: abs(model.columns([c]).start[0, 5]))
+    (shift,) = model.columns([name]).start[:, 5]
+    dispersion = model.rf_response() / model.rf_start[5]
+    gain = model.response([name])[0] - flat.response([name])[0]
+    assert_allclose(gain, shift * dispersion, atol=1e-6 * np.abs(gain).max())
+    facts = off_momentum(TaylorNetwork.from_ring(petra3, 6), petra3.length)
+    k = model.columns([name]).layer[0] + 1
+    assert_allclose(-shift, facts.dispersion[k, 0] / (facts.momentum_compaction * petra3.length),
+                    rtol=1e-3)  # fmt: skip
+
+
+# h of the finite differences: their own error is its square
+CASES = {
+    "quadrupole_gradient": ("quadrupole", 1e-5),
+    "gradient_absolute": ("sextupole", 1e-6),
+    "skew_gradient": ("quadrupole", 1e-6),
+    "quadrupole_roll": ("quadrupole", 1e-5),
+    "quadrupole_offset_x": ("quadrupole", 1e-6),
+    "quadrupole_offset_y": ("quadrupole", 1e-6),
+    "dipole_field": ("bend", 1e-6),
+    "dipole_roll": ("bend", 1e-6),
+    "corrector_kick_x": ("hcorrector", 1e-8),
+    "corrector_kick_y": ("vcorrector", 1e-8),
+    "sextupole_strength": ("sextupole", 1e-3),
+    "sextupole_offset_x": ("sextupole", 1e-6),
+    "sextupole_offset_y": ("sextupole", 1e-6),
+    "insertion_device_focusing": ("wiggler", 1e-6),
+    "family_gradient": ("family", 1e-6),
+    "corrector_roll": ("hcorrector", 1e-4),
+    "radiation_loss_bends": (None, 1e-4),
+    "radiation_loss_wigglers": (None, 1e-4),
+}
+
+
+def test_every_effect_on_the_ring_has_a_case():
+    own = {name for name, effect in CATALOGUE.items() if isinstance(effect, RingEffect)}
+    assert own == {*CASES, "corrector_calibration"}
+
+
+@pytest.fixture(scope="module")
+def bent(small_ring):
+    """A small ring whose orbit is not on the axis: every term of the second order counts."""
+    return apply(small_ring, [Cause("corrector_kick_x", "v3", 2e-5),
+                              Cause("corrector_kick_y", "v7", 3e-5)])  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", CASES)
+def test_derivative_vs_finite_difference(bent, effect):
+    kind, h = CASES[effect]
+    places = CATALOGUE[effect].places(bent)
+    if kind in (None, "family"):
+        place = places[-1]
+    else:
+        fitting = [p for p in places if bent[p].kind == kind]
+        if not fitting:
+            pytest.skip(f"the small ring has no {kind} for it")
+        place = fitting[len(fitting) // 2]
+    (mine,) = derivatives(ResponseModel(bent), [(effect, place)])
+    up, down = (ResponseModel(apply(bent, [Cause(effect, place, a)])) for a in (h, -h))
+    theirs = (up.response() - down.response()) / (2 * h)
+    rf = (up.rf_response() - down.rf_response()) / (2 * h)
+    for own, other in ((mine[:-1], theirs), (mine[-1], rf)):
+        assert_allclose(own, other, atol=3e-5 * np.abs(other).max() + 1e-6)
+    assert np.abs(theirs).max() > 0
+
+
+def test_gradient_at_a_marker_moves_the_monitors_behind_it(petra3, model):
+    """No magnet stands between: the read-outs themselves change."""
+    kinds = "".join(
+        {"marker": "m", "monitor": "b", "drift": "d"}.get(e.kind, "-") for e in petra3.elements
+    )
+    place = petra3.elements[re.search("m[d]*b", kinds).start()].name
+    (mine,) = derivatives(model, [("gradient_absolute", place)])
+    up, down = (
+        ResponseModel(apply(petra3, [Cause("gradient_absolute", place, a)])) for a in (1e-5, -1e-5)
+    )
+    theirs = (up.response() - down.response()) / 2e-5
+    assert_allclose(mine[:-1], theirs, atol=1e-5 * np.abs(theirs).max())
+
+
+def test_derivative_by_calibration_is_the_response(bent):
+    model = ResponseModel(bent)
+    (mine,) = derivatives(model, [("corrector_calibration", "v5")])
+    c = model.correctors.index("v5")
+    assert_allclose(mine[c], model.response()[c], rtol=1e-9, atol=1e-12)
+    assert not np.delete(mine, c, axis=0).any()
+
+
+def test_refusals(small_ring):
+    model = ResponseModel(small_ring)
+    with pytest.raises(UnknownNameError, match="did you mean"):
+        model.response(["v33"])
+    with pytest.raises(MeasurementError, match="no corrector"):
+        model.response(["QF::0"])
+    with pytest.raises(EffectError, match="does not act on the ring"):
+        derivatives(model, [("monitor_gain_x", "last_a")])
+
+
+@real
+def test_design_vs_measured_petra3():
+    """The README of the data: 160.8 micrometres, all blocks and monitors, by another code."""
+    from tmlattice import load_ring
+
+    ring = load_ring(REAL / "p3_low_beta.mat")
+    measured = read_measurement(REAL)
+    design = predict(ResponseModel(ring), measured)
+    difference = measured.response - design.response
+    assert_allclose(np.sqrt(np.nanmean(difference**2)), 160.8e-6, rtol=1e-3)
+    rf = measured.rf.orbit - design.rf.orbit
+    assert np.sqrt(np.nanmean(rf**2)) < 0.15 * np.sqrt(np.nanmean(measured.rf.orbit**2))

@@ -1,0 +1,63 @@
+"""`tmlattice predict`: the orbit response of correctors that were not measured."""
+
+from pathlib import Path
+
+import click
+
+from tmlattice.cli.options import FILE, console, lattice_options, quiet_option
+
+
+@click.command("predict")
+@click.argument("lattice")
+@lattice_options
+@click.option(
+    "--calibration",
+    type=FILE,
+    metavar="FILE",
+    help="JSON with the gains, rolls and couplings of monitors and the calibrations and rolls of "
+    "correctors.",
+)
+@click.option(
+    "--corrector",
+    "correctors",
+    multiple=True,
+    metavar="NAME",
+    help="Predict this one; repeat for more. Else all.",
+)
+@click.option("--kick", type=float, default=1e-4, show_default=True, help="Of each, rad.")
+@click.option("--out", type=FILE, required=True, metavar="FILE", help="A table: .csv.")
+@quiet_option
+def predict(
+    lattice: str,
+    sequence: str | None,
+    energy: float | None,
+    calibration: Path | None,
+    correctors: tuple[str, ...],
+    kick: float,
+    out: Path,
+    quiet: bool,
+) -> None:
+    """Predict how the stored beam's orbit answers a kick of each corrector, at fixed RF frequency.
+
+    The table has the columns of a measurement's response.csv: corrector, monitor, and the orbit
+    change x, y in m. It is linear in the kick.
+    """
+    from tmlattice.files import output_file
+    from tmlattice.lattice import load_ring
+    from tmlattice.measurement.folder import write_response_table
+    from tmlattice.response.calibration import calibrated_response, read_calibration
+
+    if kick == 0 or not abs(kick) < float("inf"):
+        raise click.BadParameter(f"a kick of {kick:g} rad; it is finite and not zero")
+    with output_file(out) as file:
+        ring = load_ring(lattice, sequence, energy)
+        causes = read_calibration(calibration, ring) if calibration else []
+        columns, response = calibrated_response(ring, causes, correctors or None)
+        monitors = [monitor.name for monitor in ring.monitors]
+        orbits = list(zip(columns.names, kick * response, strict=True))
+        write_response_table(file, monitors, orbits)
+    if not quiet:
+        console().print(
+            f"{ring.name}: {len(columns.names)} correctors, {len(monitors)} monitors, kick "
+            f"{1e6 * kick:g} µrad\nwritten: {out}"
+        )

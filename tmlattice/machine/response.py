@@ -1,0 +1,190 @@
+"""A simulated orbit response: closed orbits of a machine whose errors are known."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import c as SPEED_OF_LIGHT
+from tqdm.auto import tqdm
+
+from tmlattice.effects import Cause, Settings, apply, background_rms, check, monitors_with
+from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.lattice import Ring
+from tmlattice.machine.at_engine import PETRA_HARMONIC, PETRA_LENGTH, AtEngine
+from tmlattice.machine.machine import ENGINES
+from tmlattice.machine.shots import draw_background, stream
+from tmlattice.measurement import OrbitResponse, RfStep
+from tmlattice.response import ResponseModel
+from tmlattice.response.calibration import corrector_scales
+
+Array = NDArray[np.float64]
+
+NOISE = (2e-6, 1.2e-6)
+"""rms of an orbit change, m: stored-beam readings of PETRA III (x, y)."""
+RF_STEP = -3000.0
+"""Hz."""
+
+
+@dataclass(frozen=True)
+class ResponseSimulation:
+    """What a simulated response was made from, and the response.
+
+    Attributes:
+        measured: the response.
+        ring, causes, background, engine, seed, machine_seed, one_sided: see `simulate_response`.
+    """
+
+    measured: OrbitResponse
+    ring: Ring
+    causes: tuple[Cause, ...]
+    background: Mapping[str, float]
+    engine: str
+    seed: int
+    machine_seed: int
+    one_sided: bool
+
+    def truth(self) -> dict[str, Any]:
+        """What was really there, for `write_truth`."""
+        positions = {element.name: element.s for element in self.ring.elements}
+        return {
+            "effects": [
+                {
+                    "effect": cause.effect,
+                    "element": cause.element,
+                    "s": positions.get(cause.element or ""),
+                    "amount": cause.amount,
+                }
+                for cause in self.causes
+            ],
+            "launches": np.zeros((0, 5)),
+            "background": {
+                **self.background,
+                "engine": self.engine,
+                "machine_seed": self.machine_seed,
+                "one_sided": self.one_sided,
+            },
+            "seed": self.seed,
+        }
+
+
+def simulate_response(
+    ring: Ring,
+    causes: Sequence[Cause] = (),
+    *,
+    correctors: Sequence[str] | None = None,
+    kick: float = 1e-4,
+    rf_step: float = RF_STEP,
+    one_sided: bool = False,
+    background: Mapping[str, float | None] | None = None,
+    noise: float | Sequence[float] = NOISE,
+    engine: str = "at",
+    seed: int = 0,
+    machine_seed: int | None = None,
+    progress: bool = True,
+) -> ResponseSimulation:
+    """Step the correctors of a machine with known errors one by one, and its RF.
+
+    Args:
+        ring: the design.
+        causes: what is wrong with it.
+        correctors: names; None: all, in beam order.
+        kick: the whole change of each corrector, rad.
+        rf_step: Hz; 0: the RF is not stepped.
+        one_sided: from the corrector's own kick to `kick` more, else from half below to half above.
+        background: small random errors: effect -> rms (None: the catalogue's own), or "all".
+        noise: rms of one orbit change, m, one number or (x, y).
+        engine: "at": closed orbits of thick symplectic elements; "ocelot": of the second-order
+            maps. Neither linearises.
+        seed: of the noise.
+        machine_seed: of the background; else `seed`.
+        progress: show a bar where there is a terminal.
+
+    Raises:
+        EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
+        MeasurementError: a corrector that is none, or a ring without monitors.
+        TmlatticeError: another engine.
+        UnstableRingError: no closed orbit.
+    """
+    if engine not in ENGINES:
+        raise TmlatticeError(f"no engine '{engine}'; there are {' and '.join(ENGINES)}")
+    rms = background_rms(background or {})
+    machine_seed = seed if machine_seed is None else machine_seed
+    every = [*draw_background(ring, rms, machine_seed), *causes]
+    check(ring, every)
+    names = tuple(monitor.name for monitor in ring.monitors)
+    if not names:
+        raise MeasurementError(f"'{ring.name}' has no monitor; nothing reads its orbit")
+    columns = ResponseModel(ring).columns(correctors)
+    harmonic = max(round(PETRA_HARMONIC * ring.length / PETRA_LENGTH), 1)
+    frequency = harmonic * SPEED_OF_LIGHT / ring.length
+    low, high = (0.0, kick) if one_sided else (-kick / 2, kick / 2)
+    steps: list[tuple[str | None, float, float]] = [(name, low, high) for name in columns.names]
+    if rf_step:
+        relative = rf_step / frequency
+        steps.append((None, 0.0, relative) if one_sided else (None, -relative / 2, relative / 2))
+    orbits = (_at_orbits if engine == "at" else _map_orbits)(ring, every, steps)
+    monitors = monitors_with(ring, every)
+    changes = np.stack(
+        [
+            monitors.read(up) - monitors.read(down)
+            for down, up in tqdm(
+                orbits, total=len(steps), unit="step", disable=None if progress else True
+            )
+        ]
+    )
+    changes[:, monitors.frozen] = 0.0
+    sigma = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
+    for i, change in enumerate(changes):
+        change += sigma * stream(seed, "response", i).standard_normal(change.shape)  # noqa: PLW2901
+    count = len(columns.names)
+    rf = RfStep(frequency, harmonic, rf_step, changes[-1]) if rf_step else None
+    measured = OrbitResponse(
+        correctors=columns.names,
+        planes=columns.planes,
+        kicks=np.full(count, kick),
+        monitors=names,
+        response=changes[:count],
+        noise=np.tile(sigma, (len(names), 1)) if (sigma > 0).all() else None,
+        rf=rf,
+        lattice=ring.name,
+        energy=ring.energy,
+    )
+    return ResponseSimulation(
+        measured, ring, tuple(causes), rms, engine, seed, machine_seed, one_sided
+    )
+
+
+Step = tuple[str | None, float, float]
+
+
+def _at_orbits(
+    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step]
+) -> Iterator[tuple[Array, Array]]:
+    """The orbits below and above each step of a corrector, or of the RF (None)."""
+    engine = AtEngine(ring, causes)
+
+    def setting(name: str | None, amount: float) -> Settings:
+        if name is None:
+            return {"rf": {"frequency_relative": amount}}
+        return {name: {"kick": ring[name].angle + amount}}
+
+    for name, low, high in steps:
+        down, up = engine.closed_orbits([setting(name, low), setting(name, high)])
+        yield down, up
+
+
+def _map_orbits(
+    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step]
+) -> Iterator[tuple[Array, Array]]:
+    """The same from the second-order maps."""
+    wrong = apply(ring, causes)
+    model = ResponseModel(wrong)
+    for name, low, high in steps:
+        if name is None:
+            down, up = (ResponseModel(wrong, frequency=f).readings for f in (low, high))
+        else:
+            (scale,) = corrector_scales(ring, causes, [name])
+            down, up = model.closed_orbits([name, name], [scale * low, scale * high])
+        yield down, up

@@ -1,0 +1,109 @@
+"""Calibration of monitors and correctors: a file of effects, and the response that they make."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import Cause, apply, check, find, monitors_with
+from tmlattice.errors import EffectError, TmlatticeError
+from tmlattice.files import output_file, write_json
+from tmlattice.lattice import Ring
+from tmlattice.measurement.documents import located, read_document
+from tmlattice.response.model import Columns, ResponseModel
+
+Array = NDArray[np.float64]
+
+FORMAT = "tmlattice-calibration"
+CALIBRATES = (
+    "monitor_gain_x", "monitor_gain_y", "monitor_roll", "monitor_coupling", "monitor_swap",
+    "monitor_dead", "corrector_calibration", "corrector_roll",
+)  # fmt: skip
+"""The effects that a calibration may hold."""
+
+
+def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
+    """The effects of a calibration file.
+
+    Args:
+        path: JSON, see the schema `calibration`.
+        ring: that they sit on.
+
+    Raises:
+        MeasurementError: no such file, or not a calibration of this ring.
+    """
+    path = Path(path)
+    document = read_document(path, "calibration", FORMAT)
+    with located(path):
+        causes = [Cause(e["effect"], e["element"], float(e["amount"])) for e in document["effects"]]
+    try:
+        _check(causes)
+        check(ring, causes)
+    except TmlatticeError as error:
+        raise type(error)(f"{path}: {error}") from error
+    return causes
+
+
+def write_calibration(path: str | Path, causes: Iterable[Cause]) -> None:
+    """Write a calibration file: whole, or not at all.
+
+    Raises:
+        EffectError: an effect that is no calibration.
+        OutputError: it cannot be written.
+    """
+    from tmlattice import __version__
+
+    causes = list(causes)
+    _check(causes)
+    effects = [{"effect": c.effect, "element": c.element, "amount": c.amount} for c in causes]
+    document = {"format": FORMAT, "version": 1, "package": __version__, "effects": effects}
+    with output_file(Path(path)) as file:
+        write_json(file, document)
+
+
+def corrector_scales(ring: Ring, causes: Iterable[Cause], names: Sequence[str]) -> Array:
+    """What each corrector does of what it is told, 1 for a good one, [corrector]."""
+    scale = {ring[name].name: 1.0 for name in names}
+    for cause in causes:
+        if cause.effect == "corrector_calibration":
+            name = ring[cause.element or ""].name
+            if name in scale:
+                scale[name] += cause.amount
+    return np.array(list(scale.values()))
+
+
+def calibrated_response(
+    ring: Ring, causes: Sequence[Cause] = (), correctors: Sequence[str] | None = None
+) -> tuple[Columns, Array]:
+    """What the monitors of a ring with errors read for a radian of each corrector.
+
+    Args:
+        ring: the design.
+        causes: on the ring and on its monitors.
+        correctors: names; None: all, in beam order.
+
+    Returns:
+        The correctors, and m/rad [corrector, monitor, 2]; NaN where a monitor is silent.
+
+    Raises:
+        EffectError, UnknownNameError: a cause that the ring cannot have.
+        MeasurementError: a corrector that is none.
+        UnstableRingError: no closed orbit.
+    """
+    model = ResponseModel(apply(ring, causes))
+    columns = model.columns(correctors)
+    monitors = monitors_with(ring, causes)
+    scales = corrector_scales(ring, causes, columns.names)
+    beam = scales[:, None, None] * model.response(columns.names)
+    readings = np.einsum("mij,cmj->cmi", monitors.matrix(), beam)
+    readings[:, monitors.silent | monitors.frozen] = np.nan
+    return columns, readings
+
+
+def _check(causes: Iterable[Cause]) -> None:
+    for cause in causes:
+        if find(cause.effect).name not in CALIBRATES:
+            raise EffectError(
+                f"'{cause.effect}' is no calibration; those are {', '.join(CALIBRATES)}"
+            )

@@ -1,0 +1,72 @@
+"""Compiled: closed orbits of many settings of one corrector each, without linearisation."""
+
+import numba
+import numpy as np
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def settle(W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths):  # type: ignore[no-untyped-def]
+    """Broyden's method from a given Jacobian; True where it settled, [orbit].
+
+    Args:
+        W0, W1, W2, curved: the ring's maps, its closing way the last, [map, ...].
+        layer: the map that is replaced, [orbit].
+        V0, V1, V2: what stands there instead, [orbit, ...].
+        solve: the start's change for a miss of the turn in the first coordinates, [n, free].
+        turn: what the turn should change them by, [free].
+        tolerance: largest change of the start, m and rad.
+        paths: starts with the guess, [orbit, 0]; filled, [orbit, map + 1, n].
+    """
+    n, free = paths.shape[2], len(turn)
+    miss, before, weight = np.zeros(free), np.zeros(free), np.zeros(free)
+    change, error = np.zeros(n), np.zeros(n)
+    good = [False] * paths.shape[0]
+    for orbit in range(paths.shape[0]):
+        inverse = solve.copy()
+        for step in range(60):
+            for k in range(paths.shape[1] - 1):
+                x, y = paths[orbit, k], paths[orbit, k + 1]
+                replaced = k == layer[orbit]
+                for a in range(n):
+                    total = V0[orbit, a] if replaced else W0[k, a]
+                    m = 0
+                    for i in range(n):
+                        value = V1[orbit, a, i] if replaced else W1[k, a, i]
+                        if curved[k]:
+                            for j in range(i, n):
+                                bend = V2[orbit, a, m] if replaced else W2[k, a, m]
+                                value += bend * x[j]
+                                m += 1
+                        total += value * x[i]
+                    y[a] = total
+            for i in range(free):
+                miss[i] = paths[orbit, -1, i] - paths[orbit, 0, i] - turn[i]
+            if step > 0:  # Broyden: the Jacobian's inverse learns from what the last change did
+                below = 0.0
+                for a in range(n):
+                    error[a] = change[a]
+                    for i in range(free):
+                        error[a] -= inverse[a, i] * (before[i] - miss[i])
+                for i in range(free):
+                    weight[i] = 0.0
+                    for a in range(n):
+                        weight[i] += change[a] * inverse[a, i]
+                    below += weight[i] * (before[i] - miss[i])
+                if below != 0.0:
+                    for a in range(n):
+                        for i in range(free):
+                            inverse[a, i] += error[a] * weight[i] / below
+            largest = 0.0
+            for a in range(n):
+                change[a] = 0.0
+                for i in range(free):
+                    change[a] += inverse[a, i] * miss[i]
+                paths[orbit, 0, a] += change[a]
+                largest = max(largest, abs(change[a]))
+            before[:] = miss
+            if not largest < 1.0:
+                break
+            if largest < tolerance:
+                good[orbit] = True
+                break
+    return good

@@ -1,0 +1,304 @@
+"""Closed orbit at fixed RF frequency, and its derivative for every corrector and for the RF.
+
+A kick v at the exit of a layer acts on the turn like w = C^-1 v at its start, C the matrix from
+the start to there. With the one-turn matrix M the closed orbit at the start moves by dz, where
+
+    (M - 1) dz + M w = (0, 0, 0, 0, d tau, *):
+
+the four transverse coordinates repeat, the turn lasts as long as the RF's harmonic number of
+periods (d tau = 0 at fixed frequency), and the energy is free to make it so. The sixth row is the
+energy's: without losses it is conserved, and what is lost is given back at the ring's end.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import physical_constants
+
+from tmlattice.errors import MeasurementError, UnstableRingError
+from tmlattice.lattice import Ring
+from tmlattice.maps import LayerMaps, RingMaps, ring_maps
+from tmlattice.maps.taylor import second_derivatives
+from tmlattice.network.network import TaylorNetwork
+from tmlattice.response.kernels import settle
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+ELECTRON_GEV = physical_constants["electron mass energy equivalent in MeV"][0] * 1e-3
+KICK = 1e-4
+"""Of the central differences of a corrector's map, rad; the maps are linear in the kick."""
+CORRECTORS = {"hcorrector": "x", "vcorrector": "y"}
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Correctors as sources of an orbit change.
+
+    Attributes:
+        names, planes: of the correctors.
+        place: in `ring.elements`, [column].
+        layer: of each, [column].
+        slope: d v / d x of the kick v at the layer's exit, 1/rad, [column, n, n].
+        start: the closed orbit at the start of the ring for one radian, [column, n].
+        pulled: the kick at the layer's exit as a change of the launch, [column, n].
+    """
+
+    names: tuple[str, ...]
+    planes: tuple[str, ...]
+    place: Indices
+    layer: Indices
+    slope: Array
+    start: Array
+    pulled: Array
+
+
+class ResponseModel:
+    """A ring's closed orbit at fixed RF frequency and its derivatives, from the layers' maps.
+
+    Cavities are drifts: a stored beam on the closed orbit meets the RF at the phase that gives
+    back what it lost, and a static orbit needs no more than that.
+
+    Args:
+        ring: with its errors and settings.
+        dimension: 6; or 4 for a beam whose energy stays, whatever the correctors do.
+        frequency: relative change of the RF frequency from the one at which the design orbit is
+            closed; six coordinates.
+
+    Attributes:
+        ring, layers, maps: what it was made from.
+        state: the closed orbit at the start of the ring, [n].
+        path: at the start, at the layers' exits and at the end of the ring, [layer + 2, n].
+        tangents: matrices from the start to there, [layer + 2, n, n].
+        inverse: their inverses.
+        free: the coordinates that are free at the start: all but tau.
+        readings: the closed orbit at the monitors, m, [monitor, 2].
+        reading_slopes: d reading / d launch, [monitor, 2, n].
+
+    Raises:
+        UnstableRingError: no closed orbit.
+    """
+
+    ring: Ring
+    layers: LayerMaps
+    maps: RingMaps
+
+    def __init__(self, ring: Ring, dimension: int = 6, frequency: float = 0.0) -> None:
+        if frequency and dimension != 6:
+            raise ValueError("the RF moves the energy, which four coordinates do not have")
+        self.ring = ring
+        self.layers = LayerMaps(_without_rf(ring), dimension)
+        self.maps = ring_maps(self.layers.ring, dimension, self.layers)
+        self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
+        self._network = TaylorNetwork(self.maps)
+        self._turn = np.zeros(len(self.free))
+        if dimension == 6:
+            self._turn[4] = self.slip * frequency / (1 + frequency)
+        self.state, self.path, steps = self._closed_orbit()
+        tangents = [np.eye(dimension)]
+        for step in steps:
+            tangents.append(step @ tangents[-1])
+        self.tangents = np.stack(tangents)
+        self.inverse = np.linalg.inv(self.tangents)
+        self._solve = self._solver(self.tangents[-1])
+
+        at, maps = self.maps.at, self.maps
+        bent = np.einsum("maij,mj->mai", second_derivatives(maps.R2), self.path[at])
+        self.readings = self._read(self.path[at])
+        self.reading_slopes = (maps.R1 + bent) @ self.tangents[at]
+
+    @property
+    def dimension(self) -> int:
+        """4 or 6."""
+        return self.layers.dimension
+
+    @property
+    def monitors(self) -> tuple[str, ...]:
+        """In the order of the readings."""
+        return self.maps.monitors
+
+    @property
+    def slip(self) -> float:
+        """d (c T) / d (relative frequency) of the RF's turn T = harmonic / frequency, m."""
+        gamma = self.ring.energy / ELECTRON_GEV
+        return -self.ring.length / float(np.sqrt(1 - gamma**-2))
+
+    @cached_property
+    def correctors(self) -> tuple[str, ...]:
+        """All of the ring, in beam order."""
+        return tuple(e.name for e in self.ring.elements if e.kind in CORRECTORS)
+
+    @cached_property
+    def closing(self) -> Array:
+        """dz for a kick w at the start, [n, n]: see the module."""
+        rows = np.arange(len(self.free))
+        return np.asarray(self._solve @ self.tangents[-1][rows])
+
+    @cached_property
+    def rf_start(self) -> Array:
+        """The closed orbit's change at the start for a relative step of the frequency, [n]."""
+        if self.dimension != 6:
+            raise ValueError("the RF moves the energy, which four coordinates do not have")
+        return -self._solve[:, 4] * self.slip
+
+    def columns(self, correctors: Sequence[str] | None = None) -> Columns:
+        """Correctors as sources; None: all of the ring.
+
+        Raises:
+            UnknownNameError: no such element.
+            MeasurementError: one that is no corrector.
+        """
+        ring = self.ring
+        names = self.correctors if correctors is None else correctors
+        place = np.array([ring.index(name) for name in names], dtype=np.int64)
+        planes = []
+        for i in place:
+            element = ring.elements[i]
+            if element.kind not in CORRECTORS:
+                raise MeasurementError(
+                    f"'{element.name}' is a {element.kind}, no corrector; name a corrector"
+                )
+            planes.append(CORRECTORS[element.kind])
+        layer = self.layers.layer_of[place] if len(place) else np.empty(0, dtype=np.int64)
+        n = self.dimension
+        kick, slope = np.empty((len(place), n)), np.empty((len(place), n, n))
+        for row, (i, k) in enumerate(zip(place, layer, strict=True)):
+            kick[row], slope[row] = self._kick(int(i), int(k))
+        pulled = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
+        return Columns(
+            names=tuple(ring.elements[i].name for i in place),
+            planes=tuple(planes),
+            place=place,
+            layer=layer,
+            slope=slope,
+            start=pulled @ self.closing.T,
+            pulled=pulled,
+        )
+
+    def response(self, correctors: Sequence[str] | None = None) -> Array:
+        """d (closed orbit) / d kick at fixed RF frequency, m/rad, [corrector, monitor, 2].
+
+        Args:
+            correctors: names; None: all of the ring, in beam order.
+
+        Raises:
+            UnknownNameError: no such element.
+            MeasurementError: one that is no corrector.
+        """
+        columns = self.columns(correctors)
+        before = np.einsum("mai,ci->cma", self.reading_slopes, columns.start)
+        after = np.einsum("mai,ci->cma", self.reading_slopes, columns.pulled)
+        return np.asarray(before + self.downstream(columns)[:, :, None] * after)
+
+    def downstream(self, columns: Columns) -> NDArray[np.bool_]:
+        """Whether a monitor reads behind the corrector, [column, monitor]."""
+        return np.asarray(self.maps.at[None] > columns.layer[:, None])
+
+    def closed_orbits(self, correctors: Sequence[str], kicks: Sequence[float] | Array) -> Array:
+        """The closed orbit with one corrector stepped, not linearised, m, [orbit, monitor, 2].
+
+        Second order in every layer, as the maps are; `response` is its derivative.
+
+        Args:
+            correctors: one for each orbit; a name may stand many times.
+            kicks: added to the corrector's own, rad, [orbit].
+
+        Raises:
+            UnknownNameError: no such element.
+            UnstableRingError: no closed orbit within reach.
+        """
+        n, ring = self.dimension, self.layers.ring
+        W0, W1, W2 = self._network.one_turn_weights()
+        layer = np.empty(len(correctors), dtype=np.int64)
+        replaced = []
+        paths = np.empty((len(correctors), len(W0) + 1, n))
+        paths[:, 0] = self.state
+        for row, (name, kick) in enumerate(zip(correctors, kicks, strict=True)):
+            i = ring.index(name)
+            layer[row] = self.layers.layer_of[i]
+            element = ring.elements[i]
+            changed = element.changed(angle=element.angle + float(kick))
+            replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
+        V0, V1, V2 = (np.stack(v) for v in zip(*replaced, strict=True))
+        good = settle(
+            W0, W1, W2, W2.any(axis=(1, 2)), layer, V0, V1, V2, self._solve, self._turn, 1e-14,
+            paths,
+        )  # fmt: skip
+        if not all(good):
+            raise UnstableRingError(_NO_ORBIT)
+        return self._read(paths[:, self.maps.at])
+
+    def _read(self, here: Array) -> Array:
+        """Readings [..., monitor, 2] of the states at the exits that the monitors hang on."""
+        maps = self.maps
+        bent = np.einsum("maij,...mj->...mai", second_derivatives(maps.R2), here)
+        return np.asarray(maps.R0 + np.einsum("...mai,...mi->...ma", maps.R1 + bent / 2, here))
+
+    def rf_response(self) -> Array:
+        """d (closed orbit) / d (relative RF frequency), m, [monitor, 2]."""
+        return np.asarray(self.reading_slopes @ self.rf_start)
+
+    def _kick(self, place: int, layer: int) -> tuple[Array, Array]:
+        """The corrector's kick at its layer's exit, and how it depends on the state there."""
+        element = self.layers.ring.elements[place]
+        up, down = (
+            self.layers.layer(layer, {place: element.changed(angle=element.angle + h)})[0]
+            for h in (KICK, -KICK)
+        )
+        w0, w1, w2 = ((p - m) / (2 * KICK) for p, m in zip(up, down, strict=True))
+        x = self.path[layer]
+        bent = second_derivatives(w2[None])[0] @ x
+        return w0 + (w1 + bent / 2) @ x, w1 + bent
+
+    def _solver(self, turn: Array) -> Array:
+        """[n, free]: what makes good a miss of the turn."""
+        rows = np.arange(len(self.free))
+        solve = np.zeros((self.dimension, len(rows)))
+        matrix = (np.eye(self.dimension) - turn)[np.ix_(rows, self.free)]
+        try:
+            solve[self.free] = np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:
+            raise UnstableRingError(_NO_ORBIT) from None
+        return solve
+
+    def _closed_orbit(self) -> tuple[Array, Array, Array]:
+        """Newton's method: the state, the states along the ring, the layers' Jacobians."""
+        x = np.zeros(self.dimension)
+        rows = np.arange(len(self.free))
+        for _ in range(30):
+            path, steps = self._network.jacobians(x)
+            turn = np.eye(self.dimension)
+            for step in steps:
+                turn = step @ turn
+            miss = (path[-1] - x)[rows] - self._turn
+            if not (np.isfinite(miss).all() and np.isfinite(turn).all()):
+                break
+            change = self._solver(turn) @ miss
+            x = x + change
+            if np.abs(change).max() < max(1e-15, 1e-12 * np.abs(x).max()):
+                path, steps = self._network.jacobians(x)
+                return x, path, steps
+        raise UnstableRingError(_NO_ORBIT)
+
+
+_NO_ORBIT = (
+    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
+    "kicks are too large"
+)
+
+
+def _without_rf(ring: Ring) -> Ring:
+    """The ring with drifts in the place of its cavities."""
+    cavities = [i for i, e in enumerate(ring.elements) if e.kind == "cavity"]
+    if not cavities:
+        return ring
+    from tmlattice.lattice.ocelot import elements
+
+    drift = {
+        i: replace(ring.elements[i], source=elements.Drift(l=ring.elements[i].length))
+        for i in cavities
+    }
+    return ring.with_elements(drift)
