@@ -149,7 +149,7 @@ def oracle_answer(judged: Mapping[str, Any], ranking: str) -> dict[str, Any]:
     oracle = judged["oracle"]
     members = list(oracle[ranking])
     if ranking == "posterior":
-        total = np.cumsum([m["probability"] for m in members])
+        total = np.cumsum([m["probability"] or 0.0 for m in members])  # null: it sees nothing
         members = members[: int(np.searchsorted(total, 0.95)) + 1]
     if not oracle["detected"]:
         return {"verdict": "nothing", "findings": []}
