@@ -1,6 +1,6 @@
 """What goes wrong with correctors: their design kick is zero, their setting is each shot's own."""
 
-from tmlattice.effects.effect import RingEffect, register
+from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
 from tmlattice.lattice import Element
 
 
@@ -18,56 +18,42 @@ class _Kick(_OnCorrector):
 
 
 @register
-class CorrectorKickX(_Kick):
+class CorrectorKickX(_Kick, ErrorEffect):
     """A horizontal kick that nobody set."""
 
     name = "corrector_kick_x"
+    error = "kick_x"
     sign = "px += amount, whatever the setting"
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """A horizontal kick."""
-        return element.with_errors(kick_x=amount)
 
 
 @register
-class CorrectorKickY(_Kick):
+class CorrectorKickY(_Kick, ErrorEffect):
     """A vertical kick that nobody set."""
 
     name = "corrector_kick_y"
+    error = "kick_y"
     sign = "py += amount, whatever the setting"
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """A vertical kick."""
-        return element.with_errors(kick_y=amount)
 
 
 @register
-class CorrectorCalibration(_OnCorrector):
+class CorrectorCalibration(_OnCorrector, StrengthEffect):
     """A corrector kicks more or less than it is told to."""
 
     name = "corrector_calibration"
+    strength = "angle"
     unit = "relative"
     sign = "kick = (1 + amount) x setting; -2 is a reversed one"
     background = 0.04
     largest = 2.0
 
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """The set kick times 1 + amount."""
-        if element.angle == 0:
-            return element
-        return element.changed(angle=element.angle * (1 + amount))
-
 
 @register
-class CorrectorRoll(_OnCorrector):
+class CorrectorRoll(_OnCorrector, ErrorEffect):
     """A corrector turned about the beam axis."""
 
     name = "corrector_roll"
+    error = "roll"
     unit = "rad"
     sign = "positive turns the kick from x towards y"
     background = 1e-2
     largest = 0.1
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Turned, with whatever kick it has."""
-        return element.with_errors(roll=amount)

@@ -97,6 +97,37 @@ class RingEffect(Effect):
         """The element with this much of it more; energy in GeV."""
 
 
+class ErrorEffect(RingEffect):
+    """An effect that is one of the errors which an element can carry.
+
+    Attributes:
+        error: its name in `lattice.ring.Errors`.
+    """
+
+    error: ClassVar[str]
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """The element with this much more of the error."""
+        return element.with_errors(**{self.error: amount})
+
+
+class StrengthEffect(RingEffect):
+    """An effect that scales what an element is set to.
+
+    Attributes:
+        strength: k1, k2, or the angle that a corrector is set to.
+    """
+
+    strength: ClassVar[str]
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """The strength times 1 + amount; the same element where it has none."""
+        strength = getattr(element, self.strength)
+        if strength == 0:
+            return element
+        return element.changed(**{self.strength: strength * (1 + amount)})
+
+
 class ReadingEffect(Effect):
     """An effect on what one monitor tells."""
 

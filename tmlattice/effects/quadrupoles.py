@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from tmlattice.effects.effect import RingEffect, register
+from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
 from tmlattice.lattice import Element, Ring
 
 
@@ -15,18 +15,15 @@ class _OnQuadrupole(RingEffect):
 
 
 @register
-class QuadrupoleGradient(_OnQuadrupole):
+class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
     """A quadrupole's strength is not what its setting says."""
 
     name = "quadrupole_gradient"
+    strength = "k1"
     unit = "relative"
     sign = "k1 becomes (1 + amount) k1"
     background = 1e-3
     largest = 0.3
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """k1 times 1 + amount."""
-        return element.changed(k1=element.k1 * (1 + amount))
 
 
 class _Gradient(RingEffect):
@@ -40,79 +37,65 @@ class _Gradient(RingEffect):
 
 
 @register
-class GradientAbsolute(_Gradient):
+class GradientAbsolute(_Gradient, ErrorEffect):
     """A gradient where the model has none, or more than it has."""
 
     name = "gradient_absolute"
+    error = "k1l"
     sign = "integrated k1 L, thin, in the middle: px -= amount x, py += amount y"
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """A thin quadrupole in the middle."""
-        return element.with_errors(k1l=amount)
 
 
 @register
-class SkewGradient(_Gradient):
+class SkewGradient(_Gradient, ErrorEffect):
     """A skew gradient."""
 
     name = "skew_gradient"
+    error = "k1sl"
     sign = "integrated k1s L, thin, in the middle: px += amount y, py += amount x"
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """A thin skew quadrupole in the middle."""
-        return element.with_errors(k1sl=amount)
 
 
 @register
-class QuadrupoleRoll(_OnQuadrupole):
+class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
     """A quadrupole turned about the beam axis."""
 
     name = "quadrupole_roll"
+    error = "roll"
     unit = "rad"
     sign = "positive turns the magnet's x axis towards y"
     background = 2e-4
     largest = 0.03
 
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Turned."""
-        return element.with_errors(roll=amount)
-
 
 @register
-class QuadrupoleOffsetX(_OnQuadrupole):
+class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
     """A quadrupole that stands beside its axis."""
 
     name = "quadrupole_offset_x"
+    error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
     background = 1e-4
     largest = 2e-3
 
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Shifted in x."""
-        return element.with_errors(dx=amount)
-
 
 @register
-class QuadrupoleOffsetY(_OnQuadrupole):
+class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
     """A quadrupole that stands above or below its axis."""
 
     name = "quadrupole_offset_y"
+    error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
     background = 1e-4
     largest = 2e-3
 
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Shifted in y."""
-        return element.with_errors(dy=amount)
-
 
 @register
-class FamilyGradient(_OnQuadrupole):
+class FamilyGradient(_OnQuadrupole, StrengthEffect):
     """The power supply of a family of quadrupoles is off: all of them have the same error."""
 
     name = "family_gradient"
+    strength = "k1"
     unit = "relative"
     sign = "k1 of every member becomes (1 + amount) k1"
     largest = 0.05
@@ -131,7 +114,3 @@ class FamilyGradient(_OnQuadrupole):
             for i, e in enumerate(ring.elements)
             if e.family.casefold() == family and self.sits_on(e)
         ]
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """k1 times 1 + amount."""
-        return element.changed(k1=element.k1 * (1 + amount))

@@ -1,6 +1,6 @@
 """What goes wrong with sextupoles."""
 
-from tmlattice.effects.effect import RingEffect, register
+from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
 from tmlattice.lattice import Element
 
 
@@ -13,45 +13,36 @@ class _OnSextupole(RingEffect):
 
 
 @register
-class SextupoleStrength(_OnSextupole):
+class SextupoleStrength(_OnSextupole, StrengthEffect):
     """A sextupole's strength is not what its setting says."""
 
     name = "sextupole_strength"
+    strength = "k2"
     unit = "relative"
     sign = "k2 becomes (1 + amount) k2; -2 is a reversed one"
     background = 5e-3
     largest = 2.0
 
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """k2 times 1 + amount."""
-        return element.changed(k2=element.k2 * (1 + amount))
-
 
 @register
-class SextupoleOffsetX(_OnSextupole):
+class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     """A sextupole that stands beside its axis."""
 
     name = "sextupole_offset_x"
+    error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
     background = 1e-4
     largest = 3e-3
 
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Shifted in x."""
-        return element.with_errors(dx=amount)
-
 
 @register
-class SextupoleOffsetY(_OnSextupole):
+class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     """A sextupole that stands above or below its axis."""
 
     name = "sextupole_offset_y"
+    error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
     background = 1e-4
     largest = 3e-3
-
-    def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Shifted in y."""
-        return element.with_errors(dy=amount)
