@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import re
 import subprocess
 import sys
 import zlib
@@ -67,7 +68,9 @@ def test_no_mark_is_left_and_shots_are_in_the_format(site):
         assert f"<code>{field}</code>" in page, field
 
 
-def test_quoted_example_is_a_registered_effect():
+def test_quoted_example_is_a_registered_effect(site):
     page = (ROOT / "docs" / "new_effect.md").read_text(encoding="utf-8")
     assert "tmlattice/effects/sextupoles.py" in page
-    assert inspect.getsourcefile(type(CATALOGUE["sextupole_strength"])).endswith("sextupoles.py")
+    effect = type(CATALOGUE["sextupole_strength"])
+    assert inspect.getsourcefile(effect).endswith("sextupoles.py")
+    assert effect.__doc__ in re.sub(r"<[^>]+>", "", text(site, "new_effect"))  # it is shown
