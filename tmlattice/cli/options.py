@@ -10,35 +10,47 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
-
 FILE = click.Path(path_type=Path)
 
 REGULARIZATIONS = ["symplectic", "none", "l1", "l2"]
 
 
-class Launch(click.ParamType):  # type: ignore[type-arg]
-    """x,px,y,py as one word."""
+class Numbers(click.ParamType):  # type: ignore[type-arg]
+    """Numbers separated by commas, as one word.
 
-    name = "x,px,y,py"
+    Args:
+        name: how they are shown: one name each.
+        least: the smallest that is allowed.
+        advice: what a wrong value is answered with.
+    """
+
+    def __init__(self, name: str, advice: str, least: float = float("-inf")) -> None:
+        self.name = name
+        self._advice = advice
+        self._least = least
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """Four finite numbers."""
+        """As many finite numbers as there are names."""
         if isinstance(value, tuple):
             return value
         try:
             numbers = tuple(float(part) for part in str(value).split(","))
         except ValueError:
             numbers = ()
-        if len(numbers) != 4 or not all(abs(n) < float("inf") for n in numbers):
-            self.fail(
-                f"'{value}' is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0",
-                param,
-                ctx,
-            )
+        allowed = all(self._least <= n and abs(n) < float("inf") for n in numbers)
+        if len(numbers) != len(self.name.split(",")) or not allowed:
+            self.fail(f"'{value}'{self._advice}", param, ctx)
         return numbers
+
+
+LAUNCH = Numbers(
+    "x,px,y,py", " is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0"
+)
+LAUNCH_SIGMA = Numbers(
+    "X,PX,Y,PY,DELTA", ": give five rms values, such as 1e-4,2e-5,1e-4,2e-5,0", least=0.0
+)
 
 
 class BackgroundText(click.ParamType):  # type: ignore[type-arg]
@@ -98,7 +110,7 @@ def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for decorate in reversed((
         click.option("--change", type=float, default=-0.2, show_default=True,
                      help="Relative change of the magnet's strength."),
-        click.option("--launch", type=Launch(), default="1e-3,0,1e-3,0", show_default=True,
+        click.option("--launch", type=LAUNCH, default="1e-3,0,1e-3,0", show_default=True,
                      help="State at the start of the ring, m and rad."),
         click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True,
                      help="Rms of one reading, m."),

@@ -9,6 +9,7 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    LAUNCH_SIGMA,
     BackgroundText,
     console,
     lattice_argument,
@@ -41,26 +42,6 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
                 ctx,
             )
         return words[0], words[1] if len(words) == 3 else None, amount
-
-
-class Numbers(click.ParamType):  # type: ignore[type-arg]
-    """Five numbers separated by commas."""
-
-    name = "X,PX,Y,PY,DELTA"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """Five numbers, zero or more."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            numbers = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != 5 or not all(0 <= n < float("inf") for n in numbers):
-            self.fail(f"'{value}': give five rms values, such as 1e-4,2e-5,1e-4,2e-5,0", param, ctx)
-        return numbers
 
 
 @click.command("simulate")
@@ -113,7 +94,7 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
 @click.option("--radiation", is_flag=True, help="Bends and wigglers radiate.")
 @click.option(
     "--launch-sigma",
-    type=Numbers(),
+    type=LAUNCH_SIGMA,
     default="1e-4,2e-5,1e-4,2e-5,0",
     show_default=True,
     help="Rms of the launches about the nominal ones.",
