@@ -15,6 +15,7 @@ from tmlattice.cli.options import (
     json_option,
     lattice_options,
     quiet_option,
+    trajectories,
 )
 
 if TYPE_CHECKING:
@@ -110,8 +111,9 @@ def diagnose(
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
-        data = _trajectories(measurement)
-        before = None if reference is None else _trajectories(reference)
+        refusal = ", which is not diagnosed yet; give first turns"
+        data = trajectories(measurement, refusal)
+        before = None if reference is None else trajectories(reference, refusal)
         ring = load_ring(lattice, sequence, energy)
         with _progress(quiet) as progress:
             result = _diagnosed(
@@ -169,18 +171,6 @@ def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
         f"their error, at {score.name} (s = {score.s:.2f} m)",
         soft_wrap=True,
     )
-
-
-def _trajectories(path: Path) -> "Measurement":
-    from tmlattice.errors import MeasurementError
-    from tmlattice.measurement import Measurement, read_measurement
-
-    data = read_measurement(path)
-    if not isinstance(data, Measurement):
-        raise MeasurementError(
-            f"'{path}' is an orbit response, which is not diagnosed yet; give first turns"
-        )
-    return data
 
 
 def _diagnosed(

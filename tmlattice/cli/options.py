@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from tmlattice.measurement import Measurement
+
 FILE = click.Path(path_type=Path)
 
 REGULARIZATIONS = ["symplectic", "none", "l1", "l2"]
@@ -138,6 +140,21 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 def quiet_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """--quiet."""
     return click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors.")(function)
+
+
+def trajectories(path: Path, refusal: str) -> "Measurement":
+    """The first turns of a measurement folder, or of a table.
+
+    Raises:
+        MeasurementError: an orbit response, with what the command says to it.
+    """
+    from tmlattice.errors import MeasurementError
+    from tmlattice.measurement import Measurement, read_measurement
+
+    data = read_measurement(path)
+    if not isinstance(data, Measurement):
+        raise MeasurementError(f"'{path}' is an orbit response{refusal}")
+    return data
 
 
 def console() -> "Console":

@@ -16,6 +16,7 @@ from tmlattice.cli.options import (
     quiet_option,
     recipe_options,
     table,
+    trajectories,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +88,9 @@ def tune_fit(
             ring = load_ring(lattice, sequence, energy)
             outcome = run(ring, progress=not quiet, **options)
         else:
-            data = _trajectory(measurement)
+            data = trajectories(
+                measurement, "; tune-fit takes a trajectory, the first turn of a beam"
+            )
             ring = load_ring(lattice, sequence, energy)
             outcome = _fit(ring, data, measurement, quiet, options)
         _draw(outcome, folder)
@@ -110,18 +113,6 @@ def _refuse_own_data(context: click.Context) -> None:
             raise click.UsageError(
                 f"--{name} makes data and --measurement reads them: leave one of the two out"
             )
-
-
-def _trajectory(path: Path) -> "Measurement":
-    from tmlattice.errors import MeasurementError
-    from tmlattice.measurement import Measurement, read_measurement
-
-    data = read_measurement(path)
-    if not isinstance(data, Measurement):
-        raise MeasurementError(
-            f"'{path}' is an orbit response; tune-fit takes a trajectory, the first turn of a beam"
-        )
-    return data
 
 
 def _fit(

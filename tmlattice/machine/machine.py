@@ -26,6 +26,20 @@ CHUNK = 64
 """Shots tracked at once: memory does not grow with their number."""
 
 
+def true_causes(ring: Ring, causes: Sequence[Cause]) -> list[dict[str, Any]]:
+    """Causes as a truth file states them: "effect", "element", "s" (m, or None), "amount"."""
+    positions = {element.name: element.s for element in ring.elements}
+    return [
+        {
+            "effect": cause.effect,
+            "element": cause.element,
+            "s": positions.get(cause.element or ""),
+            "amount": cause.amount,
+        }
+        for cause in causes
+    ]
+
+
 class Engine(Protocol):
     """Tracks a ring with causes in it."""
 

@@ -13,7 +13,7 @@ from tmlattice.effects import Cause, Settings, apply, background_rms, check, mon
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.machine.at_engine import PETRA_HARMONIC, PETRA_LENGTH, AtEngine
-from tmlattice.machine.machine import ENGINES
+from tmlattice.machine.machine import ENGINES, true_causes
 from tmlattice.machine.shots import draw_background, stream
 from tmlattice.measurement import OrbitResponse, RfStep
 from tmlattice.response import ResponseModel
@@ -47,17 +47,8 @@ class ResponseSimulation:
 
     def truth(self) -> dict[str, Any]:
         """What was really there, for `write_truth`."""
-        positions = {element.name: element.s for element in self.ring.elements}
         return {
-            "effects": [
-                {
-                    "effect": cause.effect,
-                    "element": cause.element,
-                    "s": positions.get(cause.element or ""),
-                    "amount": cause.amount,
-                }
-                for cause in self.causes
-            ],
+            "effects": true_causes(self.ring, self.causes),
             "launches": np.zeros((0, 5)),
             "background": {
                 **self.background,

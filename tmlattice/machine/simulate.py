@@ -10,7 +10,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.effects import Cause, Settings, background_rms
 from tmlattice.lattice import Ring
-from tmlattice.machine.machine import Machine
+from tmlattice.machine.machine import Machine, true_causes
 from tmlattice.machine.shots import (
     LAUNCH_SIGMA,
     Shots,
@@ -85,18 +85,8 @@ class Simulation:
 
     def truth(self) -> dict[str, Any]:
         """What was really there, for `write_truth`: effects, launches, background, seeds."""
-        ring = self.machine.ring
-        positions = {element.name: element.s for element in ring.elements}
         return {
-            "effects": [
-                {
-                    "effect": cause.effect,
-                    "element": cause.element,
-                    "s": positions.get(cause.element or ""),
-                    "amount": cause.amount,
-                }
-                for cause in self.causes
-            ],
+            "effects": true_causes(self.machine.ring, self.causes),
             "launches": self.shots.launches[:, [0, 1, 2, 3, 5]],
             "background": {
                 **self.background,
