@@ -12,6 +12,7 @@ import numpy as np
 
 import tmlattice
 from tmlattice.diagnosis.data import of_measurement
+from tmlattice.diagnosis.metric import metric
 from tmlattice.diagnosis.model import Model
 from tmlattice.diagnosis.refine import Problem, fit
 from tmlattice.diagnosis.scan import scan
@@ -37,10 +38,8 @@ def scanner(ring, measurement):
     hypotheses = [h for h in model.hypotheses() if h[0] != "monitor_dead"]
 
     def call():
-        return scan(
-            model, base.paths, base.launches, hypotheses, problem.whitening, base.projection,
-            base.residual, data.active,
-        )  # fmt: skip
+        about = metric(model, base.paths, problem.whitening, base.projection, data.active)
+        return scan(about, base.launches, hypotheses, base.residual)
 
     return call, len(hypotheses)
 

@@ -6,6 +6,7 @@ from scipy import stats
 
 from tmlattice.diagnosis import scan as scanning
 from tmlattice.diagnosis.data import of_measurement
+from tmlattice.diagnosis.metric import metric
 from tmlattice.diagnosis.model import Model
 from tmlattice.diagnosis.noise import estimate
 from tmlattice.diagnosis.refine import Problem, fit
@@ -48,11 +49,14 @@ class Base:
         self.whitening = Whitening(self.data, spread)
         self.problem = Problem(self.model, self.data, self.whitening, {})
         self.fit = fit(self.problem, (), self.data.launches)
+        self.metric = metric(
+            self.model, self.fit.paths, self.whitening, self.fit.projection, self.data.active
+        )
 
     def scan(self, hypotheses=None, **options):
         return scanning.scan(
-            self.model, self.fit.paths, self.fit.launches, hypotheses or self.hypotheses,
-            self.whitening, self.fit.projection, self.fit.residual, self.data.active, **options,
+            self.metric, self.fit.launches, hypotheses or self.hypotheses, self.fit.residual,
+            **options,
         )  # fmt: skip
 
     def rows(self, hypotheses):
@@ -99,8 +103,7 @@ def test_sums_behind_each_place_equal_explicit_signatures(kind, request):
 @pytest.mark.parametrize("kind", ["base", "dense"])
 def test_free_kicks_and_free_monitors_equal_explicit_least_squares(kind, request):
     base = request.getfixturevalue(kind)
-    arguments = (base.whitening, base.fit.projection, base.fit.residual, base.data.active)
-    kicks = scanning.scan_kicks(base.model, base.fit.paths, [5, 700, 1400], *arguments)
+    kicks = scanning.scan_kicks(base.metric, [5, 700, 1400], base.fit.residual)
     clean = base.fit.projection.out(base.fit.residual)
     for i, layer in enumerate([5, 700, 1400]):
         kicked = base.model.kick_signatures(base.fit.paths, np.array([layer]))[0]
@@ -111,7 +114,7 @@ def test_free_kicks_and_free_monitors_equal_explicit_least_squares(kind, request
         best, *_ = np.linalg.lstsq(rows.T, clean, rcond=1e-6)
         assert kicks.statistic[i] == pytest.approx(best @ rows @ clean, rel=1e-5)
     shape = base.fit.paths.readings.shape
-    monitors = scanning.scan_monitors(246, shape, *arguments)
+    monitors = scanning.scan_monitors(base.metric, base.fit.residual)
     m = 100
     alone = np.zeros((6, *shape))
     for i, (shot, plane) in enumerate(np.ndindex(3, 2)):

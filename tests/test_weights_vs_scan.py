@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 from tmlattice import TaylorMap, TaylorNetwork, fine_tune
 from tmlattice.diagnosis.data import of_measurement
+from tmlattice.diagnosis.metric import metric
 from tmlattice.diagnosis.model import Model
 from tmlattice.diagnosis.refine import Problem, fit
 from tmlattice.diagnosis.scan import scan
@@ -72,10 +73,8 @@ def test_score_of_the_gradient_is_the_scans_signed_root(small_ring, measurement,
     data = of_measurement(small_ring, measurement)
     problem = Problem(model, data, Whitening(data), {})
     found = fit(problem, (), data.launches)
-    referee = scan(
-        model, found.paths, found.launches, reading.hypotheses, problem.whitening,
-        found.projection, found.residual, data.active, effective=1.0,
-    )  # fmt: skip
+    about = metric(model, found.paths, problem.whitening, found.projection, data.active)
+    referee = scan(about, found.launches, reading.hypotheses, found.residual, effective=1.0)
     root = np.sign(referee.amount) * np.sqrt(referee.statistic)
     # what launches leave a millionth of has lost as many digits in both
     seen = referee.information > 1e-4 * np.median(referee.information)

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.challenge.case import Case, Truth, ring_of
-from tmlattice.challenge.ruler import background_signatures
 from tmlattice.diagnosis.data import Data, joined, of_measurement
+from tmlattice.diagnosis.explain import FALSE_ALARM
 from tmlattice.diagnosis.model import Hypothesis, Model
+from tmlattice.diagnosis.scan import effective_number, free_threshold
+from tmlattice.diagnosis.small_errors import background_signatures
 from tmlattice.diagnosis.whitening import Projection, Whitening
 from tmlattice.effects import Cause, RingEffect, find, names
 from tmlattice.machine import draw_background
@@ -28,7 +30,6 @@ Array = NDArray[np.float64]
 CLASS = 9.0
 """Chi-square within which the oracle cannot tell hypotheses apart."""
 
-FALSE_ALARM = 0.005
 DRAWS = 200
 REFINED = 60
 LISTED = 400
@@ -67,10 +68,12 @@ class Oracle:
                 self.small.append(cause)
         self.model = Model(ring, data.settings, known=known)
         self.paths = self.model.paths(launches, self.small)
-        spread = background_signatures(self.model, launches, truth.background, self.paths)
+        spread = None
         self.linear = np.zeros(self.paths.readings.shape)
-        if spread is not None:
-            rms = np.array([truth.background[cause.effect] for cause in small])
+        if truth.background:
+            _, rms, spread = background_signatures(
+                self.model, self.paths, launches, truth.background
+            )
             amounts = np.array([cause.amount for cause in small])
             self.linear = np.einsum("h,hsrp->srp", amounts / rms, spread)
         self.whitening = Whitening(self.data, spread)
@@ -132,17 +135,11 @@ class Oracle:
         return rows
 
     def _threshold(self, seed: int) -> float:
-        """The largest statistic that noise reaches in 0.5 % of data sets: its simulated tail.
-
-        The largest of N independent chi-squares of one degree; N by maximum likelihood.
-        """
-        from scipy import stats
-
+        """The largest statistic that noise reaches in 0.5 % of data sets: its simulated tail."""
         draws = np.random.default_rng([seed, 7]).standard_normal((DRAWS, self.whitening.rows))
         inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
         largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
-        number = max(DRAWS / -np.log1p(-stats.chi2.sf(largest, 1)).sum(), 1.0)
-        return float(stats.chi2.isf(-np.expm1(np.log1p(-FALSE_ALARM) / number), 1))
+        return free_threshold(FALSE_ALARM, 1, effective_number(largest, 1))
 
 
 def _best(

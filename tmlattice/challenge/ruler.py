@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.data import Data
 from tmlattice.diagnosis.model import Model
+from tmlattice.diagnosis.small_errors import background_signatures
 from tmlattice.diagnosis.whitening import Projection, Whitening
 from tmlattice.effects import Cause, Settings
 from tmlattice.lattice import Ring
@@ -18,20 +19,6 @@ from tmlattice.lattice import Ring
 Array = NDArray[np.float64]
 
 UNKNOWN_LAUNCH = (np.inf, np.inf, np.inf, np.inf, 0.0)
-
-
-def background_signatures(
-    model: Model, launches: Array, rms: Mapping[str, float], paths: object = None
-) -> Array | None:
-    """tau_h s_h of every small error along these trajectories, [error, shot, reading, 2], m."""
-    found = paths or model.paths(launches)
-    parts = []
-    for name, size in rms.items():
-        hypotheses = model.hypotheses([name])
-        if hypotheses:
-            rows = model.signatures(found, hypotheses, launches)  # type: ignore[arg-type]
-            parts.append(size * np.nan_to_num(rows))
-    return np.concatenate(parts) if parts else None
 
 
 class Ruler:
@@ -60,7 +47,9 @@ class Ruler:
         self.launches = launches
         paths = self.model.paths(launches)
         shape = paths.readings.shape
-        spread = background_signatures(self.model, launches, background or {}, paths)
+        spread = None
+        if background:
+            *_, spread = background_signatures(self.model, paths, launches, background)
         data = Data(
             np.zeros(shape),
             np.ones(shape, dtype=bool),

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.metric import Metric, metric
 from tmlattice.diagnosis.model import Hypothesis
 from tmlattice.diagnosis.refine import Fit, Problem, fit
 from tmlattice.diagnosis.scan import (
@@ -90,6 +91,7 @@ class Explanation:
         first, first_kicks: the scans of the launches alone, which saw the first finding.
         scan, left: the last ones, of what is left.
         full: whether the search ended because no more findings were allowed.
+        problem: as the last fit was of it, without what was left out.
     """
 
     fit: Fit
@@ -104,6 +106,7 @@ class Explanation:
     scan: Scan
     left: FreeScan
     full: bool
+    problem: Problem
 
 
 class _Search:
@@ -131,45 +134,23 @@ class _Search:
         self.layers = list(range(len(problem.model.maps.layers)))
 
     # --- one scan -------------------------------------------------------------------------------
-    def scan(self, state: Fit) -> Scan:
+    def metric(self, state: Fit) -> Metric:
         problem = self.problem
+        return metric(
+            problem.model, state.paths, problem.whitening, state.projection, problem.data.active
+        )
+
+    def scan(self, state: Fit, about: Metric | None = None) -> Scan:
         result = scan(
-            problem.model,
-            state.paths,
+            about or self.metric(state),
             state.launches,
             self.hypotheses,
-            problem.whitening,
-            state.projection,
             state.residual,
-            problem.data.active,
             effective=self.effective,
             seed=self.seed,
         )
         self.effective = result.effective
         return result
-
-    def scan_kicks(self, state: Fit) -> FreeScan:
-        problem = self.problem
-        return scan_kicks(
-            problem.model,
-            state.paths,
-            self.layers,
-            problem.whitening,
-            state.projection,
-            state.residual,
-            problem.data.active,
-        )
-
-    def scan_monitors(self, state: Fit) -> FreeScan:
-        problem = self.problem
-        return scan_monitors(
-            len(problem.model.at),
-            state.paths.readings.shape,
-            problem.whitening,
-            state.projection,
-            state.residual,
-            problem.data.active,
-        )
 
     def spike(self, state: Fit) -> tuple[float, tuple[int, int, int], float]:
         """The reading that is least explained: statistic, place, evidence gained by dropping it."""
@@ -242,12 +223,13 @@ class _Search:
         steps = 0
         first: tuple[Scan, FreeScan] | None = None
         while True:
-            found = self.scan(state.fit)
-            kicks = self.scan_kicks(state.fit)
+            about = self.metric(state.fit)
+            found = self.scan(state.fit, about)
+            kicks = scan_kicks(about, self.layers, state.fit.residual)
             first = first or (found, kicks)
             full = len(state.fit.causes) + len(state.fit.kicks) + len(self.monitors) >= self.most
             over = full or len(self.spikes) > SPIKES
-            options = [] if over else self._options(state.fit, found, kicks)
+            options = [] if over else self._options(state.fit, about, found, kicks)
             options = [option for option in options if option.gain > 0]
             seen.add(_names(state.fit))
             if not options:
@@ -274,9 +256,10 @@ class _Search:
             scan=found,
             left=kicks,
             full=full,
+            problem=self.problem,
         )
 
-    def _options(self, state: Fit, found: Scan, kicks: FreeScan) -> list["_Option"]:
+    def _options(self, state: Fit, about: Metric, found: Scan, kicks: FreeScan) -> list["_Option"]:
         """What could be done next."""
         problem = self.problem
         options = []
@@ -292,7 +275,7 @@ class _Search:
         layers, monitors = problem.model.maps.layers, problem.model.maps.monitors
         for kind, free, names, taken in (
             ("kick", kicks, layers, state.kicks),
-            ("monitor", self.scan_monitors(state), monitors, self.monitors),
+            ("monitor", scan_monitors(about, state.residual), monitors, self.monitors),
         ):
             place = int(free.gain.argmax())
             where = int(free.places[place])

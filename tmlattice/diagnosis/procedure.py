@@ -297,6 +297,8 @@ def diagnose(
         model, fitted, before = small.model, small.data, small.before
 
     def problem_without(dropped: NDArray[np.bool_]) -> Problem:
+        if small is not None and not dropped.any():
+            return Problem(model, fitted, small.whitening, places)
         kept = fitted.without(dropped)
         spread = None if small is None else small.spread
         return Problem(model, kept, Whitening(kept, spread), places)
@@ -331,7 +333,10 @@ def diagnose(
         kept = fitted
         p_value = float(stats.chi2.sf(before.chi2, _freedom(fitted, before)))
     fits = [before, result] if causes or result.kicks else [before]
-    estimates = [small.estimate(f) if small else [] for f in fits]
+    estimates: list[list[Cause]] = [[] for _ in fits]
+    if small is not None:
+        seen_by = (small.whitening, explanation.problem.whitening)
+        estimates = [small.estimate(f, w) for f, w in zip(fits, seen_by, strict=False)]
     gap = None
     if heldout is not None:
         other = of_measurement(ring, heldout).with_sigma(np.array(noise))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.model import Hypothesis, Model
+from tmlattice.diagnosis.model import Hypothesis, Model, Paths
 from tmlattice.diagnosis.refine import Fit, Problem, fit
 from tmlattice.diagnosis.whitening import Whitening
 from tmlattice.effects import Cause
@@ -34,6 +34,7 @@ class SmallErrors:
         model: with those amounts in it.
         data: readings plus what the signatures make of the amounts.
         spread: rms times signature of every error, [error, shot, reading, 2], m.
+        whitening: of these data with this spread.
         before: launches alone, in this model.
         hypotheses, rms: of every error.
     """
@@ -41,13 +42,13 @@ class SmallErrors:
     model: Model
     data: Data
     spread: Array
+    whitening: Whitening
     before: Fit
     hypotheses: tuple[Hypothesis, ...]
     rms: Array
 
-    def estimate(self, explained: Fit) -> list[Cause]:
-        """The likeliest small errors beside an explanation."""
-        whitening = Whitening(self.data, self.spread)
+    def estimate(self, explained: Fit, whitening: Whitening) -> list[Cause]:
+        """The likeliest small errors beside an explanation, which was found in this whitening."""
         clean = explained.projection.out(explained.residual)
         return _causes(self.hypotheses, self.rms, self.spread, whitening, clean)
 
@@ -64,6 +65,24 @@ def _causes(
     weights = whitening.back(rows[None])[0]
     amounts = rms * np.einsum("esrp,srp->e", spread, weights, optimize=True)
     return [Cause(*h, float(a)) for h, a in zip(hypotheses, amounts, strict=True)]
+
+
+def background_signatures(
+    model: Model, paths: Paths, launches: Array, rms: Mapping[str, float]
+) -> tuple[list[Hypothesis], Array, Array]:
+    """Every small error along these trajectories.
+
+    Args:
+        model, paths, launches: the base.
+        rms: by effect.
+
+    Returns:
+        Which they are; the rms of each, [error]; rms times signature, [error, shot, reading, 2], m.
+    """
+    hypotheses = model.hypotheses(list(rms))
+    scale = np.array([rms[name] for name, _ in hypotheses])
+    signatures = np.nan_to_num(model.signatures(paths, hypotheses, launches))
+    return hypotheses, scale, scale[:, None, None, None] * signatures
 
 
 def small_errors(
@@ -86,16 +105,7 @@ def small_errors(
     for _ in range(ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
         alone = fit(Problem(model, data, Whitening(data), {}), (), launches)
-        hypotheses: list[Hypothesis] = []
-        parts, sizes = [], []
-        for name, size in rms.items():
-            some = model.hypotheses([name])
-            if some:
-                hypotheses += some
-                sizes += [size] * len(some)
-                parts.append(size * np.nan_to_num(model.signatures(alone.paths, some, launches)))
-        spread = np.concatenate(parts)
-        scale = np.array(sizes)
+        hypotheses, scale, spread = background_signatures(model, alone.paths, launches, rms)
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
         moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
         shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
@@ -104,4 +114,4 @@ def small_errors(
         launches = before.launches
         clean = before.projection.out(before.residual)
         estimate = _causes(hypotheses, scale, spread, whitening, clean)
-    return SmallErrors(model, shifted, spread, before, tuple(hypotheses), scale)
+    return SmallErrors(model, shifted, spread, whitening, before, tuple(hypotheses), scale)

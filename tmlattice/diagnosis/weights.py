@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis import kernels
 from tmlattice.diagnosis.data import of_measurement
+from tmlattice.diagnosis.metric import behind
 from tmlattice.diagnosis.model import Hypothesis, Model
 from tmlattice.diagnosis.noise import estimate
 from tmlattice.diagnosis.refine import Problem, fit
@@ -397,9 +398,9 @@ class _Trajectories:
         clean = found.projection.out(found.residual).reshape(shots, -1)[:, :-5]
         clean = clean.reshape(shots, count, 2)
         # of a change of the launch that only the monitors from each one on see
-        H = _downstream(np.einsum("smpi,smpj->smij", G, G))
-        K = _downstream(np.einsum("smpi,smpq->smiq", G, Q))
-        g = _downstream(np.einsum("smpi,smp->smi", G, clean))
+        H = behind(np.einsum("smpi,smpj->smij", G, G))
+        K = behind(np.einsum("smpi,smpq->smiq", G, Q))
+        g = behind(np.einsum("smpi,smp->smi", G, clean))
         layers = len(model.maps.layers)
         start = model.maps.start[1 : layers + 1]
         back = np.linalg.inv(paths.tangents[:, 1 : layers + 1])  # kick -> change of the launch
@@ -453,13 +454,6 @@ class _Trajectories:
         values, vectors = np.linalg.eigh(information / safe[:, :, None] / safe[:, None])
         values = np.where(values > UNSEEN, values, 0.0)
         return np.asarray(size[:, :, None] * vectors * np.sqrt(values)[:, None])
-
-
-def _downstream(terms: Array) -> Array:
-    """Sums over monitors from each one to the last, and none, [shot, monitor + 1, ...]."""
-    sums = np.zeros((terms.shape[0], terms.shape[1] + 1, *terms.shape[2:]))
-    sums[:, :-1] = np.cumsum(terms[:, ::-1], axis=1)[:, ::-1]
-    return sums
 
 
 def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:

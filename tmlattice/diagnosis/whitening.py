@@ -45,6 +45,7 @@ class Whitening:
         self._inverse: Array | None = None  # of the Cholesky factor: products beat solutions
         if background is not None and len(background):
             B = (self.weight * background).reshape(len(background), -1)
+            B = B[B.any(axis=1)]  # correctors that nobody sets, say, do nothing
             covariance = B.T @ B
             covariance[np.diag_indices(len(covariance))] += 1.0
             factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)

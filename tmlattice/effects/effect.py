@@ -55,25 +55,31 @@ class Effect(ABC):
             UnknownNameError: no such element.
             EffectError: an element that cannot have it, a missing name, an amount not finite.
         """
-        places = self.places(ring)
         if not np.isfinite(cause.amount):
             raise EffectError(f"{self.name}: the amount is {cause.amount}; give a number")
         if self.discrete and cause.amount not in range(int(self.largest) + 1):
             raise EffectError(f"{self.name} is there or not: {self.sign}; not {cause.amount:g}")
-        if places == [None]:
+        places = self._allowed(ring)
+        if None in places:
             if cause.element is not None:
                 raise EffectError(f"{self.name} has no element; leave '{cause.element}' out")
             return
         if cause.element is None:
             raise EffectError(f"{self.name} needs an element: {self.sits_on_text}")
-        if cause.element not in places and cause.element.casefold() not in {
-            place.casefold() for place in places if place is not None
-        }:
+        if cause.element.casefold() not in places:
             kind = ring[cause.element].kind
             raise EffectError(
                 f"{self.name} cannot sit on '{cause.element}', a {kind}; "
                 f"it sits on: {self.sits_on_text}"
             )
+
+    def _allowed(self, ring: Ring) -> frozenset[str | None]:
+        """Its places without regard to case: found once a ring, for thousands of small errors."""
+        key = ("places", self.name)
+        if key not in ring.memory:
+            ring.memory[key] = frozenset(p and p.casefold() for p in self.places(ring))
+        found: frozenset[str | None] = ring.memory[key]
+        return found
 
 
 class RingEffect(Effect):
