@@ -210,6 +210,7 @@ class _Search:
                 others.launches,
                 others.kicks,
                 hopeless=best,
+                slopes=others.slopes,
             )
             best = max(best, tried.log_evidence)
             chosen.append(Rival(hypothesis, tried))
@@ -342,7 +343,9 @@ class _Search:
         """A free kick gives way to a named cause, or to none, where that explains more."""
         others = {k: v for k, v in state.fit.kicks.items() if k != layer}
         seen = {k: v for k, v in state.kicks.items() if k != layer}
-        without = fit(self.problem, state.fit.causes, state.fit.launches, others)
+        without = fit(
+            self.problem, state.fit.causes, state.fit.launches, others, slopes=state.fit.slopes
+        )
         if without.log_evidence > state.fit.log_evidence:
             return _State(without, state.named, seen)
         rivals = self.rivals(without, self.scan(without), 8)
@@ -359,7 +362,9 @@ class _Search:
         k = own[0]
         rest = (*state.fit.causes[:k], *state.fit.causes[k + 1 :])
         named = [*state.named[:k], *state.named[k + 1 :]]
-        without = fit(self.problem, rest, state.fit.launches, state.fit.kicks)
+        without = fit(
+            self.problem, rest, state.fit.launches, state.fit.kicks, slopes=state.fit.slopes
+        )
         if without.log_evidence > state.fit.log_evidence:
             return _State(without, named, state.kicks)
         rivals = self.rivals(without, self.scan(without), 12)
@@ -369,6 +374,7 @@ class _Search:
                 (*rest, state.fit.causes[k]),
                 state.fit.launches,
                 state.fit.kicks,
+                slopes=state.fit.slopes,
             )
             rivals = sorted(
                 [*rivals, Rival(hypothesis, kept)], key=lambda rival: -rival.fit.log_evidence

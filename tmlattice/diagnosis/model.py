@@ -32,6 +32,7 @@ from tmlattice.effects import (
 from tmlattice.effects.settings import groups
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
+from tmlattice.maps.magnets import Weights
 from tmlattice.network.autograd import curved
 from tmlattice.network.monitors import positions
 from tmlattice.network.threads import share
@@ -40,7 +41,12 @@ Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
 """An effect and the place where it might sit."""
 
-Patch = tuple[list[Array], int, list[Array]]
+LayerParts = tuple[Weights, list[Weights]]
+"""The weights of a layer, and the read-outs of the monitors before its magnet."""
+
+MADE = 10_000
+"""Changed layers that a model remembers: some 20 MB."""
+
 FEW = 10
 """Known causes of which a model is worth keeping."""
 
@@ -102,12 +108,27 @@ def _base(ring: Ring, known: tuple[Cause, ...], dimension: int) -> _Base:
 class _Group:
     """Shots with equal settings, and the stacked weights of their ring."""
 
-    def __init__(self, shots: NDArray[np.intp], settings: Settings, active: bool) -> None:
+    def __init__(
+        self, number: int, shots: NDArray[np.intp], settings: Settings, active: bool
+    ) -> None:
+        self.number = number
+        self.layers: frozenset[int] = frozenset()  # that the settings touch
         self.shots = shots
         self.active = active
         self.settings = settings
+        self.latest: tuple[tuple[Hypothesis, ...], Directions] | None = None
         self.W: list[Array] = []
         self.R: list[Array] = []
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """What stood in a group's weights, by layer and by read-out."""
+
+    layers: NDArray[np.intp]
+    W: list[Array]
+    rows: NDArray[np.intp]
+    R: list[Array]
 
 
 class Model:
@@ -146,12 +167,17 @@ class Model:
             np.concatenate([w, c[None]])
             for w, c in zip((maps.W0, maps.W1, maps.W2), maps.closing.coefficients, strict=True)
         ]
-        self.groups = []
+        self._touched: dict[Hypothesis, tuple[int, ...]] = {}
+        self._made: dict[tuple[int, tuple[Cause, ...], int], LayerParts] = {}
+        self.groups: list[_Group] = []
         for shots, setting, there in self._alike(settings):
-            group = _Group(shots, setting, there)
+            group = _Group(len(self.groups), shots, setting, there)
             group.W = [w.copy() for w in base]
             group.R = [r.copy() for r in (maps.R0, maps.R1, maps.R2)]
-            self._patch(group, set_elements(self.ring, setting))
+            replaced = set_elements(self.ring, setting)
+            group.layers = frozenset(int(self.layers.layer_of[place]) for place in replaced)
+            if replaced:
+                self._set(group, {k: self.layers.layer(k, replaced) for k in group.layers})
             self.groups.append(group)
 
     def _alike(
@@ -164,20 +190,55 @@ class Model:
                     yield own, setting, active
 
     # --- weights with causes in them ------------------------------------------------------------
-    def _patch(self, group: _Group, replaced: dict[int, Element]) -> list[Patch]:
-        undo: list[Patch] = []
-        touched = sorted({int(self.layers.layer_of[place]) for place in replaced})
-        for k in touched:
-            own, reads = self.layers.layer(k, replaced)
-            undo.append((group.W, k, [w[k].copy() for w in group.W]))
-            for stack, new in zip(group.W, own, strict=True):
-                stack[k] = new
-            first = int(self.maps.start[k])
-            for i, read in enumerate(reads):
-                undo.append((group.R, first + i, [r[first + i].copy() for r in group.R]))
-                for stack, new in zip(group.R, read, strict=True):
-                    stack[first + i] = new
-        return undo
+    def _set(self, group: _Group, parts: Mapping[int, LayerParts]) -> _Patch:
+        """Put layers into a group's weights; returns what was there."""
+        layers = np.fromiter(parts, dtype=np.intp)
+        old_W = [w[layers] for w in group.W]
+        for stack, new in zip(
+            group.W, zip(*(own for own, _ in parts.values()), strict=True), strict=True
+        ):
+            stack[layers] = new
+        reads = {
+            int(self.maps.start[k]) + i: read
+            for k, (_, found) in parts.items()
+            for i, read in enumerate(found)
+        }
+        rows = np.fromiter(reads, dtype=np.intp)
+        old_R = [r[rows] for r in group.R]
+        if reads:
+            for stack, new in zip(group.R, zip(*reads.values(), strict=True), strict=True):
+                stack[rows] = new
+        return _Patch(layers, old_W, rows, old_R)
+
+    def _parts(self, group: _Group, causes: Sequence[Cause]) -> dict[int, LayerParts]:
+        """The layers that causes touch, as they are with them: groups of equal settings share what
+        no setting touches, and what one fit needed the next one finds."""
+        touching: dict[int, list[Cause]] = {}
+        for cause in causes:
+            for layer in self._layers_of(cause):
+                touching.setdefault(layer, []).append(cause)
+        replaced: dict[int, Element] | None = None
+        found: dict[int, LayerParts] = {}
+        if len(self._made) > MADE:
+            self._made.clear()
+        for layer, own in touching.items():
+            key = (layer, tuple(own), group.number if layer in group.layers else -1)
+            part = self._made.get(key)
+            if part is None:
+                if replaced is None:
+                    replaced = changed_elements(self.ring, causes, group.settings)
+                part = self._made[key] = self.layers.layer(layer, replaced)
+            found[layer] = part
+        return found
+
+    def _layers_of(self, cause: Cause) -> tuple[int, ...]:
+        place = (cause.effect, cause.element)
+        if place not in self._touched:
+            effect = find(cause.effect)
+            assert isinstance(effect, RingEffect)
+            members = effect.members(self.ring, cause.element)
+            self._touched[place] = tuple(sorted({int(self.layers.layer_of[m]) for m in members}))
+        return self._touched[place]
 
     @contextmanager
     def _with(self, group: _Group, causes: Sequence[Cause]) -> Iterator[None]:
@@ -185,13 +246,14 @@ class Model:
         if not ring_causes or not group.active:
             yield
             return
-        undo = self._patch(group, changed_elements(self.ring, ring_causes, group.settings))
+        before = self._set(group, self._parts(group, ring_causes))
         try:
             yield
         finally:
-            for stacks, k, old in undo:
-                for stack, values in zip(stacks, old, strict=True):
-                    stack[k] = values
+            for stack, values in zip(group.W, before.W, strict=True):
+                stack[before.layers] = values
+            for stack, values in zip(group.R, before.R, strict=True):
+                stack[before.rows] = values
 
     def _runs(
         self, causes: Sequence[Cause], kicks: Kicks
@@ -472,9 +534,11 @@ class Model:
             design = _base(self.design, (), self.dimension).layers
             self._base.directions[key] = directions(design, hypotheses)
         base = self._base.directions[key]
-        replaced = set_elements(self.ring, group.settings)
-        if not replaced:
+        if not group.layers:
             return base
+        if group.latest is not None and group.latest[0] == key:
+            return group.latest[1]
+        replaced = set_elements(self.ring, group.settings)
         touched = {self.ring.elements[place].name for place in replaced}
         families = {self.ring.elements[place].family for place in replaced}
         again = [
@@ -493,12 +557,15 @@ class Model:
             )
             for name in names
         }
-        return Directions(
+        found = Directions(
             hypotheses=base.hypotheses,
             owner=np.concatenate([base.owner[keep], owner[fresh.owner]]),
             read_owner=np.concatenate([base.read_owner[keep_read], owner[fresh.read_owner]]),
             **joined,
         )
+        if len(key) > FEW:
+            group.latest = (key, found)
+        return found
 
 
 def _through(monitors: Array, beam: Array) -> Array:

@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 DECADES = 4.0
 """Amounts of a fault reach from its largest down by so many powers of ten."""
 
+SAME = 0.02
+"""A slope is good while amount and orbit change by no more than this share."""
+
 UNKNOWN = 0.05
 """Prior share of faults that the catalogue does not hold."""
 
@@ -56,6 +59,24 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Slope:
+    """d rows / d amount of one cause, [row], and where it was taken: at which amount, and with
+    which orbit, [shot, reading, 2], m."""
+
+    row: Array
+    amount: float
+    beam: Array
+
+    def holds(self, amount: float, beam: Array) -> bool:
+        """Whether amount and orbit are still nearly the same."""
+        if abs(amount - self.amount) > SAME * abs(amount):
+            return False
+        if beam is self.beam:
+            return True
+        return bool(np.linalg.norm(beam - self.beam) <= SAME * np.linalg.norm(beam))
+
+
+@dataclass(frozen=True)
 class Fit:
     """Causes with their best amounts, and what they leave.
 
@@ -71,6 +92,7 @@ class Fit:
         covariance: of the amounts, [cause, cause]; zero for discrete ones.
         log_evidence: up to a constant of the data.
         converged: false where the last step was still significant.
+        slopes: of the causes that are not discrete, by cause.
     """
 
     causes: tuple[Cause, ...]
@@ -83,6 +105,7 @@ class Fit:
     covariance: Array
     log_evidence: float
     converged: bool
+    slopes: Mapping[Hypothesis, Slope] = field(default_factory=dict, repr=False)
 
 
 def amount_prior(cause: Cause) -> float:
@@ -105,6 +128,7 @@ def fit(
     *,
     steps: int = 8,
     hopeless: float = -np.inf,
+    slopes: Mapping[Hypothesis, Slope] | None = None,
 ) -> Fit:
     """The best amounts of these causes, the best free kicks, and the best launches.
 
@@ -115,6 +139,7 @@ def fit(
         kicks: free ones by layer, with first guesses.
         steps: at most.
         hopeless: give up where the evidence stays far below this after two steps.
+        slopes: of an earlier fit of the same problem: those that still hold are not taken again.
     """
     causes, kicks = tuple(causes), dict(kicks or {})
     state = _evaluate(problem, causes, kicks, launches)
@@ -126,12 +151,14 @@ def fit(
     if not np.isfinite(state.chi2):
         return replace(state, covariance=np.zeros((len(causes), len(causes))))
     converged = False
-    rows = _slopes(problem, state)
+    state = replace(state, slopes=dict(slopes or {}))
+    state, rows = _with_slopes(problem, state)
     for step in range(steps):
         change, moved, promised = _step(problem, state, rows)
         best = None
         for shrink in (1.0, 0.5, 0.25, 0.0625):
             trial = _moved(problem, state, shrink * change, shrink * moved)
+            trial = replace(trial, slopes=state.slopes)
             if trial.chi2 < state.chi2 or (shrink == 1.0 and trial.chi2 <= state.chi2 + 1e-6):
                 best = trial
                 break
@@ -143,7 +170,7 @@ def fit(
         if fell < 0.02 and promised < 0.02:
             converged = True
             break
-        rows = _slopes(problem, state)
+        state, rows = _with_slopes(problem, state)
         if step == 1 and -0.5 * state.chi2 < hopeless - 100 - 0.5 * promised:
             break
     return _finished(problem, state, rows, converged)
@@ -173,12 +200,20 @@ def _continuous(fit_: Fit) -> list[int]:
     return [i for i, cause in enumerate(fit_.causes) if not find(cause.effect).discrete]
 
 
-def _slopes(problem: Problem, state: Fit) -> Array:
-    """d rows / d parameters: amounts, then the kicks of each layer in active shots."""
+def _with_slopes(problem: Problem, state: Fit) -> tuple[Fit, Array]:
+    """The fit with slopes that hold; and d rows / d parameters: amounts, then the kicks of each
+    layer in active shots."""
     model, whitening = problem.model, problem.whitening
     rows = []
+    slopes: dict[Hypothesis, Slope] = {}
     for i in _continuous(state):
         cause = state.causes[i]
+        place = (cause.effect, cause.element)
+        known = state.slopes.get(place)
+        if known is not None and known.holds(cause.amount, state.paths.beam):
+            slopes[place] = known
+            rows.append(known.row[None])
+            continue
         effect = find(cause.effect)
         h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
         amounts = (cause.amount + h, cause.amount - h)
@@ -195,7 +230,9 @@ def _slopes(problem: Problem, state: Fit) -> Array:
             )
             for a in amounts
         ]
-        rows.append(whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))[None])
+        row = whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
+        slopes[place] = Slope(row, cause.amount, state.paths.beam)
+        rows.append(row[None])
     shots = np.flatnonzero(problem.data.active)
     for layer in state.kicks:
         kicked = model.kick_signatures(state.paths, np.array([layer]))[0]
@@ -203,7 +240,8 @@ def _slopes(problem: Problem, state: Fit) -> Array:
         for i, shot in enumerate(shots):
             alone[i, :, shot] = kicked[:, shot]
         rows.append(whitening.signature(alone).reshape(2 * len(shots), -1))
-    return np.concatenate(rows) if rows else np.zeros((0, whitening.rows))
+    stacked = np.concatenate(rows) if rows else np.zeros((0, whitening.rows))
+    return replace(state, slopes=slopes), stacked
 
 
 def _step(problem: Problem, state: Fit, rows: Array) -> tuple[Array, Array, float]:

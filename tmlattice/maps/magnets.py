@@ -293,6 +293,10 @@ class RingMaps:
 Weights = tuple[Array, Array, Array]
 
 
+KNOWN = 20_000
+"""Maps that are remembered, some 40 MB: more than a large ring has different elements."""
+
+
 class LayerMaps:
     """The layers of one ring, made one by one, also with some elements replaced.
 
@@ -327,7 +331,7 @@ class LayerMaps:
         self._ways: dict[int, Quadratic] = {}
 
     @staticmethod
-    def physics(element: Element) -> Hashable:
+    def physics(element: Element) -> tuple[Hashable, Hashable]:
         """Equal for elements with equal maps."""
         return (_physics(element.source), element.errors)
 
@@ -336,8 +340,12 @@ class LayerMaps:
         key = self.physics(element)
         known = self._known.get(key)
         if known is None:
+            if len(self._known) > KNOWN:  # a fit asks for ever new amounts
+                self._known.clear()
+                self._kept.clear()
             known = self._known[key] = _quadratic(element, self.ring.energy, self.dimension)
-            self._kept.append(element.source)  # where the key is its id, it must not be freed
+            if isinstance(key[0], int):  # an id: its source must not be freed
+                self._kept.append(element.source)
         return known
 
     def first_element(self, k: int) -> int:
