@@ -33,6 +33,8 @@ class Effect(ABC):
         sits_on_text: the elements it can sit on, for people.
         power: readings change as amount ** power to leading order.
         discrete: it is there or not; the amount says in which form.
+        curved: the square of an amount within the largest fault acts as much as the amount: what
+            is linear about none of it misleads.
     """
 
     name: ClassVar[str]
@@ -43,6 +45,7 @@ class Effect(ABC):
     sits_on_text: ClassVar[str]
     power: ClassVar[int] = 1
     discrete: ClassVar[bool] = False
+    curved: ClassVar[bool] = False
 
     @abstractmethod
     def places(self, ring: Ring) -> list[str | None]:

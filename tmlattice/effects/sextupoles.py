@@ -29,6 +29,7 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     """A sextupole that stands beside its axis."""
 
     name = "sextupole_offset_x"
+    curved = True  # the field at the offset is quadratic
     error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
@@ -41,6 +42,7 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     """A sextupole that stands above or below its axis."""
 
     name = "sextupole_offset_y"
+    curved = True  # the field at the offset is quadratic
     error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
