@@ -138,6 +138,7 @@ def row_of(
         "seconds": result.get("seconds"),
         "closed": result["gap"]["closed"],
         "heldout_chi2_per_dof": _after(result),
+        "heldout_as_noise": _as_noise(result, len(places.monitors) // 2),
         "stated": stated(result, causes),
         "refused": _refused(result),
     }
@@ -179,6 +180,16 @@ def _refused(result: Mapping[str, Any]) -> bool:
 def _after(result: Mapping[str, Any]) -> float | None:
     heldout = result["gap"]["heldout"]
     return None if heldout is None else heldout["after"]["chi2_per_dof"]
+
+
+def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
+    """Whether the held-out misfit of so many scored monitors lies within its 99 % interval."""
+    left = _after(result)
+    if left is None or not np.isfinite(left):
+        return None
+    freedom = 2 * monitors * len(result["gap"]["heldout"]["shots"])
+    low, high = stats.chi2.interval(0.99, freedom)
+    return bool(low <= left * freedom <= high)
 
 
 def clean_gap(
@@ -370,6 +381,13 @@ def _closed(rows: Sequence[Row]) -> dict[str, Any]:
         "ratio": _quantiles(ratios),
         "of_the_floor": _quantiles(floors),
         "chi2_per_dof": _quantiles([r["heldout_chi2_per_dof"] for r in rows if r["findings"]]),
+        "as_noise": rate(
+            [
+                r["heldout_as_noise"]
+                for r in rows
+                if r["findings"] and r["heldout_as_noise"] is not None
+            ]
+        ),
     }
 
 
