@@ -6,6 +6,7 @@
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 
-from tmlattice.diagnosis.procedure import Diagnosis, Finding, Member, diagnose
+from tmlattice.diagnosis.procedure import diagnose
+from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose"]

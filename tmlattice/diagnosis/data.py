@@ -14,9 +14,6 @@ from tmlattice.measurement import Measurement
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-LARGEST_LAUNCH_ERROR = 1.0
-"""m, rad or relative: an unknown launch has no prior; this only keeps numbers finite."""
-
 
 @dataclass(frozen=True)
 class Data:

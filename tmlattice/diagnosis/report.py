@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from tmlattice.diagnosis.procedure import Diagnosis, Finding, Member
+from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.effects import find
 
 WIDTH = 100

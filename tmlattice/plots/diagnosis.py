@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.explain import SHARES
-from tmlattice.diagnosis.procedure import Diagnosis, Finding
 from tmlattice.diagnosis.report import words
+from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.scan import free_threshold
 from tmlattice.plots.strip import lattice_strip
 
