@@ -1,7 +1,7 @@
 """Cases with a withheld cause: AT is the real machine, every case has random numbers of its own."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,7 @@ def make(
     effects: Sequence[str] | None = None,
     amount: float | None = None,
     signal: tuple[float, float] = SIGNAL,
+    background: Mapping[str, float | None] | None = None,
     progress: bool = True,
 ) -> dict[str, int]:
     """Make a challenge; cases that are there already are kept.
@@ -80,6 +81,8 @@ def make(
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a signal to noise that is drawn.
         signal: smallest and largest signal to noise.
+        background: tier B, rms of the small errors by effect (None: the catalogue's own); every
+            usual one if not given.
         progress: show a bar where there is a terminal.
 
     Returns:
@@ -92,6 +95,9 @@ def make(
         raise TmlatticeError(f"no tier '{tier}'; there are {', '.join(TIERS)}")
     if reference and tier != "B":
         raise TmlatticeError("a reference is for tier B; leave --reference out")
+    if background and tier != "B":
+        raise TmlatticeError("small errors everywhere are for tier B; leave --background out")
+    rms = background_rms(background or {"all": None}) if tier == "B" else {}
     chosen = names(effects)
     ring = ring_of(lattice)
     public = {
@@ -104,6 +110,7 @@ def make(
         "effects": None if effects is None else chosen,
         "amount": amount,
         "signal": list(signal),
+        "background": rms,
     }
     if (folder / "challenge.json").exists():
         if read_set(folder) != public:
@@ -118,7 +125,9 @@ def make(
         name = f"{number:04d}"
         if name in there:
             continue
-        draw = CaseDraw(ring, lattice, tier, seed, number, reference, shots, chosen, amount, signal)
+        draw = CaseDraw(
+            ring, lattice, tier, seed, number, reference, shots, chosen, amount, signal, rms
+        )
         case, truth = draw.make(name)
         write_case(folder, case, truth)
         unreachable.update(effect for effect, _, _ in draw.unreachable)
@@ -143,6 +152,7 @@ class CaseDraw:
         effects: Sequence[str] | None = None,
         amount: float | None = None,
         signal: tuple[float, float] = SIGNAL,
+        background: Mapping[str, float] | None = None,
     ) -> None:
         self.ring, self.lattice, self.tier = ring, lattice, tier
         self.effects = names(effects)
@@ -160,7 +170,7 @@ class CaseDraw:
         self.shots = self._draw_shots(shots + HELD_OUT, self.seed)
         before = self._draw_shots(shots, self.seed + 1)
         self.before = before if reference else None
-        self.background = background_rms({"all": None}) if tier == "B" else {}
+        self.background = dict(background or {})
         self.small = draw_background(ring, self.background, self.seed)
         self.unreachable: list[Drawn] = []
 
@@ -185,7 +195,7 @@ class CaseDraw:
             before = len(self.before)
         options: dict[str, Any] = {}
         if self.background:
-            options["background"] = {"all": None}
+            options["background"] = self.background
         causes: list[Cause] = []
         unknown: dict[str, Any] | None = None
         clean, sizes = healthy, []

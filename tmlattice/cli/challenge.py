@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, console, json_option, quiet_option, table
+from tmlattice.cli.options import (
+    FILE,
+    background_option,
+    console,
+    json_option,
+    quiet_option,
+    table,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,8 +66,16 @@ def _cluster_options(function: Any) -> Any:
     help="Smallest and largest signal to noise, log-uniform.",
 )
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
+@background_option("Tier B: small errors everywhere")
 @quiet_option
-def make(tier: str, folder: Path, quiet: bool, effects: tuple[str, ...], **options: Any) -> None:
+def make(
+    tier: str,
+    folder: Path,
+    quiet: bool,
+    effects: tuple[str, ...],
+    background: tuple[tuple[str, float | None], ...],
+    **options: Any,
+) -> None:
     """Make cases of a TIER: A one effect, B one among small errors everywhere, C two or three,
     D one that the catalogue does not hold, E none.
 
@@ -69,8 +84,9 @@ def make(tier: str, folder: Path, quiet: bool, effects: tuple[str, ...], **optio
     from tmlattice.challenge import make as make_cases
 
     lost = make_cases(
-        tier.upper(), folder=folder, effects=effects or None, progress=not quiet, **options
-    )
+        tier.upper(), folder=folder, effects=effects or None, background=dict(background),
+        progress=not quiet, **options,
+    )  # fmt: skip
     if not quiet:
         screen = console()
         screen.print(f"{options['cases']} cases of tier {tier.upper()} in {folder}")

@@ -73,6 +73,17 @@ class BackgroundText(click.ParamType):  # type: ignore[type-arg]
             self.fail(f"'{size}' is no rms; give {name}=1e-3, say", param, ctx)
 
 
+def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """`--background NAME[=RMS]`, repeated."""
+    return click.option(
+        "--background",
+        type=BackgroundText(),
+        multiple=True,
+        help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
+        "one.",
+    )
+
+
 class NameList(click.ParamType):  # type: ignore[type-arg]
     """Names separated by commas."""
 

@@ -10,7 +10,7 @@ import click
 from tmlattice.cli.options import (
     FILE,
     LAUNCH_SIGMA,
-    BackgroundText,
+    background_option,
     console,
     lattice_argument,
     quiet_option,
@@ -53,14 +53,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     multiple=True,
     help="What is wrong with the machine; repeat for more.",
 )
-@click.option(
-    "--background",
-    "background",
-    type=BackgroundText(),
-    multiple=True,
-    help="Random small errors everywhere, with this rms or the catalogue's; "
-    "`all`, or `all=SCALE`, for every usual one.",
-)
+@background_option("Random small errors everywhere")
 @click.option(
     "--kind",
     type=click.Choice(["trajectory", "orbit-response"]),
