@@ -121,34 +121,44 @@ def diagnose(
     before = fit(Problem(model, data, Whitening(data), places), (), start.launches)
     small: SmallErrors | None = None
     fitted = data
+
+    def search() -> Explanation:
+        def problem_without(dropped: NDArray[np.bool_]) -> Problem:
+            if small is not None and not dropped.any():
+                return Problem(model, fitted, small.whitening, places)
+            kept = fitted.without(dropped)
+            spread = None if small is None else small.spread
+            return Problem(model, kept, Whitening(kept, spread), places)
+
+        progress("scan")
+        hypotheses = model.hypotheses(chosen)
+        if (data.launch_sigma[:, 4] > 0).any():  # the energy of every shot is free
+            hypotheses = [h for h in hypotheses if h[0] != "energy_offset"]
+        return explain(
+            problem_without(nobody),
+            hypotheses,
+            before,
+            problem_without,
+            most=max_effects,
+            rate=false_alarm,
+            seed=seed,
+            progress=progress,
+        )
+
     if rms:
         progress("background")
         small = small_errors(ring, data, known, rms, before.launches)
         model, fitted, before = small.model, small.data, small.before
-
-    def problem_without(dropped: NDArray[np.bool_]) -> Problem:
-        if small is not None and not dropped.any():
-            return Problem(model, fitted, small.whitening, places)
-        kept = fitted.without(dropped)
-        spread = None if small is None else small.spread
-        return Problem(model, kept, Whitening(kept, spread), places)
-
-    if small is None:
-        before = fit(problem_without(nobody), (), before.launches)
-    progress("scan")
-    hypotheses = model.hypotheses(chosen)
-    if (data.launch_sigma[:, 4] > 0).any():  # the energy of every shot is free
-        hypotheses = [h for h in hypotheses if h[0] != "energy_offset"]
-    explanation = explain(
-        problem_without(nobody),
-        hypotheses,
-        before,
-        problem_without,
-        most=max_effects,
-        rate=false_alarm,
-        seed=seed,
-        progress=progress,
-    )
+    explanation = search()
+    if small is not None and _misled(small, explanation):
+        progress("background with what was found")
+        found = explanation.fit
+        errors = small.estimate(found, explanation.problem.whitening)
+        clear = [named.detection.statistic for named in explanation.named]
+        strongest = found.causes[int(np.argmax(clear))]  # the others may be the background's
+        small = small_errors(ring, data, known, rms, found.launches, [strongest], errors)
+        model, fitted, before = small.model, small.data, small.before
+        explanation = search()
     progress("report")
     result = explanation.fit
     causes = result.causes
@@ -302,6 +312,15 @@ def _check_lattice(ring: Ring, data: Data, start: Fit) -> None:
             f"the model errs by {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} µm; name "
             "the lattice of this machine, and check units and the names of the monitors"
         )
+
+
+def _misled(small: SmallErrors, explanation: Explanation) -> bool:
+    """Whether a fault is so strong that small errors along its orbit look like further faults."""
+    count = len(explanation.named) + len(explanation.kicks) + len(explanation.monitors)
+    if not explanation.fit.causes:
+        return False
+    freedom = _freedom(explanation.problem.data, explanation.fit)
+    return count > 1 or bool(stats.chi2.sf(explanation.fit.chi2, freedom) < 0.01)
 
 
 # --- after the search ----

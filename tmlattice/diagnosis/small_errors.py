@@ -91,6 +91,8 @@ def small_errors(
     known: Sequence[Cause],
     rms: Mapping[str, float],
     launches: Array,
+    causes: Sequence[Cause] = (),
+    estimate: Sequence[Cause] = (),
 ) -> SmallErrors:
     """The background of a machine as these data show it.
 
@@ -100,18 +102,23 @@ def small_errors(
         known: causes that are there anyway.
         rms: by effect.
         launches: first guess, [shot, 5].
+        causes: what was found already: small errors act along the orbit that it makes.
+        estimate: the likeliest small errors beside it.
     """
-    estimate: list[Cause] = []
-    for _ in range(ROUNDS):
+    fixed = tuple(causes)
+    for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
-        alone = fit(Problem(model, data, Whitening(data), {}), (), launches)
+        alone = fit(Problem(model, data, Whitening(data), {}, fixed), (), launches)
         hypotheses, scale, spread = background_signatures(model, alone.paths, launches, rms)
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
         moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
         shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
         whitening = Whitening(shifted, spread)
-        before = fit(Problem(model, shifted, whitening, {}), (), alone.launches)
-        launches = before.launches
-        clean = before.projection.out(before.residual)
+        explained = fit(Problem(model, shifted, whitening, {}, fixed), (), alone.launches)
+        launches = explained.launches
+        clean = explained.projection.out(explained.residual)
         estimate = _causes(hypotheses, scale, spread, whitening, clean)
+    before = explained
+    if fixed:
+        before = fit(Problem(model, shifted, whitening, {}), (), launches)
     return SmallErrors(model, shifted, spread, whitening, before, tuple(hypotheses), scale)
