@@ -26,133 +26,139 @@ _ROUNDING = 1e-16
 
 
 @_jit
-def _largest(size, values):  # type: ignore[no-untyped-def]
-    """The largest of values [lane], a power of two of them, which are lost; NaN is passed over.
+def _scratch(size):  # type: ignore[no-untyped-def]
+    """Room for a layer: the state x, its image y, the middle m, the step d [n, lane each], and the
+    largest change of the middle [lane].
 
-    Halves are compared with halves: the vector unit does it, as it does not a plain maximum.
+    One flat array, whose parts the compiler knows to be apart: with five arrays it tests before
+    every short loop whether they overlap, which costs as much as the loop.
     """
-    half = len(size[1]) // 2
+    return np.zeros((4 * len(size[0]) + 1) * len(size[1]))
+
+
+@_jit
+def _part(size, work, which):  # type: ignore[no-untyped-def]
+    """x, y, m or d (0 to 3) of the room as [n, lane], a view."""
+    n, lanes = len(size[0]), len(size[1])
+    return work[which * n * lanes : (which + 1) * n * lanes].reshape((n, lanes))
+
+
+@_jit
+def _flat_field(size, k, Q, work):  # type: ignore[no-untyped-def]
+    """d = f(m) for a cubic generator that is even in (y, py)."""
+    n, lanes = 4, len(size[1])
+    m, d = 2 * n * lanes, 3 * n * lanes
+    for a in range(2):
+        xx, xp, pp = Q[k, a, 0], Q[k, a, 1], Q[k, a, 4]
+        yy, yq, qq = Q[k, a, 7], Q[k, a, 8], Q[k, a, 9]
+        for v in range(lanes):
+            x, p = work[m + v], work[m + lanes + v]
+            y, q = work[m + 2 * lanes + v], work[m + 3 * lanes + v]
+            in_x = (xx * x + xp * p) * x + pp * p * p
+            work[d + a * lanes + v] = in_x + ((yy * y + yq * q) * y + qq * q * q)
+    for a in range(2, 4):
+        xy, xq, py, pq = Q[k, a, 2], Q[k, a, 3], Q[k, a, 5], Q[k, a, 6]
+        for v in range(lanes):
+            x, p = work[m + v], work[m + lanes + v]
+            y, q = work[m + 2 * lanes + v], work[m + 3 * lanes + v]
+            work[d + a * lanes + v] = (xy * y + xq * q) * x + (py * y + pq * q) * p
+
+
+@_jit
+def _middle(size, work):  # type: ignore[no-untyped-def]
+    """m = y + d / 2; the largest change of any m."""
+    n, lanes = len(size[0]), len(size[1])
+    y, m, d, change = n * lanes, 2 * n * lanes, 3 * n * lanes, 4 * n * lanes
+    for v in range(lanes):
+        largest = 0.0
+        for a in range(n):
+            middle = work[y + a * lanes + v] + 0.5 * work[d + a * lanes + v]
+            moved = abs(middle - work[m + a * lanes + v])
+            largest = moved if moved > largest else largest
+            work[m + a * lanes + v] = middle
+        work[change + v] = largest
+    return _largest(size, work)
+
+
+@_jit
+def _largest(size, work):  # type: ignore[no-untyped-def]
+    """Over the lanes, a power of two of them; NaN is passed over. Halves are compared with halves:
+    the vector unit does it, as it does not a plain maximum."""
+    first, half = 4 * len(size[0]) * len(size[1]), len(size[1]) // 2
     while half > 0:
         for v in range(half):
-            # Not max(): numba's looks for NaN, one lane after another.
-            other = values[v + half]
-            values[v] = other if other > values[v] else values[v]
+            mine, other = work[first + v], work[first + v + half]
+            work[first + v] = other if other > mine else mine
         half //= 2
-    return values[0]
+    return work[first]
 
 
 @_jit
-def _flat_field(size, k, Q, m, d):  # type: ignore[no-untyped-def]
-    """d = f(m) for a cubic generator that is even in (y, py).
-
-    One row after another: the vectoriser gives up where too many arrays might overlap.
-    """
-    for a in range(2):
-        for v in range(len(size[1])):
-            x, p, y, q = m[0, v], m[1, v], m[2, v], m[3, v]
-            in_x = (Q[k, a, 0] * x + Q[k, a, 1] * p) * x + Q[k, a, 4] * p * p
-            in_y = (Q[k, a, 7] * y + Q[k, a, 8] * q) * y + Q[k, a, 9] * q * q
-            d[a, v] = in_x + in_y
-    for a in range(2, 4):
-        for v in range(len(size[1])):
-            x, p, y, q = m[0, v], m[1, v], m[2, v], m[3, v]
-            by_x = Q[k, a, 2] * y + Q[k, a, 3] * q
-            by_p = Q[k, a, 5] * y + Q[k, a, 6] * q
-            d[a, v] = by_x * x + by_p * p
-
-
-@_jit
-def _middle(size, y, d, m, change):  # type: ignore[no-untyped-def]
-    """m = y + d / 2, and by how much it changed, change [lane]."""
-    for v in range(len(size[1])):
-        middle = y[0, v] + 0.5 * d[0, v]
-        change[v] = abs(middle - m[0, v])
-        m[0, v] = middle
-    for a in range(1, len(size[0])):
-        for v in range(len(size[1])):
-            middle = y[a, v] + 0.5 * d[a, v]
-            moved = abs(middle - m[a, v])
-            change[v] = moved if moved > change[v] else change[v]
-            m[a, v] = middle
-
-
-@_jit
-def _layer(size, k, W0, W1, c, A, Q, moves, flat, x, m, d, change, y):  # type: ignore[no-untyped-def]
-    """y [n, lane] = layer k of x; m is left as the middle, d and change [lane] as they come."""
+def _layer(size, k, W0, W1, c, A, Q, moves, flat, work):  # type: ignore[no-untyped-def]
+    """x of the room becomes its image by layer k; m is left as the middle."""
     n, lanes = len(size[0]), len(size[1])
+    y, m, d, change = n * lanes, 2 * n * lanes, 3 * n * lanes, 4 * n * lanes
     for a in range(n):
         for v in range(lanes):
             total = 0.0
             for i in range(n):
-                total += W1[k, a, i] * x[i, v]
-            y[a, v] = total
-    for a in range(n):
-        for v in range(lanes):
-            m[a, v] = y[a, v]
+                total += W1[k, a, i] * work[i * lanes + v]
+            work[y + a * lanes + v] = total
+            work[m + a * lanes + v] = total
+            work[d + a * lanes + v] = 0.0
     if moves[k]:
         for v in range(lanes):
-            change[v] = abs(y[0, v])
-        for a in range(1, n):
-            for v in range(lanes):
-                other = abs(y[a, v])
-                change[v] = other if other > change[v] else change[v]
-        scale = _largest(size, change)
+            largest = 0.0
+            for a in range(n):
+                other = abs(work[y + a * lanes + v])
+                largest = other if other > largest else largest
+            work[change + v] = largest
+        scale = _largest(size, work)
         before, left = scale, 0.0
         for _ in range(_ITERATIONS):
             if flat[k]:
-                _flat_field(size, k, Q, m, d)
+                _flat_field(size, k, Q, work)
             else:
-                _polynomial(size, k, c, A, Q, moves, m, d)
-            _middle(size, y, d, m, change)
-            left = _largest(size, change)
+                _polynomial(size, k, c, A, Q, moves, _part(size, work, 2), _part(size, work, 3))
+            left = _middle(size, work)
             # What is still wrong is this change times the factor by which changes shrink.
             if not 4.0 * left * left > _ROUNDING * scale * before:
                 break
             before = left
         wrong = 4.0 * left * left
         if wrong > 1e-9 * scale * before and wrong > 1e-15 * before:  # too strong a generator
-            for a in range(n):
-                for v in range(lanes):
-                    d[a, v] = np.nan
-        for a in range(n):
-            for v in range(lanes):
-                y[a, v] += d[a, v] + W0[k, a]
-    else:
-        for a in range(n):
-            for v in range(lanes):
-                y[a, v] += W0[k, a]
+            for v in range(n * lanes):
+                work[d + v] = np.nan
+    for a in range(n):
+        kick = W0[k, a]
+        for v in range(lanes):
+            i = a * lanes + v
+            work[i] = work[y + i] + work[d + i] + kick
 
 
 @_jit
 def forward(first, last, size, W0, W1, c, A, Q, moves, flat, states, middles):  # type: ignore[no-untyped-def]
     """Fill states [block, 1:, n, lane] and middles from states[block, 0]."""
-    d = np.empty((len(size[0]), len(size[1])))
-    change = np.empty(len(size[1]))
+    work = _scratch(size)
+    x, m = _part(size, work, 0), _part(size, work, 2)
     for block in range(first, last):
+        x[:] = states[block, 0]
         for k in range(W0.shape[0]):
-            _layer(
-                size, k, W0, W1, c, A, Q, moves, flat, states[block, k], middles[block, k], d,
-                change, states[block, k + 1],
-            )  # fmt: skip
+            _layer(size, k, W0, W1, c, A, Q, moves, flat, work)
+            states[block, k + 1] = x
+            middles[block, k] = m
 
 
 @_jit
 def track(first, last, size, W0, W1, c, A, Q, moves, flat, turns):  # type: ignore[no-untyped-def]
     """Fill turns [block, 1:, n, lane] from turns[block, 0]."""
-    n, lanes = len(size[0]), len(size[1])
-    x = np.empty((n, lanes))
-    y = np.empty((n, lanes))
-    m = np.empty((n, lanes))
-    d = np.empty((n, lanes))
-    change = np.empty(lanes)
+    work = _scratch(size)
+    x = _part(size, work, 0)
     for block in range(first, last):
         x[:] = turns[block, 0]
         for turn in range(1, turns.shape[1]):
             for k in range(W0.shape[0]):
-                _layer(size, k, W0, W1, c, A, Q, moves, flat, x, m, d, change, y)
-                for a in range(n):
-                    for v in range(lanes):
-                        x[a, v] = y[a, v]
+                _layer(size, k, W0, W1, c, A, Q, moves, flat, work)
             turns[block, turn] = x
 
 
