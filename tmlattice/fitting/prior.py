@@ -26,6 +26,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.data import FirstTurn, first_turn, readings_of, tangents
+from tmlattice.fitting.sparse import best_single
 from tmlattice.fitting.strengths import LARGEST, ring_strengths
 from tmlattice.lattice import Ring
 from tmlattice.maps import RingMaps
@@ -70,6 +71,7 @@ class _Strengths:
     """The amounts are relative changes of strengths, in units of `STRENGTH_RMS`."""
 
     def __init__(self, network: TaylorNetwork, ring: Ring, kinds: Sequence[str]) -> None:
+        self.design = network
         self.network = network.copy()
         self.network.requires_grad_(False)
         self.known = ring_strengths(ring, kinds, network.dimension)
@@ -231,13 +233,23 @@ def tune_slopes(space: _Space) -> Array:
 class _Fit:
     """The most probable amounts, for one prior and one scale."""
 
-    def __init__(self, space: _Space, data: FirstTurn, scale: float | None, tails: bool) -> None:
+    def __init__(
+        self,
+        space: _Space,
+        data: FirstTurn,
+        scale: float | None,
+        tails: bool,
+        start: Array | None = None,
+    ) -> None:
         self.space, self.data, self.scale, self.tails = space, data, scale, tails
         self.there = data.present.ravel()
         self.sigma2 = data.sigma[data.present] ** 2
-        self.amounts = np.zeros(len(space.layer))
+        self.amounts = np.zeros(len(space.layer)) if start is None else start
         self.readings = self.put(self.amounts)
-        self.widening = WIDEST if tails else 1.0
+        self.widening = WIDEST if tails and start is None else 1.0
+        self.choosing = scale is None
+        self.chi2 = [self.misfit()]
+        self.settled = False
 
     @property
     def width(self) -> float:
@@ -248,6 +260,29 @@ class _Fit:
     def put(self, amounts: Array) -> Array:
         self.space.put(amounts)
         return readings_of(self.space.network, self.data.launches)
+
+    def misfit(self) -> float:
+        return float(np.sum(self.data.left(self.readings) ** 2))
+
+    def run(self, iterations: int) -> None:
+        """To the maximum, from a noise far above the readings' own down to it."""
+        trust = float(np.sqrt(np.mean(self.left(self.readings) ** 2))) / FIRST_TRUST
+        while True:
+            trust = 0.0 if trust < np.sqrt(self.sigma2.min()) else trust
+            for i in range(iterations):
+                self.settled = self.iterate(trust, self.choosing and i < 4)
+                self.chi2.append(self.misfit())
+                if self.settled:
+                    break
+            if trust == 0.0:
+                return
+            trust /= 10
+
+    def final_cost(self) -> float:
+        """Of the amounts found, with the readings' own noise and the prior's own width."""
+        self.put(self.amounts)
+        half = cho_factor(self.base(_Linear(self.space, self.data), 0.0))
+        return self.cost(half, self.left(self.readings), self.amounts)
 
     def left(self, readings: Array) -> Array:
         return np.asarray((self.data.readings - readings)[self.data.present])
@@ -366,19 +401,18 @@ def fit_map(
     data = first_turn(space.network, measurement, noise, launch_sigma)
     tails = prior is Prior.FAULTS
     fit = _Fit(space, data, FAULT_SCALE if tails and scale is None else scale, tails)
-    chi2 = [float(np.sum(data.left(fit.readings) ** 2))]
-    smallest = float(np.sqrt(fit.sigma2.min()))
-    trust = float(np.sqrt(np.mean(fit.left(fit.readings) ** 2))) / FIRST_TRUST
-    while True:
-        trust = 0.0 if trust < smallest else trust
-        for i in range(iterations):
-            done = fit.iterate(trust, choose_scale=not tails and scale is None and i < 4)
-            chi2.append(float(np.sum(data.left(fit.readings) ** 2)))
-            if done:
-                break
-        if trust == 0.0:
-            break
-        trust /= 10
+    fit.run(iterations)
+    if tails:  # many maxima: another start is the one magnet that explains most
+        assert isinstance(space, _Strengths)
+        single = best_single(space.design, space.known, data)
+        if single is not None:
+            start = np.zeros(len(space.layer))
+            start[single.causes[0]] = single.amounts[0] / STRENGTH_RMS
+            other = _Fit(space, data, fit.scale, tails, start)
+            other.run(iterations)
+            best = min((fit, other), key=_Fit.final_cost)
+            best.put(best.amounts)
+            fit = best
     tunes, sigma, errors = _posterior(fit)
     changes = {
         name: (float(STRENGTH_RMS * amount), float(STRENGTH_RMS * error))
@@ -387,10 +421,10 @@ def fit_map(
     space.network.requires_grad_(True)
     return FitResult(
         network=space.network,
-        loss=[c * float(np.mean(fit.sigma2)) / len(data.launches) for c in chi2],
-        penalty=[0.0] * len(chi2),
-        best_epoch=len(chi2) - 1,
-        stopped_early=done,
+        loss=[c * float(np.mean(fit.sigma2)) / len(data.launches) for c in fit.chi2],
+        penalty=[0.0] * len(fit.chi2),
+        best_epoch=len(fit.chi2) - 1,
+        stopped_early=fit.settled,
         seconds=time.perf_counter() - begun,
         options={
             "method": "map",

@@ -27,6 +27,10 @@ from tmlattice.optics import matrix_tunes
 Array = NDArray[np.float64]
 
 
+FAULT = 0.3
+"""Prior rms of the relative change of a strength that has changed."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """Some changed strengths, fitted to the readings.
@@ -277,7 +281,7 @@ def fit_sparse(
     kinds: Sequence[str] = ("quadrupole", "sextupole"),
     noise: float | None = None,
     launch_sigma: ArrayLike | None = None,
-    fault: float = 0.3,
+    fault: float = FAULT,
     largest_number: int = 5,
     refined: int = 12,
     candidates: Sequence[str] | None = None,
@@ -368,6 +372,15 @@ def fit_sparse(
             for c, a, e in zip(best.causes, best.amounts, errors, strict=True)
         },
     )
+
+
+def best_single(
+    network: TaylorNetwork, strengths: RingStrengths, data: FirstTurn, refined: int = 12
+) -> Explanation | None:
+    """The one changed strength of greatest evidence, whether or not it is better than none."""
+    search = _Search(network, strengths, data, FAULT)
+    none = search.fit((), np.zeros(0))
+    return None if none is None else _best_of(search, none, refined)
 
 
 def _best_of(search: _Search, start: Explanation, number: int) -> Explanation | None:
