@@ -20,7 +20,7 @@ KINDS = ("quadrupole", "sextupole")
 
 DOZEN = (
     "qf::3", "qd_b1::1", "qd_b1::2", "q2_a4", "qa3_ne", "qa4::7", "qa1::12", "qe5::4", "qf::32",
-    "qf::40", "qd::46", "qd::4",
+    "qf::40", "qd::46", "qd::4", "qa4::14",
 )  # fmt: skip
 
 
@@ -103,6 +103,21 @@ def test_a_dozen_magnets_of_petra3_keep_their_rates(petra3):
     assert (np.median(errors, axis=0) < 3e-4).all()
     assert (errors < 4 * stated).all()
     assert np.median([c.prediction_rms for c in stable]) < 2 * 2e-5
+
+
+def test_told_states_the_cramer_rao_bound(small_ring, small_network):
+    """What the readings hold of one known magnet, by differences of whole rings."""
+    case = run_case(
+        small_ring, "QD::5", "told", change=-0.02, noise=1e-6, launch=(1e-4, 0.0, 1e-4, 0.0)
+    )
+    step, ends = 1e-4, []
+    for sign in (1, -1):
+        ring = perturbed_ring(small_ring, "QD::5", -0.02 + sign * step)
+        readings = TaylorNetwork.from_ring(ring)([[1e-4, 0.0, 1e-4, 0.0]]).detach().numpy()
+        ends.append((readings, matrix_tunes(ring_matrix(ring))))
+    slope = np.linalg.norm(ends[0][0] - ends[1][0])
+    bound = np.abs(ends[0][1] - ends[1][1]) * 1e-6 / slope
+    np.testing.assert_allclose(case.tune_sigma, bound, rtol=0.02)  # it is taken at the fit
 
 
 # --- map ---

@@ -31,6 +31,11 @@ FAULT = 0.3
 """Prior rms of the relative change of a strength that has changed."""
 
 
+RARER = 10.0
+"""Each cause beyond the first is so many times less likely than the one before: faults are rare,
+and with hundreds of candidates a false second one would else come in one case of a hundred."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """Some changed strengths, fitted to the readings.
@@ -170,7 +175,8 @@ class _Search:
         shift = np.zeros(data.launches.size)
         shift[moving] = free[number:]
         _, volume = np.linalg.slogdet(normal)
-        evidence = -0.5 * current - 0.5 * float(volume) - number * np.log(len(self.layer))
+        room = number * np.log(len(self.layer)) + max(number - 1, 0) * np.log(RARER)
+        evidence = -0.5 * current - 0.5 * float(volume) - room
         return Explanation(
             causes, free[:number], data.launches + shift.reshape(data.launches.shape),
             covariance[:number, :number], float(residual @ residual), evidence,
