@@ -42,6 +42,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
     assert result["cases"] == 2
     assert result["methods"]["sparse"]["right"] == 1.0
     assert result["methods"]["adam"]["right"] is None
+    assert result["methods"]["adam"]["stated"]["x"]["median"] is None
     assert "worst" in done.stdout
     assert done.stderr == ""
     folder = tmp_path / "study-tune-fit"
@@ -57,7 +58,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
     again = json.loads((tmp_path / "study.json").read_text())
     assert [r["abs_dq"] for r in again["results"]] == [r["abs_dq"] for r in result["results"]]
     with pytest.raises(TmlatticeError, match="other options"):
-        list(study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=folder))
+        study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=folder)
 
 
 def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(monkeypatch):
@@ -65,10 +66,10 @@ def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(mon
 
     from tmlattice.fitting import study
 
-    def broken(lattice, job, options):
-        if job[0] == "QF::1":
+    def broken(task):
+        if task[1][0] == "QF::1":
             raise RuntimeError("the worker broke")
-        return work(lattice, job, options)
+        return work(task)
 
     work = study._work
     monkeypatch.setattr(study, "_work", broken)
@@ -76,10 +77,8 @@ def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(mon
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as cluster:
-        cases = list(
-            study_tune_fit(
-                SMALL, ["sparse"], scheduler=cluster.scheduler_address, progress=False, **QUICK
-            )
+        cases = study_tune_fit(
+            SMALL, ["sparse"], scheduler=cluster.scheduler_address, progress=False, **QUICK
         )
     assert len(cases) == 3
     failed = [c for c in cases if c.problem]
@@ -92,7 +91,7 @@ def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(mon
 
 def test_no_scheduler_and_no_method_are_said(tmp_path):
     with pytest.raises(TmlatticeError, match="no method 'magic'"):
-        list(study_tune_fit(SMALL, ["magic"]))
+        study_tune_fit(SMALL, ["magic"])
 
 
 def test_unstable_rings_are_counted_apart(small_ring):

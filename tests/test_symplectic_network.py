@@ -194,15 +194,15 @@ def test_a_layer_far_from_symplectic_is_refused(small_network):
 
 
 @pytest.mark.slow
-def test_costs_at_most_four_truncated_sweeps(petra3_network):
-    launch = np.array([[3e-3, 0, 3e-3, 0]])
-    times = {}
-    for network in (petra3_network, petra3_network.symplectic()):
-        network.track(launch, 2)
-        best = np.inf
-        for _ in range(5):
+@pytest.mark.parametrize(("particles", "turns"), [(1, 300), (64, 60)])
+def test_costs_at_most_four_truncated_sweeps(petra3_network, particles, turns):
+    launch = np.outer(np.linspace(0.1, 1.0, particles), [3e-3, 0, 3e-3, 0])
+    networks = petra3_network, petra3_network.symplectic()
+    best = [np.inf, np.inf]
+    for _ in range(8):  # in turn: a busy machine slows both
+        for i, network in enumerate(networks):
+            network.track(launch, 2)
             begun = time.process_time()
-            network.track(launch, 300)
-            best = min(best, time.process_time() - begun)
-        times[type(network).__name__] = best
-    assert times["SymplecticNetwork"] <= 4 * times["TaylorNetwork"]
+            network.track(launch, turns)
+            best[i] = min(best[i], time.process_time() - begun)
+    assert best[1] <= 4 * best[0]

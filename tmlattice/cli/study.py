@@ -111,16 +111,14 @@ def tune_fit(
     chosen = tuple(name.strip() for name in methods.split(","))
     with ExitStack() as files:
         path = files.enter_context(output_file(json_file)) if json_file else None
-        cases = list(
-            study_tune_fit(
-                lattice, chosen, progress=not quiet, folder=out, scheduler=scheduler,
-                workers=workers, **options,
-            )
+        cases = study_tune_fit(
+            lattice, chosen, progress=not quiet, folder=out, scheduler=scheduler,
+            workers=workers, **options,
         )  # fmt: skip
         cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
         summary = {
             "format": "tmlattice-study-tune-fit",
-            "version": 2,
+            "version": 3,
             "package": __version__,
             "lattice": lattice,
             "options": {**options, "launch": list(options["launch"])},
@@ -299,11 +297,13 @@ def _print(summary: dict[str, Any]) -> None:
                 str(entry["failed"]),
             )
         screen.print(errors)
-    more = table("", "right magnet", "within stated 95 %, x", "y", "residual [µm]",
-                 "new launches [µm]", "seconds")  # fmt: skip
+    more = table("", "right magnet", "stated error x, median", "y", "within 95 % of it, x", "y",
+                 "residual [µm]", "new launches [µm]", "seconds")  # fmt: skip
     for name, entry in summary["methods"].items():
         shown = (
             (entry["right"], 1, "{:.1%}"),
+            (entry["stated"]["x"]["median"], 1, "{:.2e}"),
+            (entry["stated"]["y"]["median"], 1, "{:.2e}"),
             (entry["coverage"]["x"], 1, "{:.1%}"),
             (entry["coverage"]["y"], 1, "{:.1%}"),
             (entry["orbit_rms"], 1e6, "{:.2f}"),

@@ -31,7 +31,7 @@ def fine_tune(
         network: the design.
         measurement: launches and readings.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
-            (`fitting.adam.fit_adam`); "map", the most probable changes under a Gaussian prior
+            (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
             (`fitting.prior.fit_map`); "sparse", as few changed magnets as the evidence asks for
             (`fitting.sparse.fit_sparse`). The last two state the error of their tunes.
         options: of the method, see there.

@@ -18,18 +18,22 @@ from numpy.typing import ArrayLike, NDArray
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.data import FirstTurn, first_turn, readings_of, tangents
-from tmlattice.fitting.strengths import Strength, ring_strengths
+from tmlattice.fitting.strengths import LARGEST, RingStrengths, ring_strengths
 from tmlattice.lattice import Ring
-from tmlattice.maps import ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
-from tmlattice.network.network import chain
 from tmlattice.optics import matrix_tunes
 
 Array = NDArray[np.float64]
 
-LARGEST = 1.5
-"""A strength may change by this much, either way; beyond, it is another magnet."""
+
+FAULT = 0.3
+"""Prior rms of the relative change of a strength that has changed."""
+
+
+RARER = 10.0
+"""Each cause beyond the first is so many times less likely than the one before: faults are rare,
+and with hundreds of candidates a false second one would else come in one case of a hundred."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +63,9 @@ class _Search:
     def __init__(
         self,
         network: TaylorNetwork,
-        strengths: Sequence[Strength],
+        strengths: RingStrengths,
         data: FirstTurn,
         fault: float,
-        derivatives: tuple[Array, Array, Array],
     ) -> None:
         self.design = network
         self.model = network.copy()
@@ -70,21 +73,25 @@ class _Search:
         self.strengths = strengths
         self.data = data
         self.fault = fault
-        self.d0, self.d1, self.d2 = derivatives
-        self.layer = np.array([s.layer for s in strengths])
+        self.layer = strengths.layer
+        closing = network.maps.closing.coefficients[1]
+        steps = np.concatenate([network.weights()[1], closing[None]])[:, :4, :4]
+        self.upto = np.empty((len(steps) + 1, 4, 4))  # from the start to every exit, and the end
+        self.upto[0] = np.eye(4)
+        for k, step in enumerate(steps):
+            self.upto[k + 1] = step @ self.upto[k]
         self.known: dict[tuple[int, ...], Explanation | None] = {}
         self.now: dict[int, float] = {}
 
     def _put(self, causes: Sequence[int], amounts: ArrayLike) -> None:
+        now = dict(zip(causes, map(float, np.asarray(amounts)), strict=True))
+        if not now or now == self.now:
+            return  # only the launches are moving
+        self.now = now
+        new = self.strengths.only(list(causes)).weights(amounts)
         with torch.no_grad():
-            for cause, amount in zip(causes, np.asarray(amounts), strict=True):
-                if self.now.get(cause) == float(amount):
-                    continue  # only the launches are moving
-                self.now[cause] = float(amount)
-                strength = self.strengths[cause]
-                new = strength.weights(float(amount), self.design.dimension)
-                for parameter, weight in zip(self.model.parameters(), new, strict=True):
-                    parameter[strength.layer] = torch.from_numpy(weight)
+            for parameter, weight in zip(self.model.parameters(), new, strict=True):
+                parameter[self.layer[list(causes)]] = torch.from_numpy(weight)
 
     def _take_back(self, causes: Sequence[int]) -> None:
         self.now.clear()
@@ -168,7 +175,8 @@ class _Search:
         shift = np.zeros(data.launches.size)
         shift[moving] = free[number:]
         _, volume = np.linalg.slogdet(normal)
-        evidence = -0.5 * current - 0.5 * float(volume) - number * np.log(len(self.strengths))
+        room = number * np.log(len(self.layer)) + max(number - 1, 0) * np.log(RARER)
+        evidence = -0.5 * current - 0.5 * float(volume) - room
         return Explanation(
             causes, free[:number], data.launches + shift.reshape(data.launches.shape),
             covariance[:number, :number], float(residual @ residual), evidence,
@@ -182,6 +190,9 @@ class _Search:
         data = self.data
         maps = self.design.maps
         self._put(explanation.causes, explanation.amounts)
+        changes = np.zeros(len(self.layer))
+        changes[list(explanation.causes)] = explanation.amounts
+        d0, d1, d2 = self.strengths.slopes(changes)
         blocks, taken = [], []
         try:
             left = (data.readings - readings_of(self.model, explanation.launches)) / data.sigma
@@ -190,8 +201,8 @@ class _Search:
                 entrance = path[self.layer]
                 i, j = np.triu_indices(len(x))
                 pairs = entrance[:, i] * entrance[:, j]
-                kick = self.d0 + np.einsum("jab,jb->ja", self.d1, entrance)
-                kick += np.einsum("jam,jm->ja", self.d2, pairs)
+                kick = d0 + np.einsum("jab,jb->ja", d1, entrance)
+                kick += np.einsum("jam,jm->ja", d2, pairs)
                 at_start = np.einsum("jab,jb->ja", back[self.layer + 1], kick)
                 rows = maps.R1 @ M[maps.at]  # [monitor, 2, n]
                 seen = maps.at[:, None] > self.layer
@@ -229,12 +240,18 @@ class _Search:
         Raises:
             UnstableRingError: it has none.
         """
-        matrices = np.concatenate(
-            [self.design.weights()[1], self.design.maps.closing.coefficients[1][None]]
-        )
-        for cause, amount in zip(explanation.causes, explanation.amounts, strict=True):
-            matrices[self.layer[cause]] = self.strengths[cause].weights(float(amount))[1][:4, :4]
-        return matrix_tunes(chain(matrices[:, :4, :4]))
+        turn, last = np.eye(4), 0
+        order = np.argsort(self.layer[list(explanation.causes)])
+        causes = [explanation.causes[i] for i in order]
+        changed = self.strengths.only(causes).weights(explanation.amounts[order])[1]
+        for k, matrix in zip(self.layer[causes], changed, strict=True):
+            turn = matrix[:4, :4] @ self._between(last, k) @ turn
+            last = k + 1
+        return matrix_tunes(self._between(last, len(self.upto) - 1) @ turn)
+
+    def _between(self, first: int, last: int) -> Array:
+        """The design's matrix from one exit to a later one, [4, 4]."""
+        return np.asarray(self.upto[last] @ np.linalg.inv(self.upto[first]))
 
     def tune_covariance(self, explanation: Explanation, tunes: Array) -> Array:
         """Of the tunes [2, 2], from that of the amounts."""
@@ -270,7 +287,7 @@ def fit_sparse(
     kinds: Sequence[str] = ("quadrupole", "sextupole"),
     noise: float | None = None,
     launch_sigma: ArrayLike | None = None,
-    fault: float = 0.3,
+    fault: float = FAULT,
     largest_number: int = 5,
     refined: int = 12,
     candidates: Sequence[str] | None = None,
@@ -308,17 +325,16 @@ def fit_sparse(
         raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
     data = first_turn(network, measurement, noise, launch_sigma)
     known = ring_strengths(ring, kinds, network.dimension)
-    strengths, derivatives = known.strengths, known.slopes
     if candidates is not None:
         wanted = {ring[name].name for name in candidates}
-        places = [i for i, s in enumerate(strengths) if s.name in wanted]
+        places = [i for i, s in enumerate(known.strengths) if s.name in wanted]
         if not places:
             raise TmlatticeError(
                 f"none of {sorted(wanted)} is a powered {' or '.join(kinds)}; name some that are"
             )
-        strengths = [strengths[i] for i in places]
-        derivatives = (derivatives[0][places], derivatives[1][places], derivatives[2][places])
-    search = _Search(network, strengths, data, fault, derivatives)
+        known = known.only(places)
+    strengths = known.strengths
+    search = _Search(network, known, data, fault)
     none = search.fit((), np.zeros(0))
     if none is None:
         raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
@@ -335,7 +351,7 @@ def fit_sparse(
         changed = changed.with_changed(
             strength.name, **{strength.attribute: strength.value * (1 + float(amount))}
         )
-    tunes = matrix_tunes(ring_matrix(changed))
+    tunes = search.tunes(best)
     covariance = _spread(search, best)
     errors = np.sqrt(np.diag(best.covariance))
     return FitResult(
@@ -362,6 +378,15 @@ def fit_sparse(
             for c, a, e in zip(best.causes, best.amounts, errors, strict=True)
         },
     )
+
+
+def best_single(
+    network: TaylorNetwork, strengths: RingStrengths, data: FirstTurn, refined: int = 12
+) -> Explanation | None:
+    """The one changed strength of greatest evidence, whether or not it is better than none."""
+    search = _Search(network, strengths, data, FAULT)
+    none = search.fit((), np.zeros(0))
+    return None if none is None else _best_of(search, none, refined)
 
 
 def _best_of(search: _Search, start: Explanation, number: int) -> Explanation | None:

@@ -1,25 +1,25 @@
 """The experiment of `tune_fit` over the whole ring: one chosen magnet says little about a method.
 
-Cases run on Dask, on local processes or on a cluster; each is written to a folder as it ends, so a
-study that was stopped goes on where it was.
+Cases run on Dask, on local processes or on a cluster (`tmlattice.batch`); each is written to a
+folder as it ends, so a study that was stopped goes on where it was.
 """
 
 import dataclasses
 import hashlib
 import json
-import logging
-import os
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm.auto import tqdm
 
+from tmlattice.batch import run_batch
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.fitting.experiment import DEFAULT_LAUNCH, network_tunes, perturbed_ring
@@ -38,6 +38,8 @@ METHODS = ("adam", "adam-none", "adam-l1", "adam-l2", "map", "sparse", "told")
 is told which magnets changed: nothing else can be better."""
 
 UNSTABLE = "the perturbed ring is unstable"
+
+_LATTICE = ("lattice", "sequence", "energy")
 
 NEW_AMPLITUDE = 5.0
 """New launches, for the prediction, have this many times the fitted launch's amplitude."""
@@ -226,54 +228,17 @@ def _network_of(ring: Ring) -> TaylorNetwork:
     return _networks[id(ring)][1]
 
 
-def _work(lattice: tuple[Any, ...], job: tuple[str, str, int], options: dict[str, Any]) -> Any:
+def _work(task: tuple[tuple[Any, ...], tuple[str, str, int], dict[str, Any]]) -> dict[str, Any]:
     """A worker's task: plain data in and out, the ring loaded once."""
+    lattice, (magnet, method, seed), options = task
     if lattice not in _rings:
         _rings[lattice] = load_ring(*lattice)
-    magnet, method, seed = job
     return dataclasses.asdict(run_case(_rings[lattice], magnet, method, seed=seed, **options))
 
 
-@contextmanager
-def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
-    """A Dask client: of a cluster, or of local processes with one thread each."""
-    import distributed
-
-    logging.getLogger("distributed").setLevel(logging.ERROR)
-    if scheduler is not None:
-        try:
-            client = distributed.Client(scheduler, timeout=20)  # type: ignore[no-untyped-call]
-        except (OSError, ValueError) as error:
-            raise TmlatticeError(
-                f"no Dask scheduler answers at '{scheduler}': {error}; start one with "
-                "`dask scheduler`, or leave --scheduler out"
-            ) from error
-        with client:
-            yield client
-        return
-    threads = {name: os.environ.get(name) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
-    os.environ.update(dict.fromkeys(threads, "1"))  # the workers inherit it: one core each
-    try:
-        cluster = distributed.LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=workers or os.cpu_count() or 1,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=":0",
-            silence_logs=logging.ERROR,
-        )
-        with cluster, distributed.Client(cluster) as client:  # type: ignore[no-untyped-call]
-            yield client
-    finally:
-        for name, value in threads.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _file_of(folder: Path, job: tuple[str, str, int]) -> Path:
-    digest = hashlib.sha256("\0".join(map(str, job)).encode()).hexdigest()[:16]
-    return folder / "cases" / f"{digest}.json"
+def _name_of(job: tuple[str, str, int]) -> str:
+    """Of its file: magnets' names may hold what a file's may not."""
+    return hashlib.sha256("\0".join(map(str, job)).encode()).hexdigest()[:16]
 
 
 def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
@@ -300,8 +265,9 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
         write_json(path, text)
 
 
-def _read_case(path: Path) -> Case:
-    values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+def _case(job: tuple[str, str, int], values: dict[str, Any]) -> Case:
+    if "error" in values:  # not one of ours: the code, or the worker, broke
+        return Case(job[0], float("nan"), job[1], job[2], problem=values["error"])
     plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     return Case(**plain)
 
@@ -321,7 +287,7 @@ def study_tune_fit(
     energy: float | None = None,
     progress: bool = True,
     **options: Any,
-) -> Iterator[Case]:
+) -> list[Case]:
     """Change magnet after magnet, measure, fine-tune by each method, and hold against the truth.
 
     Args:
@@ -332,15 +298,15 @@ def study_tune_fit(
         seeds: noises for each magnet and method, seed, seed + 1, ...
         seed: the first.
         scheduler: address of a Dask scheduler; None: local processes.
-        workers: local processes; else one a core.
+        workers: local processes; 1: this one; else one a core.
         folder: where every case is written as it ends, and read from when the study goes on.
         sequence, energy: see `load_ring`.
         progress: show a bar where there is a terminal.
         options: of `run_case`.
 
-    Yields:
-        Cases as they end, those of the folder first. A case that fails says why and does not stop
-        the rest; one whose worker died is tried again when the study is.
+    Returns:
+        The cases. One that fails says why and does not stop the rest; one that broke is tried again
+        when the study is.
 
     Raises:
         TmlatticeError: an unknown method, another study's folder, or no scheduler.
@@ -350,34 +316,19 @@ def study_tune_fit(
         raise TmlatticeError(f"no method '{', '.join(unknown)}'; there are {', '.join(METHODS)}")
     names = faults(load_ring(lattice, sequence, energy), magnets, kind)
     jobs = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
-    if folder is not None:
-        identity = {"lattice": lattice, "sequence": sequence, "energy": energy, **options}
-        _open_folder(folder, identity)
-        done = [job for job in jobs if _file_of(folder, job).exists()]
-        for job in done:
-            yield _read_case(_file_of(folder, job))
-        there = set(done)
-        jobs = [job for job in jobs if job not in there]
-    if not jobs:
-        return
     where = (lattice, sequence, energy)
-    with _client(scheduler, min(workers or os.cpu_count() or 1, len(jobs))) as client:
-        from distributed import as_completed
-
-        futures = {client.submit(_work, where, job, options, pure=False): job for job in jobs}
-        ended = as_completed(futures)  # type: ignore[no-untyped-call]
-        for future in tqdm(ended, "cases", len(jobs), disable=None if progress else True):
-            job = futures.pop(future)
-            error = future.exception()
-            if error is not None:  # not one of ours: the code, or the worker, broke
-                yield Case(job[0], float("nan"), job[1], job[2],
-                           problem=f"{type(error).__name__}: {error}")  # fmt: skip
-                continue
-            case = Case(**future.result())
-            if folder is not None:
-                with output_file(_file_of(folder, job)) as path:
-                    write_json(path, dataclasses.asdict(case))
-            yield case
+    with nullcontext() if folder is not None else TemporaryDirectory() as temporary:
+        if folder is not None:
+            _open_folder(folder, {**dict(zip(_LATTICE, where, strict=True)), **options})
+        results = run_batch(
+            _work,
+            {_name_of(job): partial(tuple, (where, job, options)) for job in jobs},
+            folder / "cases" if folder is not None else Path(str(temporary)),
+            jobs=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
+    return [_case(job, results[_name_of(job)]) for job in jobs]
 
 
 def summarise(cases: Sequence[Case]) -> dict[str, Any]:
@@ -387,7 +338,9 @@ def summarise(cases: Sequence[Case]) -> dict[str, Any]:
         {"methods": {name: {"abs_dq": {"x": {"median", "p95", "worst"}, "y"}, "rel_dq", "orbit_rms"
         (median after, m), "prediction_rms" {"median", "p95", "worst"} (m), "right" (fraction of
         cases with exactly the right magnets, or null), "coverage" ({"x", "y"}: fraction of cases
-        within the stated 95 % error, or null), "seconds" (median), "predicted", "failed"}},
+        within the stated 95 % error, or null), "stated" (standard errors of the tunes, as "abs_dq";
+        those of "told" are the Cramer-Rao bound, what the readings hold of a known magnet),
+        "seconds" (median), "predicted", "failed"}},
         "cases", "unstable"}; "unstable" counts magnets whose perturbed ring has no tune.
     """
     methods: dict[str, Any] = {}
@@ -407,6 +360,8 @@ def summarise(cases: Sequence[Case]) -> dict[str, Any]:
         named = [c.right for c in mine if c.right is not None]
         entry["right"] = sum(named) / len(mine) if named else None
         stated = [(c.absolute_error, c.tune_sigma) for c in good if c.tune_sigma is not None]
+        sigmas = np.array([sigma for _, sigma in stated]).reshape(-1, 2)
+        entry["stated"] = {plane: _spread(sigmas[:, i]) for i, plane in enumerate("xy")}
         entry["coverage"] = {
             plane: float(np.mean([e[i] <= 1.96 * s[i] for e, s in stated if e is not None]))
             if stated

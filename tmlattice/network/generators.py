@@ -45,6 +45,21 @@ def field_matrix(n: int) -> Array:
     return np.asarray(matrix)
 
 
+@functools.cache
+def _by_degree(n: int) -> list[tuple[slice, Array]]:
+    """For c, A, Q: the coefficients that they come from, of one degree each, and `field_matrix`
+    between them, [coefficient, n * column]."""
+    parts, column, first = [], 0, 0
+    for degree in range(1, DEGREE + 1):
+        width = len(kronecker_exponents(n, degree - 1))
+        count = len(kronecker_exponents(n, degree))
+        columns, own = slice(column, column + width), slice(first, first + count)
+        matrix = field_matrix(n)[:, columns, own].reshape(n * width, count).T
+        parts.append((own, np.ascontiguousarray(matrix)))
+        column, first = column + width, first + count
+    return parts
+
+
 def field(generator: Array) -> tuple[Array, Array, Array]:
     """c [layer, n], A [layer, n, n], Q [layer, n, n (n + 1) / 2] of S grad H, for each layer.
 
@@ -52,16 +67,18 @@ def field(generator: Array) -> tuple[Array, Array, Array]:
         generator: [layer, coefficient].
     """
     n = dimension_of(generator.shape[-1])
-    rows = np.einsum("amk,lk->lam", field_matrix(n), generator)
-    c, A, Q = rows[..., 0], rows[..., 1 : n + 1], rows[..., n + 1 :]
-    return np.ascontiguousarray(c), np.ascontiguousarray(A), np.ascontiguousarray(Q)
+    c, A, Q = (
+        (generator[:, own] @ matrix).reshape(len(generator), n, -1) for own, matrix in _by_degree(n)
+    )
+    return c[..., 0], A, Q
 
 
 def pull_field(c: Array, A: Array, Q: Array) -> Array:
     """The transpose of `field`: gradients with respect to c, A, Q as one to g."""
     n = c.shape[1]
-    rows = np.concatenate([c[..., None], A, Q], axis=2)
-    return np.asarray(np.einsum("amk,lam->lk", field_matrix(n), rows))
+    parts = zip((c, A, Q), _by_degree(n), strict=True)
+    rows = [part.reshape(len(c), -1) @ matrix.T for part, (_, matrix) in parts]
+    return np.concatenate(rows, axis=1)
 
 
 def dimension_of(coefficients: int) -> int:

@@ -42,7 +42,8 @@ class _FlowSweep(torch.autograd.Function):
         states[:, 0] = start
         middles = np.empty((len(start), len(W1), n, len(size[1])))
         w0 = W0.detach().numpy()
-        sweeps.run(flows.forward, len(start), size, w0, W1, c, A, Q, moves, states, middles)
+        fields = c, A, Q, moves, _flat(c, A, Q)
+        sweeps.run(flows.forward, len(start), size, w0, W1, *fields, states, middles)
         check_alive(states, maps, size, batch)
         readings = np.empty((len(start), len(maps.at), 2, len(size[1])))
         bent = curved(maps.R2)
@@ -77,6 +78,19 @@ class _FlowSweep(torch.autograd.Function):
 
 def _moves(c: Array, A: Array, Q: Array) -> Flags:
     return np.asarray(c.any(axis=1) | A.any(axis=(1, 2)) | Q.any(axis=(1, 2)))
+
+
+_SKEW = np.ones((4, 10), dtype=bool)
+"""Where Q of a generator that is even in (y, py) is zero."""
+_SKEW[:2, [0, 1, 4, 7, 8, 9]] = False
+_SKEW[2:, [2, 3, 5, 6]] = False
+
+
+def _flat(c: Array, A: Array, Q: Array) -> Flags:
+    """Where the field is purely of the second degree and keeps the mid-plane; four coordinates."""
+    if c.shape[1] != 4:
+        return np.zeros(len(c), dtype=bool)
+    return np.asarray(~(c.any(axis=1) | A.any(axis=(1, 2)) | Q[:, _SKEW].any(axis=1)))
 
 
 class SymplecticNetwork(LayerChain):
@@ -160,32 +174,32 @@ class SymplecticNetwork(LayerChain):
         )
         return readings
 
-    def _fields(self) -> tuple[Array, Array, Array, Array, Array, Flags]:
+    def _fields(self) -> tuple[Array, Array, Array, Array, Array, Flags, Flags]:
         c, A, Q = field(self.generator.detach().numpy())
-        return self.W0.detach().numpy(), self.W1.numpy(), c, A, Q, _moves(c, A, Q)
+        return self.W0.detach().numpy(), self.W1.numpy(), c, A, Q, _moves(c, A, Q), _flat(c, A, Q)
 
     def _forward(self, size: sweeps.Size, states: Array) -> None:
         middles = np.empty((len(states), states.shape[1] - 1, *states.shape[2:]))
         sweeps.run(flows.forward, len(states), size, *self._fields(), states, middles)
 
-    def _one_turn_fields(self) -> tuple[Array, Array, Array, Array, Array, Flags]:
+    def _one_turn_fields(self) -> tuple[Array, Array, Array, Array, Array, Flags, Flags]:
         """The fields of all layers, and of the way to the ring's end as a last one."""
         closing = [w[None] for w in self.maps.closing.coefficients]
         W1 = nearest_symplectic(closing[1])
         c, A, Q = field(cubic_generator(W1, closing[2]))
-        end = closing[0], W1, c, A, Q, _moves(c, A, Q)
+        end = closing[0], W1, c, A, Q, _moves(c, A, Q), _flat(c, A, Q)
         both = zip(self._fields(), end, strict=True)
-        W0, W1, c, A, Q, moves = (np.concatenate(pair) for pair in both)
-        return W0, W1, c, A, Q, moves
+        W0, W1, c, A, Q, moves, flat = (np.concatenate(pair) for pair in both)
+        return W0, W1, c, A, Q, moves, flat
 
     def _track(self, size: sweeps.Size, history: Array) -> None:
-        W0, W1, c, A, Q, moves = self._one_turn_fields()
+        W0, W1, *fields, moves, flat = self._one_turn_fields()
         # Inside a turn nobody looks: matrices that follow each other are multiplied.
         ends = np.flatnonzero(moves | W0.any(axis=1))
         ends = np.unique([*ends, len(W1) - 1])
         first = np.concatenate([[0], ends[:-1] + 1])
         merged = np.stack([chain(W1[a : b + 1]) for a, b in zip(first, ends, strict=True)])
-        rest = (w[ends] for w in (c, A, Q, moves))
+        rest = (w[ends] for w in (*fields, moves, flat))
         sweeps.run(flows.track, len(history), size, W0[ends], merged, *rest, history)
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
@@ -197,12 +211,12 @@ class SymplecticNetwork(LayerChain):
 
     def _slopes(self, x: Array) -> tuple[Array, Array, Array, Array]:
         """States [layer + 2, n], middles, the fields' slopes there and W1, [layer + 1, ...]."""
-        W0, W1, c, A, Q, moves = self._one_turn_fields()
+        W0, W1, c, A, Q, moves, flat = self._one_turn_fields()
         size = sweeps.size_of(self.dimension, 1)
         states = np.empty((1, len(W0) + 1, self.dimension, 1))
         states[0, 0, :, 0] = x
         middles = np.empty((1, len(W0), self.dimension, 1))
-        sweeps.run(flows.forward, 1, size, W0, W1, c, A, Q, moves, states, middles)
+        sweeps.run(flows.forward, 1, size, W0, W1, c, A, Q, moves, flat, states, middles)
         path, middle = states[0, :, :, 0], middles[0, :, :, 0]
         slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middle)
         return path, middle, slopes, W1

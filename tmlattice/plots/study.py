@@ -47,7 +47,9 @@ def plot_study(ring: Ring, cases: "Sequence[Case]", figure: Figure | None = None
         ax.set_yscale("log")
         ax.set_ylabel(f"|dQ{name}|")
         ax.grid(alpha=0.25)
-        ax.legend(loc="upper right", ncols=4, fontsize="small").set_in_layout(False)
-    grid[0].set_title("Tune error after fine-tuning, by the place of the changed magnet")
+        ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small")
+    grid[0].set_title(
+        "Tune error after fine-tuning, by the place of the changed magnet", loc="left"
+    )
     lattice_strip(ring, grid[2])
     return figure
