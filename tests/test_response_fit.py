@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.diagnosis.response_fit import fit
+from tmlattice.diagnosis.response_fit import Group, normal_equations, solve
 
 
 @pytest.fixture
@@ -38,31 +38,65 @@ def dense(residual, weight, plane, u, v, J):
 def test_fit_vs_dense_least_squares(problem, rng):
     residual, weight, *_ = problem
     X = dense(*problem)
-    start = 0.05 * rng.standard_normal(X.shape[1])
-    found = fit(*problem, 0.3, 0.2, 0.1, start=start, rounds=1)
-    prior = np.concatenate([np.full(18, 0.3), np.full(12, 0.2), np.full(7, 0.1)])
+    size = X.shape[1]
+    start = 0.05 * rng.standard_normal(size)
+    rms = np.concatenate([np.full(18, 0.3), np.full(12, 0.2), np.full(7, 0.1)])
+    group = Group("all", np.eye(size), 1.0, each=rms)
+    found = solve(normal_equations(*problem), [group], start, rounds=0)
     w, y = weight.ravel(), np.nan_to_num(residual.ravel()) + X @ start
-    matrix = X.T @ (w[:, None] * X) + np.diag(prior**-2)
-    whole = np.linalg.solve(matrix, X.T @ (w * y))
-    mine = np.concatenate([found.monitor.ravel(), found.column, found.ring])
-    assert_allclose(mine, whole, atol=1e-9)
-    assert_allclose(found.sigma, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-8)
-    left = y - X @ whole
-    seen = w > 0
-    assert_allclose(found.left.ravel()[seen], left[seen], atol=1e-9)
+    matrix = X.T @ (w[:, None] * X) + np.diag(rms**-2)
+    assert_allclose(found.values, np.linalg.solve(matrix, X.T @ (w * y)), atol=1e-9)
+    assert_allclose(found.sigma, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-7)
 
 
-def test_scale_of_the_prior_is_that_of_the_truth(rng):
-    """200 errors of rms 0.003: the evidence finds it to some 5 % where readings are good."""
+def test_a_family_shares_its_error_vs_a_correlated_prior(problem):
+    """Members and their family: the prior's covariance is D + t^2 of ones."""
+    X = dense(*problem)
+    residual, weight, *_ = problem
+    size = X.shape[1]
+    own = Group("own", np.eye(size), 0.1)
+    family = np.zeros((size, 1))
+    family[-7:] = 1
+    found = solve(normal_equations(*problem), [own, Group("family", family, 0.5)], rounds=0)
+    prior = 0.1**2 * np.eye(size) + 0.5**2 * family @ family.T
+    matrix = X.T @ (weight.ravel()[:, None] * X) + np.linalg.inv(prior)
+    right = X.T @ (weight.ravel() * np.nan_to_num(residual.ravel()))
+    assert_allclose(found.values, np.linalg.solve(matrix, right), atol=1e-9)
+    assert_allclose(found.sigma, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-6)
+
+
+def test_trust_shortens_the_step_and_not_the_result(problem):
+    normal = normal_equations(*problem)
+    size = len(normal.vector)
+    group = [Group("all", np.eye(size), 0.2)]
+    free = solve(normal, group, rounds=0).values
+    trust = np.full(size, 0.002)
+    short = solve(normal, group, trust=trust, rounds=0).values
+    assert np.linalg.norm(short) < 0.9 * np.linalg.norm(free)
+    there = normal_equations(*problem)
+    moved = there.__class__(there.matrix, there.vector - there.matrix @ free)
+    assert_allclose(solve(moved, group, free, trust, rounds=0).values, free, atol=1e-9)
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_scale_of_the_prior_is_that_of_the_truth(rng, heavy):
+    """200 errors of rms 0.003, one of them 50 times as large where the prior is heavy."""
     columns, monitors, errors = 40, 30, 200
     J = rng.standard_normal((errors, columns, monitors))
     truth = 3e-3 * rng.standard_normal(errors)
+    rms = truth.std()
+    if heavy:
+        truth[7] = 0.15
     noise = 1e-3
     residual = np.tensordot(truth, J, 1) + noise * rng.standard_normal((columns, monitors))
-    flat = np.full((columns, monitors), noise**-2)
-    nothing = np.zeros((columns, monitors))
+    flat, nothing = np.full((columns, monitors), noise**-2), np.zeros((columns, monitors))
     plane = np.zeros(columns, dtype=int)
-    found = fit(residual, flat, plane, nothing, nothing, J, 0.1, 0.1, 0.1)
-    assert_allclose(found.scale, truth.std(), rtol=0.1)
-    pull = (found.ring - truth) / found.sigma[-errors:]
+    basis = np.zeros((2 * monitors + columns + errors, errors))
+    basis[-errors:] = np.eye(errors)
+    group = Group("ring", basis, 0.1, heavy=heavy)
+    normal = normal_equations(residual, flat, plane, nothing, nothing, J)
+    found = solve(normal, [group], rounds=40)
+    # Student's scale of normal numbers is some 0.75 of their rms
+    assert_allclose(group.rms, rms, rtol=0.35 if heavy else 0.1)
+    pull = (found.values[-errors:] - truth) / found.sigma[-errors:]
     assert 0.8 < pull.std() < 1.2

@@ -20,9 +20,10 @@ from tmlattice.cli.options import (
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
+    from tmlattice.diagnosis.response import ResponseDiagnosis
     from tmlattice.diagnosis.weights import WeightReading
     from tmlattice.lattice import Ring
-    from tmlattice.measurement import Measurement
+    from tmlattice.measurement import Measurement, OrbitResponse
 
 
 @click.command("diagnose")
@@ -32,9 +33,9 @@ if TYPE_CHECKING:
 @click.option(
     "--holdout",
     type=click.FloatRange(0, 1, max_open=True),
-    default=0.33,
-    show_default=True,
-    help="Share of the shots that the fit does not see; they judge the gap.",
+    default=None,
+    help="Share of the shots, or of the correctors, that the fit does not see; they judge the gap. "
+    "0.33 of shots, 0.2 of correctors where nothing is said.",
 )
 @click.option(
     "--reference",
@@ -71,6 +72,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="Of the split, the threshold's simulation and the bootstrap.",
 )
+@click.option(
+    "--lattice-out",
+    type=FILE,
+    metavar="FILE",
+    help="Of an orbit response: the ring with its errors, in the package's JSON; FILE"
+    ".calibration.json beside it holds what monitors and correctors do (`tmlattice predict`).",
+)
 @json_option
 @click.option(
     "--out",
@@ -88,17 +96,20 @@ def diagnose(
     background: tuple[tuple[str, float | None], ...],
     effects: tuple[str, ...] | None,
     network: Path | None,
+    lattice_out: Path | None,
     json_file: Path | None,
     out: Path | None,
     quiet: bool,
+    holdout: float | None,
     **options: Any,
 ) -> None:
     """Say where the ring differs from LATTICE, by which effect, and how far the gap shrinks.
 
-    MEASUREMENT is a folder of first turns, as `tmlattice simulate` writes it. The verdict is one of
-    named, equivalent (several explanations fit alike), located (something is there that the
-    catalogue does not explain), distributed (no single place) and nothing; the exit code is 0 for
-    each of them.
+    MEASUREMENT is a folder of first turns, or of an orbit response, as `tmlattice simulate` writes
+    it. The verdict is one of named, equivalent (several explanations fit alike), located (something
+    is there that the catalogue does not explain), distributed (no single place) and nothing; the
+    exit code is 0 for each of them. An orbit response ends in a step for each family of errors, and
+    options that speak of launches have no meaning for it.
     """
     from tmlattice.files import output_file, output_folder, write_json
 
@@ -111,9 +122,24 @@ def diagnose(
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
-        refusal = ", which is not diagnosed yet; give first turns"
-        data = trajectories(measurement, refusal)
-        before = None if reference is None else trajectories(reference, refusal)
+        from tmlattice.measurement import OrbitResponse, read_measurement
+
+        data = read_measurement(measurement)
+        if isinstance(data, OrbitResponse):
+            _refuse(
+                "an orbit response", reference=reference, background=background, effects=effects,
+                network=network, radiation=options["radiation"],
+            )  # fmt: skip
+            response = _response(
+                load_ring(lattice, sequence, energy), data, measurement, folder, extra, lattice_out,
+                0.2 if holdout is None else holdout, options["seed"], quiet,
+            )  # fmt: skip
+            if not quiet:
+                _print_response(response, out, json_file, lattice_out)
+            return
+        _refuse("first turns", lattice_out=lattice_out)
+        options["holdout"] = 0.33 if holdout is None else holdout
+        before = None if reference is None else trajectories(reference, "; give first turns")
         ring = load_ring(lattice, sequence, energy)
         with _progress(quiet) as progress:
             result = _diagnosed(
@@ -139,6 +165,87 @@ def diagnose(
         _print(result, out, json_file)
         if reading:
             _print_weights(ring, reading)
+
+
+def _refuse(kind: str, **given: Any) -> None:
+    """An option that has no meaning for this kind of measurement."""
+    for name, value in given.items():
+        if value:
+            raise click.UsageError(f"--{name.replace('_', '-')} has no meaning for {kind}")
+
+
+def _response(
+    ring: "Ring",
+    data: "OrbitResponse",
+    path: Path,
+    folder: Path | None,
+    extra: Path | None,
+    lattice_out: Path | None,
+    holdout: float,
+    seed: int,
+    quiet: bool,
+) -> "ResponseDiagnosis":
+    """Diagnose an orbit response and write what was asked for."""
+    from tmlattice.diagnosis.response import diagnose_response
+    from tmlattice.errors import MeasurementError, UnknownNameError
+    from tmlattice.files import write_json
+    from tmlattice.lattice import save_ring
+    from tmlattice.response.calibration import write_calibration
+
+    with _progress(quiet) as progress:
+        try:
+            result = diagnose_response(ring, data, holdout=holdout, seed=seed, progress=progress)
+        except (MeasurementError, UnknownNameError) as error:
+            raise MeasurementError(f"{path}: {error}") from error
+        document = result.as_json()
+        document["provenance"]["measurement"] = str(path)
+        if lattice_out:
+            save_ring(result.repaired, lattice_out)
+            write_calibration(calibration_beside(lattice_out), result.calibration)
+        if folder:
+            progress("figures")
+            _write_response(result, folder, document["provenance"])
+            write_json(folder / "diagnosis.json", document)
+        if extra:
+            write_json(extra, document)
+    return result
+
+
+def calibration_beside(lattice: Path) -> Path:
+    """Where the calibration of a lattice file stands."""
+    return lattice.with_name(f"{lattice.name}.calibration.json")
+
+
+def _write_response(result: "ResponseDiagnosis", folder: Path, provenance: dict[str, Any]) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from tmlattice.diagnosis.response_report import response_text
+    from tmlattice.report.response import draw_response, response_page
+
+    html = response_page(result, draw_response(result, folder), provenance)
+    (folder / "report.html").write_text(html, encoding="utf-8")
+    (folder / "report.txt").write_text(response_text(result) + "\n", encoding="utf-8")
+
+
+def _print_response(
+    result: "ResponseDiagnosis", out: Path | None, json_file: Path | None, lattice_out: Path | None
+) -> None:
+    from tmlattice.diagnosis.response_report import response_text
+
+    screen = console()
+    screen.print(response_text(result, min(screen.width, 120)), soft_wrap=True)
+    columns = len(result.measured.correctors)
+    screen.print(
+        f"\n{result.ring.name}: {columns} correctors, {int(result.held.sum())} of them held out, "
+        f"{int(result.good.sum())} monitors, seed {result.seed}, {result.seconds:.1f} s"
+    )
+    written = [f"{out}/: report.html, report.txt, diagnosis.json, figures"] if out else []
+    written += [str(json_file)] if json_file else []
+    if lattice_out:
+        written += [str(lattice_out), str(calibration_beside(lattice_out))]
+    if written:
+        screen.print(f"written: {'; '.join(written)}", soft_wrap=True)
 
 
 def _weights(ring: "Ring", path: Path, data: "Measurement") -> "WeightReading":

@@ -2,26 +2,37 @@
 
 A fifth of the correctors is never fitted. Of each of them only the kick is taken, from a random
 half of the monitors, and the other half judges; the RF's orbit is fitted on half of the monitors
-and judged on the other half.
+and judged on the other half. Which families of errors are kept is decided on other correctors, held
+out from the rest, so that the figures of the steps judge and choose nothing.
 
-Skew gradients act on the tunes to second order: fitted after the gradients and not together with
-them, they close the coupling's gap and open the in-plane one again. The steps say so.
+>>> result = diagnose_response(ring, measured)
+>>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
+
+Gain and calibration are degenerate in scale but for the dispersion; neighbouring quadrupoles can
+pull against one another. Priors settle both: a family of correctors or quadrupoles (one kind of
+magnet, or one supply) shares an error, its members scatter about it, and how much is learnt from
+the data. Gradients and skew gradients are fitted together, because skew ones move the tunes.
 """
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import re
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
-from tmlattice.diagnosis.response_fit import Fit, fit
+from tmlattice.diagnosis.response_fit import Group, Normal, Posterior, normal_equations, solve
 from tmlattice.effects import Cause, apply
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
+from tmlattice.optics import matrix_tunes
 from tmlattice.response import ResponseModel, derivatives
+from tmlattice.response.calibration import CALIBRATES
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -29,15 +40,44 @@ Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
-BAD = 4.0
-"""A monitor whose rms residual is so many times the median one's is bad."""
-GAIN, CALIBRATION = 0.05, 0.05  # rms of the priors: twice the catalogue's gain, its calibration
-CROSS, ROLL = 0.01, 0.01
-GRADIENT, SKEW = 5e-3, 1e-3
-"""Where the search for the scale of the gradients' priors starts: relative, and 1/m."""
-COUPLING_ROUNDS = 3
-ROUNDS = 5
-"""Of Gauss and Newton, while monitors are dropped and the weights follow the residual."""
+BAD = 5.0
+"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+FEW = 4
+"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+STEP = 0.01
+"""Trusted change of a gain, a calibration or a gradient (relative) in one round."""
+SKEW_STEP = 3e-4  # 1/m: larger steps move the tunes
+ROLL_STEP = 0.02
+LARGEST_GRADIENT = 0.02
+"""Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
+LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
+HELPS, SPOILS = 0.995, np.array([1.05, 1.05, 1.25])
+"""A step is kept where its judge falls to the first, and none (in-plane, coupling, RF) rises above
+the second; the RF's judge has some 25 readings and is uncertain by 14 % itself."""
+INNER = 0.2
+"""Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
+
+NOTHING = 1.3
+"""Held-out chi2 per reading of the design below which nothing is wrong."""
+MISSING = 1.5
+"""Held-out chi2 per reading of the result above which an effect is missing."""
+
+IN_PLANE = ("corrector_calibration", "family_gradient", "monitor_gain", "quadrupole_gradient")
+COUPLING = ("monitor_roll", "corrector_roll", "skew_gradient")
+ORDER: tuple[tuple[tuple[str, ...], tuple[int, int]], ...] = (
+    (("corrector_calibration", "family_gradient"), (3, 0)),
+    (("monitor_gain",), (2, 0)),
+    (("quadrupole_gradient",), (4, 0)),
+    (("monitor_roll",), (0, 1)),
+    (("corrector_roll",), (0, 1)),
+    (("skew_gradient",), (2, 2)),
+)
+"""What is tried, one after another; rounds in-plane, and before them rounds of the other plane.
+Skew gradients move the tunes to second order, which the gradients then take back."""
+NAMES = {
+    "monitor_gain": "monitor_gain_x, monitor_gain_y",
+    "monitor_roll": "monitor_roll, monitor_coupling",
+}
 
 
 @dataclass(frozen=True)
@@ -45,11 +85,13 @@ class Step:
     """The gap with what has been allowed so far.
 
     Attributes:
-        effect: what was added last; the first is "design".
+        effect: what was tried; the first is "design".
         parameters: how many it has.
         heldout_rms_in_plane, heldout_rms_coupling: m, over held-out correctors.
+        heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
         dispersion_rms: of the RF's orbit in x on the half of the monitors not fitted, m.
+        kept: whether it helped those who choose; the figures of one that was not are its own.
     """
 
     effect: str
@@ -58,6 +100,36 @@ class Step:
     heldout_rms_coupling: float
     heldout_chi2_per_dof: float
     dispersion_rms: float
+    heldout_rms_position: float = float("nan")
+    kept: bool = True
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {name: value for name, value in vars(self).items() if name != "kept"}
+
+
+@dataclass(frozen=True)
+class Left:
+    """What the model does not explain of the fitted readings.
+
+    Attributes:
+        chi2_per_dof: by the readings' noise; 1 is noise.
+        readings: how many.
+        low_rank: share of the sum of squares that the eight strongest patterns hold, (x, y).
+    """
+
+    chi2_per_dof: float
+    readings: int
+    low_rank: tuple[float, float]
+
+    @property
+    def p_value(self) -> float:
+        """Chance that noise leaves as much."""
+        return float(chi2.sf(self.chi2_per_dof * self.readings, self.readings))
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {"chi2_per_dof": self.chi2_per_dof, "low_rank": list(self.low_rank)}
 
 
 @dataclass(frozen=True)
@@ -65,18 +137,171 @@ class ResponseDiagnosis:
     """Ordered steps and what was found.
 
     Attributes:
-        steps: the first is the design's.
-        causes: of the ring, its correctors and its monitors, those of the last step.
+        ring: the design.
+        measured: the response, its monitors in the ring's order.
+        steps: those kept; the first is the design's, the last the result's.
+        refused: those that did not help, or spoilt the RF's response.
+        causes: of the ring, its correctors and its monitors.
         errors: posterior rms of each, the same length.
         bad_monitors: names of those left out.
+        scales: rms of the priors, as the data have them, by name.
+        degenerate: what the data alone do not settle, in words.
+        held: correctors held out, [column], the RF last.
+        good: monitors kept, [monitor].
+        design, model: the model's response before and after, m, [column, monitor, 2].
+        data: measured, the RF last, m.
         seed: of the split.
+        seconds: that it took.
     """
 
+    ring: Ring
+    measured: OrbitResponse
     steps: tuple[Step, ...]
+    refused: tuple[Step, ...]
     causes: tuple[Cause, ...]
     errors: tuple[float, ...]
     bad_monitors: tuple[str, ...]
+    scales: dict[str, float]
+    degenerate: tuple[str, ...]
+    held: Flags
+    good: Flags
+    design: Array
+    model: Array
+    data: Array
     seed: int
+    seconds: float
+
+    @property
+    def verdict(self) -> str:
+        """`nothing` where the design leaves noise alone; else `distributed`: many small errors."""
+        return "nothing" if self.steps[0].heldout_chi2_per_dof < NOTHING else "distributed"
+
+    @property
+    def repaired(self) -> Ring:
+        """The ring with its errors; monitors and correctors are in `calibration`."""
+        return apply(self.ring, [c for c in self.causes if c.effect not in CALIBRATES])
+
+    @property
+    def calibration(self) -> tuple[Cause, ...]:
+        """What monitors and correctors do, for `write_calibration`."""
+        bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
+        return (*(c for c in self.causes if c.effect in CALIBRATES), *bad)
+
+    def as_json(self) -> dict[str, Any]:
+        """The result in the format `tmlattice-diagnosis`, version 1 (see `schemas/`)."""
+        from tmlattice import __version__
+
+        noise = self.measured.noise
+        assert noise is not None
+        sigma = float(np.sqrt(np.mean(noise[self.good] ** 2)))
+        misfits = [
+            {"rms": step.heldout_rms_in_plane, "chi2_per_dof": step.heldout_chi2_per_dof}
+            for step in self.steps
+        ]
+        before, after = (max(m["rms"] ** 2 - sigma**2, 0.0) for m in (misfits[0], misfits[-1]))
+        left = self.left
+        return {
+            "format": "tmlattice-diagnosis",
+            "version": 1,
+            "package": __version__,
+            "kind": "orbit_response",
+            "verdict": self.verdict,
+            "findings": [],
+            "steps": [step.as_json() for step in self.steps],
+            "refused": [step.as_json() for step in self.refused],
+            "bad_monitors": list(self.bad_monitors),
+            "degenerate": list(self.degenerate),
+            "priors": self.scales,
+            "errors": [
+                {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
+                for c, s in zip(self.causes, self.errors, strict=True)
+            ],
+            "gap": {
+                "noise": sigma,
+                "fit": {
+                    "before": self._misfit(self.design),
+                    "after": self._misfit(self.model),
+                },
+                "heldout": {
+                    "before": misfits[0],
+                    "after": misfits[-1],
+                    "shots": [],
+                    "monitors": "half",
+                    "steps": misfits,
+                },
+                "closed": 1 - after / before if before > 0 else None,
+                "closed_interval": None,
+            },
+            "unexplained": {"p_value": left.p_value, "places": [], "patterns": left.as_json()},
+            "tunes": {"before": _tunes(self.ring), "after": _tunes(self.repaired)},
+            "next_measurement": None,
+            "sensitivity": {},
+            "warnings": list(self.warnings),
+            "provenance": self.provenance,
+        }
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What made it."""
+        from tmlattice import __version__
+
+        return {
+            "package": __version__,
+            "lattice": self.ring.name,
+            "measurement": "",
+            "options": {
+                "reference": False, "background": {}, "holdout": float(self.held[:-1].mean()),
+                "effects": None, "max_effects": len(ORDER), "radiation": False, "false_alarm": 0.0,
+            },
+            "seed": self.seed,
+            "seconds": self.seconds,
+        }  # fmt: skip
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader should know."""
+        last = self.steps[-1]
+        if last.heldout_chi2_per_dof < MISSING:
+            return ()
+        return (
+            f"On held-out readings {1e6 * last.heldout_rms_in_plane:.1f} µm are left, "
+            f"{np.sqrt(last.heldout_chi2_per_dof):.1f} times the noise: an effect is missing.",
+        )
+
+    @property
+    def left(self) -> "Left":
+        """What stays of the fitted correctors' readings, in their own plane."""
+        patterns = []
+        noise = self.measured.noise
+        assert noise is not None
+        total, count = 0.0, 0
+        for p in (0, 1):
+            rows = ~self.held[:-1] & (np.array(self.measured.planes) == "xy"[p])
+            miss = (self.data - self.model)[:-1][rows][:, self.good, p]
+            miss = np.nan_to_num(miss)
+            size = np.linalg.svd(miss, compute_uv=False) ** 2
+            patterns.append(float(size[:8].sum() / max(size.sum(), 1e-300)))
+            total += float(np.sum((miss / noise[self.good, p]) ** 2))
+            count += miss.size
+        return Left(total / max(count, 1), count, (patterns[0], patterns[1]))
+
+    def _misfit(self, read: Array) -> dict[str, float]:
+        noise = self.measured.noise
+        assert noise is not None
+        rows = np.flatnonzero(~self.held[:-1])
+        plane = np.array([int(p == "y") for p in self.measured.planes])[rows]
+        miss = pick((self.data - read)[rows][:, self.good], plane)
+        pull = miss / noise[self.good][:, plane].T
+        return {
+            "rms": float(np.sqrt(np.nanmean(miss**2))), "chi2_per_dof": float(np.nanmean(pull**2)),
+        }  # fmt: skip
+
+    def error(self, effect: str, element: str) -> tuple[float, float]:
+        """Amount and posterior rms of a cause."""
+        for cause, sigma in zip(self.causes, self.errors, strict=True):
+            if (cause.effect, cause.element) == (effect, element):
+                return cause.amount, sigma
+        raise KeyError((effect, element))
 
 
 def diagnose_response(
@@ -87,7 +312,7 @@ def diagnose_response(
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> ResponseDiagnosis:
-    """Monitors and correctors, then gradients, then what couples the planes.
+    """Correctors and families, monitors, single gradients, then what couples the planes.
 
     Args:
         ring: the design.
@@ -98,289 +323,523 @@ def diagnose_response(
 
     Raises:
         MeasurementError: no RF step, no noise, or too few correctors.
+        UnstableRingError: no closed orbit.
     """
-    return _Run(ring, measured, holdout, seed, progress).run()
+    return ResponseRun(ring, measured, holdout, seed, progress).run()
 
 
-class _Run:
+def stem(name: str) -> str:
+    """What a family's names begin with: up to the first underscore, dot or `::`."""
+    return re.split(r"_|\.|::", name, maxsplit=1)[0].casefold()
+
+
+def families(names: Sequence[str]) -> tuple[list[str], Array]:
+    """Stems that more than one has, and who belongs to them, [name, family] of 0 and 1."""
+    stems = [stem(name) for name in names]
+    kinds = [kind for kind in dict.fromkeys(stems) if stems.count(kind) > 1]
+    return kinds, np.array([[float(own == kind) for kind in kinds] for own in stems]).reshape(
+        len(names), len(kinds)
+    )
+
+
+@dataclass
+class _State:
+    """Everything that is fitted: monitors' matrices, correctors, the ring's errors."""
+
+    monitors: Array  # [monitor, 2, 2]
+    calibration: Array  # [column]
+    roll: Array
+    gradients: Array
+    skew: Array
+
+    def copy(self) -> "_State":
+        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
+
+
+class ResponseRun:
+    """The fit of one measured response; `run` is the whole of it."""
+
     def __init__(
         self,
         ring: Ring,
         measured: OrbitResponse,
-        holdout: float,
-        seed: int,
-        progress: Callable[[str], Any],
+        holdout: float = 0.2,
+        seed: int = 0,
+        progress: Callable[[str], Any] = lambda stage: None,
     ) -> None:
         names = [monitor.name for monitor in ring.monitors]
-        measured = measured.select(
-            monitors=[n for n in names if n in {ring[m].name for m in measured.monitors}]
-        )
+        known = {ring[name].name: name for name in measured.monitors}
+        measured = measured.select(monitors=[known[name] for name in names if name in known])
         if measured.rf is None or measured.rf.orbit is None:
             raise MeasurementError("an orbit response without an RF step: dispersion is not known")
         if measured.noise is None or np.isnan(measured.noise).any():
             raise MeasurementError("the noise of the readings is not known; add it")
         self.ring, self.m, self.seed, self.progress = ring, measured, seed, progress
-        self.at = np.array([names.index(n) for n in measured.monitors])
+        self.begun = time.perf_counter()
+        order = {name: i for i, name in enumerate(names)}
+        self.at = np.array([order[ring[name].name] for name in measured.monitors])
         self.data = np.concatenate([measured.response, measured.rf.orbit[None]])
         self.kicks = np.append(measured.kicks, measured.rf.step / measured.rf.frequency)
         self.plane = np.append([int(p == "y") for p in measured.planes], 0)
         self.noise = measured.noise
         columns, monitors = self.data.shape[:2]
-        rng = np.random.default_rng(seed)
-        self.held = np.zeros(columns, dtype=bool)
-        count = round(holdout * (columns - 1))
-        if not 0 < count < columns - 1:
-            raise MeasurementError(f"{columns - 1} correctors cannot be split; measure more")
-        self.held[rng.choice(columns - 1, count, replace=False)] = True
-        self.half = np.zeros((columns, monitors), dtype=bool)  # that give kicks, or the RF's fit
-        for c in [*np.flatnonzero(self.held), columns - 1]:
-            self.half[c, rng.choice(monitors, monitors // 2, replace=False)] = True
+        self._split(holdout, np.random.default_rng(seed))
         self.good = np.ones(monitors, dtype=bool)
-        self.gain = np.zeros((monitors, 2))
-        self.calibration = np.zeros(columns)
         self.quadrupoles = [e.name for e in ring.elements if e.kind == "quadrupole" and e.k1 != 0]
-        self.skew: list[Cause] = []
-        self.gradients = np.zeros(len(self.quadrupoles))
-        self.extra = 5e-6
-        """What the model still lacks, m: it lessens the weight of readings, as noise does."""
+        self.skews = [e.name for e in ring.elements if e.kind == "quadrupole"]
+        self.state = _State(
+            np.tile(np.eye(2), (monitors, 1, 1)), np.zeros(columns), np.zeros(columns),
+            np.zeros(len(self.quadrupoles)), np.zeros(len(self.skews)),
+        )  # fmt: skip
+        self.lacking = np.full(2, 1e-4)
+        """What the model lacks in-plane and across, m: it lessens weights as noise does."""
+        self.exploring = True
+        self.allowed: list[str] = []
+        self.groups: dict[str, Group] = {}
+        self.design = self._set()
+        gap = pick(self.data - self.design, self.plane)[~self.held]
+        self.lacking[:] = float(np.nanmedian(np.abs(gap))) / 0.6745
 
-    def run(self) -> ResponseDiagnosis:
-        """The steps in their order."""
-        self._set(self.ring)
-        scores: list[tuple[str, int, tuple[Any, ...]]] = [("design", 0, self._state())]
+    def _split(self, holdout: float, rng: np.random.Generator) -> None:
         columns, monitors = self.data.shape[:2]
-        self.progress("monitors and correctors")
-        for _ in range(2):
-            found = self._in_plane(False, None)
-        scores.append(
-            ("monitor_gain, corrector_calibration", 2 * monitors + columns - 1, self._state())
-        )
-        gradients = np.zeros(len(self.quadrupoles))
-        for _ in range(ROUNDS):
-            self.progress("gradients")
-            found, gradients = self._gauss_newton(gradients)
-        scores.append(("quadrupole_gradient", len(gradients), self._state()))
-        self.progress("coupling")
-        self.gradients = gradients
-        for name, skew in (("monitor_roll, monitor_coupling, corrector_roll", False),
-                           ("skew_gradient", True)):  # fmt: skip
-            own, state = self._coupling(skew)
-            count = len(own.ring) if skew else 2 * monitors + columns - 1
-            scores.append((name, count, state))
-        causes, errors = self._causes(found, self.gradients)
-        more, more_errors = self._coupling_causes(own)
-        steps = [Step(name, count, *self._score(*state)) for name, count, state in scores]
-        bad = tuple(self.m.monitors[i] for i in np.flatnonzero(~self.good))
-        return ResponseDiagnosis(
-            tuple(steps), (*causes, *more), (*errors, *more_errors), bad, self.seed
-        )
+        count = round(holdout * (columns - 1))
+        inner = round(INNER * (columns - 1 - count))
+        if not (count > 0 and inner > 0 and count + inner < columns - 2):
+            raise MeasurementError(f"{columns - 1} correctors cannot be split; measure more")
+        self.held, self.inner = np.zeros((2, columns), dtype=bool)
+        drawn = rng.permutation(columns - 1)
+        self.held[drawn[:count]] = True
+        self.inner[drawn[count : count + inner]] = True
+        self.half = np.zeros((columns, monitors), dtype=bool)  # gives kicks, or the RF's fit
+        for c in [*np.flatnonzero(self.held | self.inner), columns - 1]:
+            self.half[c, rng.choice(monitors, monitors // 2, replace=False)] = True
+        near = np.flatnonzero(self.half[-1])
+        self.inner_rf = np.zeros(monitors, dtype=bool)
+        self.inner_rf[rng.choice(near, max(1, round(INNER * len(near))), replace=False)] = True
 
-    def _set(self, ring: Ring) -> None:
+    # --- the steps --------------------------------------------------------------------------------
+    def run(self) -> ResponseDiagnosis:
+        """Explore which families help, then fit those to all correctors but the held-out ones."""
+        steps = [Step("design", 0, *self.score(self.held, self.half))]
+        refused = []
+        inner = self._inner()
+        for names, rounds in ORDER:
+            self.progress(", ".join(NAMES.get(name, name) for name in names))
+            before, allowed = (self.state.copy(), self.lacking.copy(), self.good), self.allowed
+            self.allowed = [*allowed, *names]
+            own, across = rounds
+            for block in [1] * across + [0] * own:
+                self.round(block)
+            now = self._inner()
+            step = Step(
+                ", ".join(NAMES.get(name, name) for name in names),
+                sum(self._count(name) for name in names), *self.score(self.held, self.half),
+            )  # fmt: skip
+            judge = 0 if names[0] in IN_PLANE else 1
+            good = now[judge] < HELPS * inner[judge] and (now < SPOILS * inner).all()
+            log.info("%s: inner %s -> %s, kept %s", names, inner, now, good)
+            if good:
+                steps.append(step)
+                inner = now
+            else:
+                refused.append(replace(step, kept=False))
+                (self.state, self.lacking, self.good), self.allowed = before, allowed
+                for name in names:
+                    self._forget(name)
+                self._set()
+        self.progress("result")
+        self.exploring = False
+        for block in ([1] if self._has(1) else []) + [0, 0]:
+            self.round(block)
+        last = self.score(self.held, self.half)
+        steps[-1] = Step(steps[-1].effect, steps[-1].parameters, *last)
+        causes, errors, degenerate = self._found()
+        return ResponseDiagnosis(
+            self.ring, self.m, tuple(steps), tuple(refused), causes, errors,
+            tuple(self.m.monitors[i] for i in np.flatnonzero(~self.good)),
+            {name: g.rms for name, g in self.groups.items()}, degenerate, self.held, self.good,
+            self.design, self.read(), self.data, self.seed, time.perf_counter() - self.begun,
+        )  # fmt: skip
+
+    def _inner(self) -> Array:
+        """What chooses: in-plane, coupling and dispersion rms of correctors held out for it."""
+        figures = self.score(self.inner, self.half, self.inner_rf)
+        return np.array([figures[0], figures[1], figures[3]])
+
+    def _count(self, name: str) -> int:
+        columns, monitors = self.data.shape[:2]
+        count: int = {
+            "family_gradient": len(families(self.quadrupoles)[0]),
+            "quadrupole_gradient": len(self.quadrupoles),
+            "skew_gradient": len(self.skews),
+        }.get(name, 2 * monitors if name.startswith("monitor") else columns - 1)
+        return count
+
+    def _forget(self, name: str) -> None:
+        for key in [key for key in self.groups if key.startswith(name)]:
+            del self.groups[key]
+
+    # --- the model --------------------------------------------------------------------------------
+    def ring_causes(self) -> list[Cause]:
+        """Of gradients and skew gradients, as fitted so far."""
+        pairs = (
+            ("quadrupole_gradient", self.quadrupoles, self.state.gradients),
+            ("skew_gradient", self.skews, self.state.skew),
+        )
+        return [
+            Cause(effect, place, float(a))
+            for effect, places, amounts in pairs
+            for place, a in zip(places, amounts, strict=True)
+            if a != 0
+        ]
+
+    def _set(self) -> Array:
+        """Model and readings with the errors as they are."""
+        ring = apply(self.ring, self.ring_causes())
         self.model = ResponseModel(ring)
         response = self.model.response(self.m.correctors)
         whole = np.concatenate([response, self.model.rf_response()[None]])[:, self.at]
         self.beam = whole * self.kicks[:, None, None]
+        self.across = np.zeros_like(self.beam)  # of a kick in the other plane
+        if "corrector_roll" in self.allowed:
+            turned = [Cause("corrector_roll", name, _TURN) for name in self.m.correctors]
+            model = ResponseModel(apply(ring, turned)).response(self.m.correctors)[:, self.at]
+            slope = (model - response[:, self.at] * np.cos(_TURN)) / np.sin(_TURN)
+            self.across[:-1] = slope * self.kicks[:-1, None, None]
+        return self.read()
 
-    def _pick(self, values: Array, plane: Indices) -> Array:
-        """One plane of [column, monitor, 2] for each column."""
-        return np.asarray(np.take_along_axis(values, plane[:, None, None], 2)[..., 0])
+    def read(self) -> Array:
+        """What monitors read of it, m, [column, monitor, 2]."""
+        state = self.state
+        beam = (1 + state.calibration)[:, None, None] * self.beam
+        beam = beam + state.roll[:, None, None] * self.across
+        return np.asarray(np.einsum("mij,cmj->cmi", state.monitors, beam))
 
-    def _weight(self, plane: Indices, fitted_rf: bool = True) -> Array:
-        data = self._pick(self.data, plane)
-        use = np.isfinite(data) & self.good & ~self.held[:, None]
-        use[-1] &= self.half[-1] & fitted_rf
-        variance = self.noise[:, plane].T ** 2 + self.extra**2
-        return np.where(use, 1 / variance, 0.0)
-
-    def _errors(self, effect: str, plane: Indices) -> Array:
-        """What the readings in `plane` do for each gradient, [error, column, monitor]."""
-        places = [(effect, q) for q in self.quadrupoles]
-        scale = ((1 + self.calibration) * self.kicks)[:, None]
-        gain = 1 + self.gain[:, plane].T
+    def slopes_of(self, effect: str, places: Sequence[str], plane: Indices) -> Array:
+        """What the readings in `plane` do for each error, [error, column, monitor]."""
+        scale = ((1 + self.state.calibration) * self.kicks)[:, None]
+        gain = np.diagonal(self.state.monitors, axis1=1, axis2=2)[:, plane].T
         index = plane[:, None, None]
+        pairs = [(effect, place) for place in places]
         out = np.empty((len(places), *gain.shape))
-        for i, slope in enumerate(derivatives(self.model, places, self.m.correctors)):
+        for i, slope in enumerate(derivatives(self.model, pairs, self.m.correctors)):
             out[i] = np.take_along_axis(slope[:, self.at], index, 2)[..., 0] * scale * gain
         return out
 
-    def _in_plane(self, with_gradients: bool, gradients: Array | None) -> Fit:
-        plane = self.plane
-        beam = self._pick(self.beam, plane)
-        scale, gain = 1 + self.calibration[:, None], 1 + self.gain[:, plane].T
-        read = scale * gain * beam
-        by_column = gain * beam
-        by_column[-1] = 0  # the RF's step is known
-        known = [self.gain.ravel(), self.calibration]
-        slopes: Array | Sequence[Array] = []
-        if with_gradients:
-            assert gradients is not None
-            slopes = self._errors("quadrupole_gradient", plane)
-            known.append(gradients)
-        weight = self._weight(plane)
-        found = fit(
-            self._pick(self.data, plane) - read, weight, plane, scale * beam, by_column, slopes,
-            GAIN, CALIBRATION, GRADIENT, start=np.concatenate(known),
-        )  # fmt: skip
-        if not with_gradients:
-            self.gain, self.calibration = found.monitor, found.column
-            self._look()
-        return found
+    # --- a round of Gauss and Newton --------------------------------------------------------------
+    def weight(self, block: int) -> Array:
+        """1 / variance of the readings in the own plane (0) or the other (1), [column, monitor]."""
+        plane = self.plane if block == 0 else 1 - self.plane
+        use = np.isfinite(pick(self.data, plane)) & self.good & ~self.held[:, None]
+        use[-1] &= self.half[-1]
+        if self.exploring:
+            use &= ~self.inner[:, None]
+            use[-1] &= ~self.inner_rf
+        variance = self.noise[:, plane].T ** 2 + self.lacking[block] ** 2
+        return np.where(use, 1 / variance, 0.0)
 
-    def _look(self, drop: bool = False) -> None:
-        """The residual as it is now: what the model lacks, and the monitors that are bad."""
-        weight = self._weight(self.plane)
-        left = np.where(weight > 0, self._residual(), np.nan)[:-1]
-        used = self.good & np.isfinite(left).any(axis=0)
-        rms = np.zeros(len(used))
-        rms[used] = np.sqrt(np.nanmean(left[:, used] ** 2, axis=0))
-        if drop:  # before, the optics' errors are far larger than a bad monitor's
-            self.good = used & (rms <= BAD * np.median(rms[used]))
-        self.extra = max(1e-7, float(np.nanmedian(np.abs(left[:, self.good]))) / 0.6745)
+    def _has(self, block: int) -> bool:
+        return any(name in self.allowed for name in (IN_PLANE, COUPLING)[block])
 
-    def _residual(self) -> Array:
-        scale, gain = 1 + self.calibration[:, None], 1 + self.gain[:, self.plane].T
-        read = scale * gain * self._pick(self.beam, self.plane)
-        return np.asarray(self._pick(self.data, self.plane) - read)
-
-    def _gauss_newton(self, gradients: Array) -> tuple[Fit, Array]:
-        """One step, shortened until what it minimises falls."""
-        weight = self._weight(self.plane)
-        before = np.concatenate([self.gain.ravel(), self.calibration, gradients])
-        m, c = self.gain.size, len(self.plane)
-        found = self._in_plane(True, gradients)
-        goal = np.concatenate([found.monitor.ravel(), found.column, found.ring])
-        prior = np.repeat([GAIN, CALIBRATION, found.scale], [m, c, len(gradients)])
-
-        def cost(values: Array) -> float:
-            chi2 = float((weight * np.nan_to_num(self._residual()) ** 2).sum())
-            return chi2 + float(((values / prior) ** 2).sum())
-
-        old = cost(before)
-        share = 1.0
-        while True:
-            values = before + share * (goal - before)
-            self.gain, self.calibration = values[:m].reshape(-1, 2), values[m : m + c]
-            gradients = values[m + c :]
-            self._set(apply(self.ring, [*self._gradient_causes(gradients), *self.skew]))
-            if cost(values) <= old or share < 0.1:
-                break
-            share /= 2
-        self._look(drop=True)
-        log.info("share %.3g of a step, scale %.2e, lacking %.2e m", share, found.scale, self.extra)
-        return found, gradients
-
-    def _gradient_causes(self, gradients: Array) -> list[Cause]:
-        return [
-            Cause("quadrupole_gradient", q, float(a))
-            for q, a in zip(self.quadrupoles, gradients, strict=True)
-        ]
-
-    def _coupling(self, skew: bool) -> tuple[Fit, tuple[Any, ...]]:
-        """Fit of the readings in the other plane, and what the score needs of it."""
-        own, other = self.plane, 1 - self.plane
-        scale, gain = 1 + self.calibration[:, None], 1 + self.gain[:, other].T
-        m, c = self.gain.size, len(own)
-        known = np.zeros(m + c + (len(self.quadrupoles) if skew else 0))
-        gradients = self.gradients
-        for _ in range(COUPLING_ROUNDS if skew else 1):
-            cross, roll = known[:m].reshape(-1, 2), known[m : m + c]
-            straight = scale * gain * self._pick(self.beam, own)
-            by_column = np.zeros_like(straight)
-            for i, name in enumerate(self.m.correctors):
-                slope = next(derivatives(self.model, [("corrector_roll", name)], [name]))
-                by_column[i] = slope[0, self.at, other[i]] * self.kicks[i]
-            by_column *= scale * gain
-            slopes: Array | Sequence[Array]
-            slopes = self._errors("skew_gradient", other) if skew else []
-            read = scale * gain * self._pick(self.beam, other)
-            read = read + cross[:, other].T * straight + roll[:, None] * by_column
-            residual = self._pick(self.data, other) - read
-            weight = self._weight(other)
-            self.extra = float(np.nanmedian(np.abs(residual[weight > 0]))) / 0.6745
-            weight = self._weight(other)
-            found = fit(
-                residual, weight, other, straight, by_column, slopes, CROSS, ROLL, SKEW, start=known
-            )
-            known = np.concatenate([found.monitor.ravel(), found.column, found.ring])
-            if skew:
-                self.skew = [
-                    Cause("skew_gradient", q, float(a))
-                    for q, a in zip(self.quadrupoles, found.ring, strict=True)
-                ]
-                self._set(apply(self.ring, [*self._gradient_causes(gradients), *self.skew]))
-        return found, (self.beam, self.gain, found.monitor)
-
-    def _state(self) -> tuple[Any, ...]:
-        return self.beam, self.gain, None
-
-    def _score(
-        self, beam: Array, gain: Array, cross: Array | None
-    ) -> tuple[float, float, float, float]:
-        """In-plane and coupling rms, chi2 per reading, dispersion rms: over the good monitors."""
-        own, other = self.plane, 1 - self.plane
-        read = (1 + gain) * beam
-        straight, across = self._pick(read, own), self._pick(read, other)
-        data, data_across = self._pick(self.data, own), self._pick(self.data, other)
-        if cross is not None:
-            across = across + cross[:, other].T * (1 + gain[:, other].T) * self._pick(beam, own)
-        variance = self.noise[:, own].T ** 2
-        inside, outside, chi2 = [], [], []
-        for c in np.flatnonzero(self.held):
-            seen = np.isfinite(data[c]) & self.good
-            near, far = seen & self.half[c], seen & ~self.half[c]
-            u = straight[c, near]  # all alike: what the model lacks is not the readings' noise
-            kick = (u * data[c, near]).sum() / (u * u).sum()
-            miss = data[c, far] - kick * straight[c, far]
-            inside.append(miss)
-            chi2.append(miss**2 / variance[c, far])
-            outside.append((data_across[c] - kick * across[c])[far & np.isfinite(data_across[c])])
-        judge = self.good & ~self.half[-1] & np.isfinite(data[-1])
-        rf = (data[-1] - straight[-1])[judge]
-
-        def rms(parts: Any) -> float:
-            return float(np.sqrt(np.mean(np.square(parts))))
-
-        return (
-            rms(np.concatenate(inside)),
-            rms(np.concatenate(outside)),
-            float(np.mean(np.concatenate(chi2))),
-            rms(rf),
+    def round(self, block: int) -> None:
+        """Linearise the readings of one block, solve, move, and look at what is left."""
+        normal, start, trust = self.linear(block)
+        self._put(block, solve(normal, self.priors(block), start, trust).values)
+        self._set()
+        for seen in (0, 1):
+            if self._has(seen):
+                self._look(seen)
+        log.info(
+            "lacking %s m, %s",
+            self.lacking,
+            {name: f"{group.rms:.1e}" for name, group in self.groups.items()},
         )
 
-    def _causes(self, found: Fit, gradients: Array) -> tuple[list[Cause], list[float]]:
-        causes, sigma = [], found.sigma
-        monitors, columns = len(self.m.monitors), len(self.plane)
-        for i, name in enumerate(self.m.monitors):
-            causes += [
-                Cause(f"monitor_gain_{p}", name, float(self.gain[i, j])) for j, p in enumerate("xy")
-            ]
-        causes += [
-            Cause("corrector_calibration", name, float(a))
-            for name, a in zip(self.m.correctors, self.calibration[:-1], strict=True)
-        ]
-        causes += self._gradient_causes(gradients)
-        kept = np.delete(sigma, 2 * monitors + columns - 1)  # the RF has no calibration
-        return causes, kept.tolist()
+    def linear(self, block: int) -> tuple[Normal, Array, Array]:
+        """Normal equations where the fit stands, the parameters there, and the trusted change."""
+        state, own = self.state, self.plane
+        plane = own if block == 0 else 1 - own
+        beam = (1 + state.calibration)[:, None, None] * self.beam
+        beam = beam + state.roll[:, None, None] * self.across
+        gain = np.diagonal(state.monitors, axis1=1, axis2=2)[:, plane].T
+        if block == 0:
+            by_monitor, by_column = pick(beam, own), gain * pick(self.beam, own)
+            effect, places, ring = "quadrupole_gradient", self.quadrupoles, state.gradients
+            monitors = np.diagonal(state.monitors, axis1=1, axis2=2) - 1
+            column, steps = state.calibration, (STEP, STEP, STEP)
+        else:
+            by_monitor, by_column = pick(beam, own), gain * pick(self.across, plane)
+            effect, places, ring = "skew_gradient", self.skews, state.skew
+            monitors = np.stack([state.monitors[:, 0, 1], state.monitors[:, 1, 0]], axis=1)
+            column, steps = state.roll, (ROLL_STEP, ROLL_STEP, SKEW_STEP)
+        by_column[-1] = 0  # the RF's step is known
+        wanted = effect in self.allowed or (block == 0 and "family_gradient" in self.allowed)
+        slopes: Array | list[Array] = self.slopes_of(effect, places, plane) if wanted else []
+        if block == 0 and wanted:  # relative to the design's strength, not to the one found
+            slopes = np.asarray(slopes) / (1 + ring)[:, None, None]
+        if not wanted:
+            ring = ring[:0]
+        residual = pick(self.data - self.read(), plane)
+        self.slopes = slopes
+        normal = normal_equations(
+            residual, self.weight(block), plane, by_monitor, by_column, slopes
+        )
+        start = np.concatenate([monitors.ravel(), column, ring])
+        return normal, start, np.repeat(steps, [monitors.size, len(column), len(ring)])
 
-    def _coupling_causes(self, found: Fit) -> tuple[list[Cause], list[float]]:
-        """x reads (coupling + roll) y, y reads (coupling - roll) x."""
-        causes: list[Cause] = []
-        errors: list[float] = []
-        monitors, columns = len(self.m.monitors), len(self.plane)
-        both = found.sigma[: 2 * monitors].reshape(monitors, 2)
-        spread = np.sqrt((both**2).sum(axis=1)) / 2
-        for i, name in enumerate(self.m.monitors):
-            x, y = found.monitor[i]
-            causes += [
-                Cause("monitor_roll", name, float(x - y) / 2),
-                Cause("monitor_coupling", name, float(x + y) / 2),
-            ]
-            errors += [float(spread[i])] * 2
-        rest = found.sigma[2 * monitors :]
+    def _put(self, block: int, values: Array) -> None:
+        state = self.state
+        m, c = 2 * len(self.at), len(self.plane)
+        monitors, column, ring = values[:m].reshape(-1, 2), values[m : m + c], values[m + c :]
+        if block == 0:
+            state.monitors[:, [0, 1], [0, 1]] = 1 + monitors
+            state.calibration = column
+            state.gradients = ring if len(ring) else state.gradients
+        else:
+            state.monitors[:, [0, 1], [1, 0]] = monitors
+            state.roll = column
+            state.skew = ring if len(ring) else state.skew
+
+    def priors(self, block: int) -> list[Group]:
+        """The groups of what is allowed."""
+        columns, monitors = self.data.shape[:2]
+        ring = (self.quadrupoles, self.skews)[block]
+        wanted = {"quadrupole_gradient", "family_gradient", "skew_gradient"} & set(self.allowed)
+        sizes = [2 * monitors, columns]
+        if ("skew_gradient" in wanted) if block else wanted - {"skew_gradient"}:
+            sizes.append(len(ring))
+        edge = np.concatenate([[0], np.cumsum(sizes)])
+
+        def group(name: str, part: int, basis: Array, rms: float, **options: Any) -> Group:
+            if name not in self.groups or len(self.groups[name].basis) != edge[-1]:
+                whole = np.zeros((edge[-1], basis.shape[1]))
+                whole[edge[part] : edge[part + 1]] = basis
+                old = self.groups.get(name)
+                rms, each = (rms, None) if old is None else (old.rms, old.each)
+                self.groups[name] = Group(name, whole, rms, each=each, **options)
+            return self.groups[name]
+
+        alike = np.zeros((2 * monitors, 2))
+        alike[0::2, 0] = alike[1::2, 1] = 1
+        makers: dict[str, Callable[[], list[Group]]] = {
+            "corrector_calibration": lambda: [
+                group("corrector_calibration", 1, np.eye(columns), 0.02, heavy=True),
+                group(
+                    "corrector_calibration of families", 1,
+                    families([*self.m.correctors, "\0"])[1], 0.05,
+                ),
+            ],
+            "monitor_gain": lambda: [
+                group("monitor_gain", 0, np.eye(2 * monitors), 0.01, heavy=True),
+                group("monitor_gain of a plane", 0, alike, 0.03, fixed=True),
+            ],
+            "family_gradient": lambda: [
+                group("quadrupole_gradient of families", 2, families(ring)[1], 0.01)
+            ],
+            "quadrupole_gradient": lambda: [
+                group(
+                    "quadrupole_gradient", 2, np.eye(len(ring)), 3e-3, heavy=True,
+                    most=LARGEST_GRADIENT,
+                )
+            ],
+            "monitor_roll": lambda: [
+                group("monitor_roll", 0, np.eye(2 * monitors), 0.01, heavy=True)
+            ],
+            "corrector_roll": lambda: [
+                group("corrector_roll", 1, np.eye(columns), 0.01, heavy=True)
+            ],
+            "skew_gradient": lambda: [
+                group(
+                    "skew_gradient", 2, np.eye(len(ring)), 3e-4, heavy=True, most=LARGEST_SKEW
+                )
+            ],
+        }  # fmt: skip
+        mine = COUPLING if block else IN_PLANE
+        return [g for name in mine if name in self.allowed for g in makers[name]()]
+
+    def _look(self, block: int) -> None:
+        """What the model lacks now; and the monitors that are bad, their own gains apart."""
+        plane = self.plane if block == 0 else 1 - self.plane
+        read = self.read()
+        weight = self.weight(block)
+        left = np.where(weight > 0, pick(self.data - read, plane), np.nan)[:-1]
+        typical = float(np.nanmedian(np.abs(left[:, self.good]))) / 0.6745
+        noise = float(np.median(self.noise))
+        self.lacking[block] = np.sqrt(max(typical**2 - noise**2, (noise / 5) ** 2))
+        if block == 0:
+            self._find_bad(pick(read, plane))
+
+    def _find_bad(self, read: Array) -> None:
+        use = ~self.held & ~(self.inner if self.exploring else np.zeros_like(self.held))
+        use[-1] = False
+        data = pick(self.data, self.plane)
+        ratio = np.zeros(len(self.good))
+        for p in (0, 1):
+            rows = use & (self.plane == p)
+            if rows.sum() < FEW:
+                continue
+            u, d = read[rows], data[rows]
+            seen = np.isfinite(d)
+            d = np.where(seen, d, 0)
+            u = np.where(seen, u, 0)
+            gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
+            count = np.maximum(seen.sum(axis=0), 1)
+            rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
+            rms[(seen.sum(axis=0) == 0) | (abs(gain) < 0.2)] = np.inf
+            ratio = np.maximum(ratio, rms / np.median(rms))
+        self.good = ratio <= BAD
+
+    # --- the judges -------------------------------------------------------------------------------
+    def score(
+        self, judges: Flags, half: Flags, rf: Flags | None = None
+    ) -> tuple[float, float, float, float, float]:
+        """In-plane and coupling rms, chi2, dispersion rms, in-plane rms with a position jump.
+
+        Args:
+            judges: the correctors that judge, [column].
+            half: monitors that give each of them its kick, [column, monitor].
+            rf: monitors that judge the RF's response; None: those that did not fit it.
+        """
+        own, other = self.plane, 1 - self.plane
+        gains = self.state.monitors
+        read = np.einsum("mij,cmj->cmi", gains, self.beam)
+        straight, across = pick(read, own), pick(read, other)
+        data, data_across = pick(self.data, own), pick(self.data, other)
+        jumps = pick(np.einsum("mij,cmj->cmi", gains[:, :, :], self.jumps()), own)
+        variance = self.noise[:, own].T ** 2
+        inside, jumped, outside, squares = [], [], [], []
+        for c in np.flatnonzero(judges):
+            seen = np.isfinite(data[c]) & self.good
+            near, far = seen & half[c], seen & ~half[c]
+            # all alike: what the model lacks is not the readings' noise
+            kick, miss = _fitted(straight[c][:, None], data[c], near, far)
+            inside.append(miss)
+            squares.append(miss**2 / variance[c, far])
+            jumped.append(_fitted(np.stack([straight[c], jumps[c]], 1), data[c], near, far)[1])
+            outside.append(
+                (data_across[c] - kick[0] * across[c])[far & np.isfinite(data_across[c])]
+            )
+        judge = self.good & np.isfinite(data[-1]) & (~half[-1] if rf is None else rf)
+        left = (data[-1] - straight[-1])[judge]
+        return (
+            rms_of(inside),
+            rms_of(outside),
+            float(np.mean(np.concatenate(squares))),
+            rms_of([left]),
+            rms_of(jumped),
+        )
+
+    def jumps(self) -> Array:
+        """Beam orbit for a position jump of a metre at each corrector, [column, monitor, 2]."""
+        model = self.model
+        columns = model.columns(self.m.correctors)
+        jump = np.zeros((len(columns.names), model.dimension))
+        jump[np.arange(len(jump)), 2 * self.plane[:-1]] = 1
+        pulled = np.einsum("cij,cj->ci", model.inverse[columns.layer + 1], jump)
+        before = np.einsum("mai,ci->cma", model.reading_slopes, pulled @ model.closing.T)
+        behind = np.einsum("mai,ci->cma", model.reading_slopes, pulled)
+        whole = before + model.downstream(columns)[:, :, None] * behind
+        return np.concatenate([whole[:, self.at], np.zeros((1, len(self.at), 2))])
+
+    # --- what was found ---------------------------------------------------------------------------
+    def _found(self) -> tuple[tuple[Cause, ...], tuple[float, ...], tuple[str, ...]]:
+        posterior = {}
+        for block in (0, 1):
+            groups = self.priors(block)
+            if groups:
+                normal, start, _ = self.linear(block)
+                posterior[block] = solve(normal, groups, start, rounds=0)
+        found: list[tuple[str, str, float, float]] = []
+        state, monitors = self.state, self.m.monitors
+        m = 2 * len(monitors)
+        gain = np.diagonal(state.monitors, axis1=1, axis2=2)
+        sigma = {block: p.sigma for block, p in posterior.items()}
+        for j, p in enumerate("xy"):
+            for i, name in enumerate(monitors):
+                found.append((f"monitor_gain_{p}", name, gain[i, j] - 1, sigma[0][2 * i + j]))
         for i, name in enumerate(self.m.correctors):
-            causes.append(Cause("corrector_roll", name, float(found.column[i])))
-            errors.append(float(rest[i]))
+            amount = state.calibration[i]
+            found.append(("corrector_calibration", name, amount, sigma[0][m + i]))
         for i, name in enumerate(self.quadrupoles):
-            causes.append(Cause("skew_gradient", name, float(found.ring[i])))
-            errors.append(float(rest[columns + i]))
-        return causes, errors
+            at = m + len(self.plane) + i
+            if at < len(sigma[0]):
+                found.append(("quadrupole_gradient", name, state.gradients[i], sigma[0][at]))
+        if 1 in posterior:
+            both = sigma[1][:m].reshape(-1, 2)
+            # x reads (coupling + roll) y, y reads (coupling - roll) x
+            x, y = state.monitors[:, 0, 1] / gain[:, 0], state.monitors[:, 1, 0] / gain[:, 1]
+            spread = np.hypot(*both.T) / 2
+            for i, name in enumerate(monitors):
+                found.append(("monitor_roll", name, (x[i] - y[i]) / 2, spread[i]))
+                found.append(("monitor_coupling", name, (x[i] + y[i]) / 2, spread[i]))
+            for i, name in enumerate(self.m.correctors):
+                roll = state.roll[i] / (1 + state.calibration[i])
+                found.append(("corrector_roll", name, roll, sigma[1][m + i]))
+            for i, name in enumerate(self.skews):
+                at = m + len(self.plane) + i
+                if at < len(sigma[1]):
+                    found.append(("skew_gradient", name, state.skew[i], sigma[1][at]))
+        found = [row for row in found if row[2] != 0 or row[3] != 0]
+        return (
+            tuple(Cause(effect, name, float(a)) for effect, name, a, _ in found),
+            tuple(float(s) for *_, s in found),
+            self._degenerate(posterior[0]) if posterior else (),
+        )
+
+    def _degenerate(self, posterior: Posterior) -> tuple[str, ...]:
+        """Directions that the prior holds and not the data."""
+        said = []
+        m, c = 2 * len(self.at), len(self.plane)
+        sigma = posterior.sigma
+        spread = posterior.spread
+        factor = np.linalg.cholesky(posterior.covariance + 1e-12 * np.eye(len(spread.T)))
+        draws = spread @ factor
+        scale = draws[:m].mean(axis=0)
+        kick = draws[m : m + c - 1].mean(axis=0)
+        both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
+        said.append(
+            f"mean monitor gain against mean corrector scale: known to "
+            f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
+            f"{both:+.2f}"
+        )
+        if "quadrupole_gradient" in self.groups and len(sigma) > m + c:
+            group = self.groups["quadrupole_gradient"]
+            prior = group.rms if group.each is None else group.each
+            loose = np.flatnonzero(sigma[m + c :] > 0.5 * prior)
+            names = [self.quadrupoles[i] for i in loose]
+            if names:
+                said.append(
+                    f"{len(names)} gradients that the prior holds more than the data: "
+                    + ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+                )  # fmt: skip
+        return tuple(said)
+
+
+_TURN = 0.1
+"""Roll that shows a corrector's kick in the other plane, rad."""
+
+
+def _tunes(ring: Ring) -> list[float] | None:
+    """Fractions of Qx, Qy; None where there are none."""
+    try:
+        return [float(q) for q in matrix_tunes(ResponseModel(ring, 4).tangents[-1])]
+    except UnstableRingError:
+        return None
+
+
+def pick(values: Array, plane: Indices) -> Array:
+    """One plane of [column, monitor, 2] for each column."""
+    return np.asarray(np.take_along_axis(values, plane[:, None, None], 2)[..., 0])
+
+
+def rms_of(parts: Iterable[Array]) -> float:
+    """Over all of them."""
+    return float(np.sqrt(np.mean(np.square(np.concatenate(list(parts))))))
+
+
+def _fitted(patterns: Array, data: Array, near: Flags, far: Flags) -> tuple[Array, Array]:
+    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss."""
+    size = np.abs(patterns[near]).max(axis=0)
+    size[size == 0] = 1
+    amounts = np.linalg.lstsq(patterns[near] / size, data[near], rcond=None)[0] / size
+    return amounts, data[far] - patterns[far] @ amounts

@@ -3,55 +3,50 @@
 Three kinds of parameter meet in one residual d [column, monitor]: what scales all readings of a
 monitor (gain, or the other plane's share), what scales a column (corrector calibration, or roll),
 and what changes the ring. Their normal equations are dense only in the last.
+
+Parameters have priors in groups: each has its own scale, which follows the evidence (EM), and may
+be shared: an error of a family beside the errors of its members. A heavy group has Student's
+distribution (four degrees of freedom), so that one wrong magnet does not widen the prior of all.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.blas import dsyrk
+from scipy.linalg.lapack import dpotri
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FREEDOM = 4.0
+"""Of Student's distribution."""
 
 
 @dataclass(frozen=True)
-class Fit:
-    """What the residual is explained by.
+class Normal:
+    """Normal equations; parameters: monitor and plane, then column, then error of the ring.
 
     Attributes:
-        monitor: of the readings of each plane, [monitor, 2].
-        column: of each column, [column].
-        ring: of each error of the ring, [error].
-        sigma: posterior errors of all, in this order, [parameter].
-        scale: rms of the prior of the ring's errors, as the data have it.
-        left: the residual that stays, m, [column, monitor].
+        matrix: J^T W J, [parameter, parameter].
+        vector: J^T W residual, [parameter].
     """
 
-    monitor: Array
-    column: Array
-    ring: Array
-    sigma: Array
-    scale: float
-    left: Array
+    matrix: Array
+    vector: Array
 
 
-def fit(
+def normal_equations(
     residual: Array,
     weight: Array,
-    plane: Array,
+    plane: Indices,
     by_monitor: Array,
     by_column: Array,
     by_ring: Array | Sequence[Array],
-    monitor_rms: float,
-    column_rms: float,
-    ring_rms: float,
-    start: Array | None = None,
-    rounds: int = 20,
-) -> Fit:
-    """The most probable parameters; the scale of the ring's prior follows the evidence.
-
-    MacKay's fixed point: scale^2 = sum of squares / number of well-determined parameters.
+) -> Normal:
+    """Sums over all readings.
 
     Args:
         residual: measured less model, m, [column, monitor]; weight 0 where missing.
@@ -60,58 +55,131 @@ def fit(
         by_monitor: d reading / d monitor's parameter, [column, monitor].
         by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
         by_ring: d reading / d error, [error, column, monitor]; may be empty.
-        monitor_rms, column_rms, ring_rms: of the priors; of the last only the start.
-        start: what the parameters are where the residual was taken, in the order of `Fit.sigma`;
-            None: zero. The priors are about zero, and the result is the whole of each parameter.
-        rounds: of the fixed point.
     """
     columns, monitors = residual.shape
     J = np.asarray(by_ring, dtype=float).reshape(-1, columns, monitors)
-    errors = len(J)
     m, c = 2 * monitors, columns
-    size = m + c + errors
-    A = np.zeros((size, size))
-    b = np.zeros(size)
+    A = np.zeros((m + c + len(J),) * 2)
+    b = np.zeros(len(A))
     y = np.where(weight > 0, residual, 0.0)
     place = np.arange(monitors)
+    rows = [plane == p for p in (0, 1)]
+    wu, wv = weight * by_monitor, weight * by_column
     for p in (0, 1):
-        rows = plane == p
-        w, u = weight[rows], by_monitor[rows]
         at = 2 * place + p
-        A[at, at] = (w * u * u).sum(axis=0)
-        A[np.ix_(at, m + np.flatnonzero(rows))] = (w * u * by_column[rows]).T
-        b[at] = (w * u * y[rows]).sum(axis=0)
-        if errors:
-            A[at, m + c :] = np.einsum("gcm,cm->mg", J[:, rows], w * u, optimize=True)
+        A[at, at] = (wu * by_monitor)[rows[p]].sum(axis=0)
+        A[np.ix_(at, m + np.flatnonzero(rows[p]))] = (wu * by_column)[rows[p]].T
+        b[at] = (wu * y)[rows[p]].sum(axis=0)
     own = m + np.arange(c)
-    A[own, own] = (weight * by_column**2).sum(axis=1)
-    b[own] = (weight * by_column * y).sum(axis=1)
-    if errors:
-        A[m : m + c, m + c :] = np.einsum("gcm,cm->cg", J, weight * by_column, optimize=True)
-        flat = (J * np.sqrt(weight)).reshape(errors, -1)
-        A[m + c :, m + c :] = flat @ flat.T
-        b[m + c :] = flat @ (np.sqrt(weight) * y).ravel()
-    A = np.triu(A) + np.triu(A, 1).T
-    known = np.zeros(size) if start is None else start
-    b += A @ known
-    scale = ring_rms
-    for _ in range(rounds if errors else 1):
+    A[own, own] = (wv * by_column).sum(axis=1)
+    b[own] = (wv * y).sum(axis=1)
+    root = np.sqrt(weight)
+    flat = np.empty((len(J), residual.size))
+    for i, slope in enumerate(J):
+        both = wu * slope
+        for p in (0, 1):
+            A[2 * place + p, m + c + i] = both[rows[p]].sum(axis=0)
+        A[own, m + c + i] = (wv * slope).sum(axis=1)
+        flat[i] = (root * slope).ravel()
+    if len(J):
+        A[m + c :, m + c :] = dsyrk(1.0, flat.T, trans=1, lower=0)
+        b[m + c :] = flat @ (root * y).ravel()
+    return Normal(np.triu(A) + np.triu(A, 1).T, b)
+
+
+@dataclass
+class Group:
+    """Parameters with one prior: the base parameters move by `basis` times theirs.
+
+    Attributes:
+        name: for people.
+        basis: [base parameter, parameter].
+        rms: of the prior; where the search for it starts.
+        heavy: Student's distribution instead of Gauss'.
+        fixed: the scale stays.
+        most: largest prior rms that physics allows one parameter.
+        each: prior rms of every parameter, as last found; None: `rms`.
+    """
+
+    name: str
+    basis: Array
+    rms: float
+    heavy: bool = False
+    fixed: bool = False
+    most: float = np.inf
+    each: Array | None = None
+
+    def learn(self, squares: Array) -> None:
+        """One step of EM from the expected squares of the parameters."""
+        if not len(squares):
+            self.each = squares
+            return
+        if self.heavy:
+            for _ in range(20):
+                share = (FREEDOM + 1) / (FREEDOM + squares / self.rms**2)
+                self.rms = max(float(np.sqrt(np.mean(share * squares))), 1e-9)
+            self.each = self.rms * np.sqrt((FREEDOM + squares / self.rms**2) / (FREEDOM + 1))
+        else:
+            if not self.fixed:
+                self.rms = max(float(np.sqrt(np.mean(squares))), 1e-9)
+            self.each = np.full(len(squares), self.rms)
+        self.each = np.minimum(self.each, self.most)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the residual is explained by.
+
+    Attributes:
+        values: of the base parameters, [parameter].
+        sigma: their posterior errors.
+        covariance: of the groups' parameters, in units of their priors, [p, p].
+        spread: of the base parameters: basis times prior rms, [parameter, p].
+    """
+
+    values: Array
+    sigma: Array
+    covariance: Array
+    spread: Array
+
+
+def solve(
+    normal: Normal,
+    groups: Iterable[Group],
+    start: Array | None = None,
+    trust: Array | None = None,
+    rounds: int = 2,
+) -> Posterior:
+    """The most probable parameters; the groups learn their scales.
+
+    Args:
+        normal: at `start`.
+        groups: the priors, about zero; every base parameter that may move is in one of them.
+        start: the base parameters where the residual was taken; None: zero.
+        trust: rms by which each may move away from `start`; None: freely. It shortens the step and
+            not the result: a fixed point does not know it.
+        rounds: of EM; 0: the priors stay as they are.
+    """
+    groups = list(groups)
+    known = np.zeros(len(normal.vector)) if start is None else start
+    basis = np.concatenate([g.basis for g in groups], axis=1)
+    owner = np.repeat(np.arange(len(groups)), [g.basis.shape[1] for g in groups])
+    base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
+    A = basis.T @ base @ basis
+    b = basis.T @ (normal.vector + base @ known)
+    for turn in range(max(rounds, 1)):
         prior = np.concatenate(
-            [np.full(m, monitor_rms), np.full(c, column_rms), np.full(errors, scale)]
+            [np.full(g.basis.shape[1], g.rms) if g.each is None else g.each for g in groups]
         )
         # in units of the priors, so that the matrix is well scaled
-        factor = cho_factor(A * np.outer(prior, prior) + np.eye(size), lower=True)
+        factor = cho_factor(A * np.outer(prior, prior) + np.eye(len(A)), lower=True)
         found = prior * cho_solve(factor, prior * b)
-        variance = np.diag(cho_solve(factor, np.eye(size)))
-        if errors:
-            determined = float((1 - variance[m + c :]).sum())
-            scale = float(np.sqrt((found[m + c :] ** 2).sum() / max(determined, 1e-9)))
-    step = found - known
-    explained = step[:m].reshape(monitors, 2)[:, plane].T * by_monitor
-    explained = explained + step[m : m + c, None] * by_column
-    if errors:
-        explained = explained + np.tensordot(step[m + c :], J, 1)
-    return Fit(
-        found[:m].reshape(monitors, 2), found[m : m + c], found[m + c :],
-        prior * np.sqrt(variance), scale, residual - explained,
-    )  # fmt: skip
+        covariance = dpotri(factor[0], lower=1)[0]
+        if turn < rounds:
+            squares = found**2 + np.diag(covariance) * prior**2
+            for i, group in enumerate(groups):
+                group.learn(squares[owner == i])
+    covariance = np.tril(covariance) + np.tril(covariance, -1).T
+    spread = basis * prior
+    sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))
+    return Posterior(basis @ found, sigma, covariance, spread)

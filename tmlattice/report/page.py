@@ -31,6 +31,17 @@ class Picture:
         return f"data:image/png;base64,{b64encode(self.path.read_bytes()).decode('ascii')}"
 
 
+def templates() -> Environment:
+    """Where the pages' templates are."""
+    return Environment(
+        loader=PackageLoader("tmlattice.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
 def draw(diagnosis: Diagnosis, folder: Path) -> list[Picture]:
     """Every figure of a diagnosis as a PNG file in the folder."""
     import matplotlib.pyplot as plt
@@ -56,20 +67,17 @@ def page(
         pictures: of `draw`.
         provenance: where it should state more than the diagnosis' own.
     """
-    environment = Environment(
-        loader=PackageLoader("tmlattice.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     stated = diagnosis.provenance if provenance is None else provenance
-    return environment.get_template("diagnosis.html").render(
-        diagnosis=diagnosis,
-        report=report,
-        pictures={picture.name: picture for picture in pictures},
-        provenance={
-            key: value if isinstance(value, str) else json.dumps(value)
-            for key, value in stated.items()
-        },
+    return (
+        templates()
+        .get_template("diagnosis.html")
+        .render(
+            diagnosis=diagnosis,
+            report=report,
+            pictures={picture.name: picture for picture in pictures},
+            provenance={
+                key: value if isinstance(value, str) else json.dumps(value)
+                for key, value in stated.items()
+            },
+        )
     )

@@ -1,0 +1,451 @@
+"""Which effect a fitted orbit response still lacks: each hypothesis weighed on held-out readings.
+
+>>> run = ResponseRun(ring, measured)
+>>> run.run()
+>>> for row in weigh(run): print(row.effect, row.amount, row.amount_sigma, row.judgement)
+
+A hypothesis is a set of patterns: what the readings would change by for one unit of each of its
+parameters. Patterns are fitted together with everything that the fit already has, linearly about
+it, to the same correctors; the held-out ones judge. What every corrector has of its own (its place,
+the machine's drift while it was stepped) is taken from a held-out corrector's near monitors, as its
+kick is.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from tmlattice.diagnosis.response import ResponseRun, families, pick, rms_of
+from tmlattice.effects import apply
+from tmlattice.lattice import Ring
+from tmlattice.response import ResponseModel, derivatives
+
+Array = NDArray[np.float64]
+
+ENERGY_SPREAD = 1.2e-3
+"""Relative rms energy spread of PETRA III's beam; the scale of the hypothesis."""
+DELTA = 1e-3
+"""Energy deviation of the differences."""
+BEND_GRADIENT = 1e-4
+"""1/m2, of the differences."""
+MILLIMETRE = 1e-3
+FREE = 10.0
+"""Prior rms of a parameter that stands alone, in its unit: none to speak of."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect that may be missing.
+
+    Attributes:
+        effect: its name.
+        unit: of the amounts.
+        expected: what physics would allow.
+        patterns: d reading / d amount in each column's own plane, m, [parameter, column, monitor].
+        own: each column has its own amount of each pattern.
+        most: the largest physically sensible amount.
+    """
+
+    effect: str
+    unit: str
+    expected: str
+    patterns: Array = field(repr=False)
+    own: bool = False
+    most: float = np.inf
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A hypothesis and what held-out readings say of it.
+
+    Attributes:
+        effect, unit, expected: see `Hypothesis`.
+        parameters: how many.
+        amount: the parameter, or the rms of several.
+        amount_sigma: its posterior rms, or the median one of several.
+        heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
+        without: the same in-plane rms with all other hypotheses and not this one, m, or nan.
+        judgement: "helps", "excluded" (held-out readings do not want it) or "unphysical".
+    """
+
+    effect: str
+    unit: str
+    expected: str
+    parameters: int
+    amount: float
+    amount_sigma: float
+    heldout_rms_in_plane: float
+    heldout_rms_position: float
+    without: float
+    judgement: str
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {k: v for k, v in vars(self).items() if k not in ("unit", "without")}
+
+
+HELPS = 0.98
+"""Held-out rms falls to this share at least where a hypothesis helps."""
+
+
+def weigh(
+    run: ResponseRun,
+    wanted: Iterable[str] | None = None,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> list[Weighed]:
+    """Every hypothesis alone on top of the fit; the first row is the fit without any.
+
+    Args:
+        run: after its fit.
+        wanted: names of `HYPOTHESES`; None: all.
+        progress: called with each name.
+    """
+    lattice = Fitted(run)
+    rows = [_row(lattice, None, np.inf)]
+    for name in HYPOTHESES if wanted is None else wanted:
+        progress(name)
+        found = HYPOTHESES[name](run)
+        if found is not None:
+            rows.append(_row(lattice, found, rows[0].heldout_rms_in_plane))
+    return rows
+
+
+def _row(fitted: "Fitted", hypothesis: Hypothesis | None, before: float) -> Weighed:
+    amounts, sigma, rms, jumped = fitted.weigh(hypothesis)
+    if hypothesis is None:
+        return Weighed("none", "", "", 0, 0.0, 0.0, rms, jumped, np.nan, "")
+    size = float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
+    if rms > HELPS * before:
+        judgement = "excluded"
+    else:
+        judgement = "helps" if abs(size) <= hypothesis.most else "unphysical"
+    return Weighed(
+        hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts), size,
+        float(np.median(sigma)), rms, jumped, np.nan, judgement,
+    )  # fmt: skip
+
+
+class Fitted:
+    """The linearised fit, to which patterns can be added."""
+
+    def __init__(self, run: ResponseRun) -> None:
+        self.run = run
+        normal, self.start, _ = run.linear(0)
+        groups = run.priors(0)
+        self.slopes = np.asarray(run.slopes).reshape(-1, *run.data.shape[:2])
+        basis = np.concatenate([g.basis for g in groups], axis=1)
+        prior = np.concatenate(
+            [np.full(g.basis.shape[1], g.rms) if g.each is None else g.each for g in groups]
+        )
+        self.spread = basis * prior
+        A = self.spread.T @ normal.matrix @ self.spread
+        self.factor = cho_factor(A + np.eye(len(A)), lower=True)
+        self.vector = self.spread.T @ (normal.vector + normal.matrix @ self.start)
+        self.weight = run.weight(0)
+        state, own = run.state, run.plane
+        beam = (1 + state.calibration)[:, None, None] * run.beam
+        gain = np.diagonal(state.monitors, axis1=1, axis2=2)[:, own].T
+        self.by_monitor = pick(beam, own)
+        self.by_column = gain * pick(run.beam, own)
+        self.by_column[-1] = 0
+        self.read = pick(run.read(), own)
+        residual = np.where(self.weight > 0, pick(run.data, own) - self.read, 0.0)
+        self.target = residual + self.change(self.start)
+
+    def change(self, values: Array) -> Array:
+        """Readings [column, monitor] for a change of the base parameters."""
+        run = self.run
+        m, c = 2 * len(run.at), len(run.plane)
+        out = values[:m].reshape(-1, 2)[:, run.plane].T * self.by_monitor
+        out = out + values[m : m + c, None] * self.by_column
+        if len(self.slopes):
+            out = out + np.tensordot(values[m + c :], self.slopes, 1)
+        return np.asarray(out)
+
+    def across(self, patterns: Array) -> Array:
+        """J^T W H, [base parameter, pattern]."""
+        run = self.run
+        m, c = 2 * len(run.at), len(run.plane)
+        out = np.zeros((len(self.start), len(patterns)))
+        flat = self.slopes.reshape(len(self.slopes), -1)
+        for k, pattern in enumerate(patterns):
+            weighted = self.weight * pattern
+            both = weighted * self.by_monitor
+            for p in (0, 1):
+                out[p:m:2, k] = both[run.plane == p].sum(axis=0)
+            out[m : m + c, k] = (weighted * self.by_column).sum(axis=1)
+        if len(flat):
+            out[m + c :] = flat @ (self.weight * patterns).reshape(len(patterns), -1).T
+        return out
+
+    def weigh(self, hypothesis: Hypothesis | None) -> tuple[Array, Array, float, float]:
+        """Amounts, their errors, and held-out rms in-plane without and with a position jump."""
+        if hypothesis is None:
+            return (np.zeros(0), np.zeros(0), *self._score(np.zeros(0), None))
+        H = hypothesis.patterns
+        if hypothesis.own:
+            H = _by_column(H)
+        size = np.sqrt((self.weight * H**2).sum(axis=(1, 2)))
+        kept = size > 0
+        H = H[kept]
+        B = self.spread.T @ self.across(H)
+        half = cho_solve(self.factor, B)
+        flat = H.reshape(len(H), -1)
+        weight = self.weight.ravel()
+        C = (flat * weight) @ flat.T - B.T @ half
+        r = flat @ (weight * self.target.ravel()) - half.T @ self.vector
+        spread = np.full(len(H), FREE) if len(H) <= 4 else 1 / np.sqrt(np.diag(C).mean() + 1e-300)
+        spread = np.broadcast_to(spread, len(H)) * (1.0 if len(H) <= 4 else 10.0)
+        for _ in range(1 if len(H) <= 4 else 12):
+            inverse = np.linalg.inv(C * np.outer(spread, spread) + np.eye(len(H)))
+            amounts = spread * (inverse @ (spread * r))
+            variance = np.diag(inverse) * spread**2
+            if len(H) > 4:
+                spread = np.full(len(H), np.sqrt(np.mean(amounts**2 + variance)))
+        moved = cho_solve(self.factor, self.vector - B @ amounts)
+        change = self.change(self.spread @ moved - self.start)
+        if not hypothesis.own:
+            change = change + np.tensordot(amounts, H, 1)
+        rms, jumped = self._score(change, hypothesis.patterns if hypothesis.own else None)
+        return amounts, np.sqrt(variance), rms, jumped
+
+    def _score(self, change: Array, own: Array | None) -> tuple[float, float]:
+        run = self.run
+        read = self.read + change if len(change) else self.read
+        data = pick(run.data, run.plane)
+        jumps = pick(np.einsum("mij,cmj->cmi", run.state.monitors, run.jumps()), run.plane)
+        inside: list[Array] = []
+        jumped: list[Array] = []
+        for c in np.flatnonzero(run.held):
+            patterns = [read[c], *([] if own is None else own[:, c])]
+            patterns = [p for p in patterns if np.abs(p).max() > 0]
+            seen = np.isfinite(data[c]) & run.good
+            near, far = seen & run.half[c], seen & ~run.half[c]
+            for more, into in (([], inside), ([jumps[c]], jumped)):
+                both = np.stack([*patterns, *more], axis=1)
+                scale = np.abs(both[near]).max(axis=0)
+                amounts = np.linalg.lstsq(both[near] / scale, data[c, near], rcond=None)[0]
+                into.append(data[c, far] - (both[far] / scale) @ amounts)
+        return rms_of(inside), rms_of(jumped)
+
+
+def _by_column(patterns: Array) -> Array:
+    """One parameter for each column that a pattern is not zero in."""
+    rows = []
+    for pattern in patterns:
+        for c in np.flatnonzero(np.abs(pattern).max(axis=1) > 0):
+            row = np.zeros_like(pattern)
+            row[c] = pattern[c]
+            rows.append(row)
+    return np.array(rows)
+
+
+# --- the hypotheses -------------------------------------------------------------------------------
+def _readings(run: ResponseRun, beam: Array) -> Array:
+    """Own-plane readings [column, monitor] of the beam's orbit changes [column, monitor, 2]."""
+    return pick(np.einsum("mij,cmj->cmi", run.state.monitors, beam), run.plane)
+
+
+def _kicks(run: ResponseRun) -> Array:
+    return np.asarray((run.kicks * (1 + run.state.calibration))[:-1])
+
+
+def _orders(run: ResponseRun) -> tuple[Array, Array]:
+    """Second and third order of the orbit changes for whole steps, [column, monitor, 2]."""
+    model, kicks = run.model, _kicks(run)
+    f = run.kicks[-1]
+    up, down = (
+        np.concatenate([
+            model.closed_orbits(run.m.correctors, side * kicks),
+            ResponseModel(model.ring, frequency=side * f).readings[None],
+        ])[:, run.at]
+        for side in (1, -1)
+    )  # fmt: skip
+    linear = run.beam * np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+    return (up + down) / 2 - model.readings[run.at], (up - down) / 2 - linear
+
+
+def _one_sided(run: ResponseRun) -> Hypothesis:
+    second, _ = _orders(run)
+    return Hypothesis(
+        "one-sided steps", "share", "0: two-sided, 1 or -1: one-sided",
+        _readings(run, second)[None], most=1.1,
+    )  # fmt: skip
+
+
+def _third_order(run: ResponseRun) -> Hypothesis:
+    return Hypothesis(
+        "third order of two-sided steps", "share", "1", _readings(run, _orders(run)[1])[None] / 4,
+        most=2.0,
+    )  # fmt: skip
+
+
+def _corrector_energy(run: ResponseRun) -> Hypothesis:
+    ring = run.model.ring
+    flat = ResponseModel(ring, 4).response(run.m.correctors)[:, run.at]
+    shift = run.beam.copy()
+    shift[:-1] -= flat * run.kicks[:-1, None, None]
+    shift[-1] = 0
+    return Hypothesis(
+        "corrector's energy shift", "beyond the model's", "0; -1: the energy stays",
+        _readings(run, shift)[None], most=1.1,
+    )  # fmt: skip
+
+
+def _position(run: ResponseRun, by_family: bool) -> Hypothesis:
+    jumps = _readings(run, run.jumps()) * run.kicks[:, None]
+    name = "corrector's field displaced in s"
+    if not by_family:
+        return Hypothesis(name + ", each", "m", "< 0.05 m", jumps[None], own=True, most=0.05)
+    _, members = families([*run.m.correctors, "\0"])
+    return Hypothesis(
+        name + ", by family", "m", "< 0.05 m", members.T[:, :, None] * jumps[None], most=0.05
+    )
+
+
+def _energy_drift(run: ResponseRun) -> Hypothesis:
+    rf = _readings(run, run.beam)[-1]
+    pattern = np.where((run.plane == 0)[:, None], rf, 0.0)
+    pattern[-1] = 0
+    return Hypothesis(
+        "drift of the energy", "RF step", "< 1e-3", pattern[None], own=True, most=1e-3
+    )
+
+
+def _tune_drift(run: ResponseRun) -> Hypothesis:
+    total = np.zeros((2, len(run.plane), len(run.at)))
+    focusing = [int(run.ring[name].k1 < 0) for name in run.quadrupoles]
+    np.add.at(total, focusing, run.slopes_of("quadrupole_gradient", run.quadrupoles, run.plane))
+    total[:, -1] = 0
+    return Hypothesis(
+        "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", total, own=True,
+        most=1e-4,
+    )  # fmt: skip
+
+
+def _energy_spread(run: ResponseRun) -> Hypothesis:
+    ring, kicks = run.model.ring, run.kicks[:-1, None, None]
+    per_step = run.model.rf_start[5]
+    f = DELTA / per_step
+    up, down = (
+        ResponseModel(ring, frequency=side * f).response(run.m.correctors)[:, run.at] * kicks
+        for side in (1, -1)
+    )
+    curved = np.zeros_like(run.beam)
+    curved[:-1] = (up + down - 2 * run.beam[:-1]) / 2 * (ENERGY_SPREAD / DELTA) ** 2
+    return Hypothesis(
+        "energy spread of the beam", "(1.2e-3)^2", "1", _readings(run, curved)[None], most=3.0
+    )
+
+
+def _nonlinear(run: ResponseRun) -> Hypothesis:
+    """Two-sided steps: x^3 / 4 of the whole change is left of a cubic reading."""
+    cubes = pick(run.read(), run.plane) ** 3 / 4 / MILLIMETRE**2
+    rows = np.stack([np.where((run.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
+    return Hypothesis("nonlinear monitors (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
+
+
+def _gradients(
+    run: ResponseRun, name: str, effect: str, kind: str, most: float
+) -> Hypothesis | None:
+    places = [e.name for e in run.ring.elements if e.kind == kind]
+    if not places:
+        return None
+    slopes = run.slopes_of(effect, places, run.plane)
+    return Hypothesis(name, "1/m", f"< {most:g}", slopes, most=most)
+
+
+def _radiation(run: ResponseRun) -> Hypothesis | None:
+    pairs = [
+        (f"radiation_loss_{kind}s", None)
+        for kind in ("bend", "wiggler")
+        if any(e.kind == kind for e in run.ring.elements)
+    ]
+    kicks = _kicks(run)
+    rows = []
+    for slope in derivatives(run.model, pairs, run.m.correctors):
+        beam = slope[:, run.at] * np.append(kicks, run.kicks[-1])[:, None, None]
+        rows.append(_readings(run, beam))
+    return Hypothesis("radiation in bends, wigglers", "expected loss", "1", np.array(rows), most=3)
+
+
+def _monitor_position(run: ResponseRun) -> Hypothesis:
+    model = run.model
+    columns = model.columns(run.m.correctors)
+    start = np.vstack([columns.start, model.rf_start])
+    behind = np.vstack([columns.pulled * 1.0, np.zeros(model.dimension)])
+    after = np.vstack([model.downstream(columns), np.zeros((1, len(model.monitors)), bool)])
+    slopes = model.tangents[model.maps.at][:, [1, 3]]
+    angle = np.einsum("mai,ci->cma", slopes, start)
+    angle = angle + after[:, :, None] * np.einsum("mai,ci->cma", slopes, behind)
+    kicks = np.append(_kicks(run), run.kicks[-1])
+    flat = _readings(run, angle[:, run.at] * kicks[:, None, None])
+    rows = np.zeros((len(run.at), *flat.shape))
+    for i in range(len(rows)):
+        rows[i, :, i] = flat[:, i]
+    return Hypothesis("monitors displaced in s", "m", "< 0.01 m", rows, most=0.01)
+
+
+def _bend_gradient(run: ResponseRun) -> Hypothesis:
+    """By length, for magnets of one length are one type."""
+    ring: Ring = run.model.ring
+    bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
+    kinds = sorted({round(ring.elements[i].length, 3) for i in bends})
+    rows = []
+    for kind in kinds:
+        changed = {
+            i: ring.elements[i].changed(k1=ring.elements[i].k1 + BEND_GRADIENT)
+            for i in bends
+            if round(ring.elements[i].length, 3) == kind
+        }
+        model = ResponseModel(ring.with_elements(changed))
+        response = np.concatenate(
+            [model.response(run.m.correctors), model.rf_response()[None]]
+        )[:, run.at]  # fmt: skip
+        slope = (response * run.kicks[:, None, None] - run.beam) / BEND_GRADIENT
+        scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+        rows.append(_readings(run, slope * scale))
+    return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
+
+
+def _second_order_coupling(run: ResponseRun) -> Hypothesis | None:
+    if not run.state.skew.any():
+        return None
+    causes = [c for c in run.ring_causes() if c.effect != "skew_gradient"]
+    model = ResponseModel(apply(run.ring, causes))
+    plain = np.concatenate([model.response(run.m.correctors), model.rf_response()[None]])
+    change = run.beam - plain[:, run.at] * run.kicks[:, None, None]
+    return Hypothesis(
+        "coupling to second order", "beyond the model's", "0; -1: none",
+        _readings(run, change)[None], most=1.1,
+    )  # fmt: skip
+
+
+HYPOTHESES: dict[str, Callable[[ResponseRun], Hypothesis | None]] = {
+    "one_sided_steps": _one_sided,
+    "third_order": _third_order,
+    "energy_drift": _energy_drift,
+    "gradient_drift": _tune_drift,
+    "corrector_energy": _corrector_energy,
+    "corrector_position_family": lambda run: _position(run, True),
+    "corrector_position": lambda run: _position(run, False),
+    "energy_spread": _energy_spread,
+    "monitor_nonlinearity": _nonlinear,
+    "monitor_position": _monitor_position,
+    "wiggler_gradient": lambda run: _gradients(
+        run, "gradients of damping wigglers", "insertion_device_focusing", "wiggler", 3e-3
+    ),
+    "straight_gradient": lambda run: _gradients(
+        run, "gradients in straights (markers)", "gradient_absolute", "marker", 2e-3
+    ),
+    "sextupole_gradient": lambda run: _gradients(
+        run, "gradients at sextupoles (orbit)", "gradient_absolute", "sextupole", 2e-3
+    ),
+    "bend_gradient": _bend_gradient,
+    "radiation": _radiation,
+    "second_order_coupling": _second_order_coupling,
+}

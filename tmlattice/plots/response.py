@@ -1,0 +1,132 @@
+"""Figures of an orbit response's diagnosis."""
+
+from collections.abc import Iterator
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tmlattice.diagnosis.response import ResponseDiagnosis
+from tmlattice.network.network import TaylorNetwork
+from tmlattice.optics import twiss
+from tmlattice.plots.strip import lattice_strip
+
+
+def response_figures(result: ResponseDiagnosis) -> Iterator[tuple[str, str, Figure]]:
+    """Every figure: (name, caption, figure); close each after use."""
+    yield (
+        "maps",
+        "Orbit change by corrector and monitor, each corrector in its own plane: measured, the "
+        "design's residual and the result's. Grey: left out.",
+        plot_maps(result),
+    )
+    figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
+    plot_steps(result, ax)
+    yield "steps", "The gap on held-out readings, step by step.", figure
+    if any(cause.effect == "quadrupole_gradient" for cause in result.causes):
+        yield (
+            "gradients",
+            "Gradient error of each quadrupole along the ring, with its posterior rms.",
+            plot_gradients(result),
+        )
+        yield (
+            "beta-beat",
+            "Beta of the result relative to the design's.",
+            plot_beta_beat(result),
+        )
+
+
+def plot_maps(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure:
+    """Measured response and residuals before and after, columns by plane and place."""
+    figure = plt.figure(figsize=(11, 8), layout="constrained") if figure is None else figure
+    m = result.measured
+    ring = result.ring
+    plane = np.array([int(p == "y") for p in m.planes])
+    place = np.array([ring[name].s for name in m.correctors])
+    order = np.lexsort((place, plane))
+    rows = [
+        ("measured", result.data),
+        ("measured - design", result.data - result.design),
+        ("measured - result", result.data - result.model),
+    ]
+    axes = figure.subplots(3, 1, sharex=True)
+    for ax, (title, values) in zip(axes, rows, strict=True):
+        image = 1e6 * np.take_along_axis(values[:-1], plane[:, None, None], 2)[order, :, 0]
+        image[:, ~result.good] = np.nan
+        image[result.held[:-1][order]] = np.nan if title.endswith("result") else image[
+            result.held[:-1][order]
+        ]  # fmt: skip
+        limit = float(np.nanpercentile(abs(image), 99))
+        colours = plt.get_cmap("RdBu_r").with_extremes(bad="0.8")
+        shown = ax.imshow(
+            image.T, aspect="auto", cmap=colours, vmin=-limit, vmax=limit, origin="lower",
+            interpolation="nearest",
+        )  # fmt: skip
+        ax.axvline(float((plane == 0).sum()) - 0.5, color="k", linewidth=0.8)
+        ax.set_ylabel("monitor")
+        ax.set_title(title, loc="left", fontsize=10)
+        figure.colorbar(shown, ax=ax, label="µm")
+    axes[-1].set_xlabel("corrector, along s: horizontal, then vertical")
+    return figure
+
+
+def plot_steps(result: ResponseDiagnosis, ax: Axes | None = None) -> Axes:
+    """Held-out rms after each step that was kept."""
+    if ax is None:
+        ax = plt.subplots(figsize=(9, 4))[1]
+    steps = result.steps
+    at = np.arange(len(steps))
+    for name, label, style in (
+        ("heldout_rms_in_plane", "in-plane", "o-C0"),
+        ("heldout_rms_position", "in-plane, with position jump", "o--C0"),
+        ("heldout_rms_coupling", "coupling", "s-C3"),
+        ("dispersion_rms", "RF response", "^-C2"),
+    ):
+        ax.plot(at, [1e6 * getattr(step, name) for step in steps], style, label=label)
+    noise = result.measured.noise
+    assert noise is not None
+    sigma = 1e6 * float(np.sqrt(np.mean(noise[result.good] ** 2)))
+    ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
+    ax.set_yscale("log")
+    ax.set_ylabel("held-out rms [µm]")
+    ax.set_xticks(at, [s.effect.replace(", ", ",\n") for s in steps], fontsize=7)
+    ax.grid(alpha=0.25)
+    ax.legend(frameon=False, fontsize=8)
+    return ax
+
+
+def plot_gradients(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure:
+    """Relative gradient errors with their errors, above the lattice."""
+    figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
+    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    rows = [
+        (result.ring[c.element or ""].s, c.amount, sigma)
+        for c, sigma in zip(result.causes, result.errors, strict=True)
+        if c.effect == "quadrupole_gradient"
+    ]
+    s, amount, sigma = np.array(rows).T
+    ax.errorbar(
+        s, 100 * amount, 100 * sigma, fmt=".", color="tab:red", ecolor="0.6", markersize=3,
+        elinewidth=0.8,
+    )  # fmt: skip
+    ax.axhline(0, color="0.4", linewidth=0.5)
+    ax.set_ylabel("gradient error [%]")
+    ax.grid(alpha=0.25)
+    lattice_strip(result.ring, strip)
+    return figure
+
+
+def plot_beta_beat(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure:
+    """Beta of the result relative to the design, above the lattice."""
+    figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
+    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    before, after = (twiss(TaylorNetwork.from_ring(r)) for r in (result.ring, result.repaired))
+    for plane, colour in enumerate(("C0", "C3")):
+        beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
+        ax.plot(before.s, beat, color=colour, linewidth=0.8, label="xy"[plane])
+    ax.set_ylabel("beta / design - 1 [%]")
+    ax.grid(alpha=0.25)
+    ax.legend(frameon=False)
+    lattice_strip(result.ring, strip)
+    return figure
