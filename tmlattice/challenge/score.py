@@ -140,6 +140,7 @@ def row_of(
         "heldout_chi2_per_dof": _after(result),
         "heldout_as_noise": _as_noise(result, len(places.monitors) // 2),
         "stated": stated(result, causes),
+        "class": _class(result),
         "refused": _refused(result),
     }
     answers: dict[str, Mapping[str, Any]] = {"tool": result}
@@ -190,6 +191,22 @@ def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
     freedom = 2 * monitors * len(result["gap"]["heldout"]["shots"])
     low, high = stats.chi2.interval(0.99, freedom)
     return bool(low <= left * freedom <= high)
+
+
+def _class(result: Mapping[str, Any]) -> Row | None:
+    """What the data did not part, where one thing was found: effects, number of elements, and the
+    next shot that was proposed: whether it changes a setting, and by how much it would part them.
+    """
+    if len(result["findings"]) != 1 or len(result["findings"][0]["credible_set"]) < 2:
+        return None
+    members = result["findings"][0]["credible_set"]
+    shot = result["next_measurement"]
+    return {
+        "effects": sorted({member["effect"] for member in members}),
+        "elements": len({member["element"] for member in members}),
+        "by_setting": None if shot is None else bool(shot["settings"]),
+        "separation_sigma": None if shot is None else shot["separation_sigma"],
+    }
 
 
 def clean_gap(
@@ -272,6 +289,7 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["false_refusals"] = rate([row["refused"] for row in clear])
     out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
     out["relative_to_oracle"] = _relative(clear)
+    out["classes"] = classes(rows)
     return out
 
 
@@ -346,6 +364,26 @@ def coverage(rows: Sequence[Row]) -> dict[str, Any]:
         "median_members": float(np.median([a["members"] for a in strong])) if strong else None,
         "no_larger_than_oracle": rate([tool <= own for tool, own in oracle]),
     }
+
+
+def classes(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Effects that stayed together, the most frequent first, and what one more shot would bring."""
+    found: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        if row["class"] is not None:
+            found.setdefault(tuple(row["class"]["effects"]), []).append(row["class"])
+    return [
+        {
+            "effects": list(effects),
+            "cases": len(some),
+            "elements": float(np.median([one["elements"] for one in some])),
+            "by_setting": rate(
+                [one["by_setting"] for one in some if one["by_setting"] is not None]
+            ),
+            "separation_sigma": _quantiles([one["separation_sigma"] for one in some])["median"],
+        }
+        for effects, some in sorted(found.items(), key=lambda item: -len(item[1]))
+    ]
 
 
 def pulls(values: Sequence[float | None]) -> dict[str, Any]:

@@ -198,6 +198,13 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
             if "tool" in methods:
                 shown.add_row(name, *(_plain(methods["tool"][key]) for key in keys))
         screen.print(shown)
+    if result.get("classes"):
+        shown = table("stay together", "cases", "elements", "next shot parts by, sigma", "settings")
+        for entry in result["classes"][:12]:
+            shown.add_row(", ".join(entry["effects"]), str(entry["cases"]),
+                          _number(entry["elements"]), _number(entry["separation_sigma"]),
+                          _plain(entry["by_setting"]))  # fmt: skip
+        screen.print(shown)
     if "coverage" in result:
         _print_sets(screen, result)
     if "kinds" in result:
