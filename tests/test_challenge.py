@@ -159,7 +159,13 @@ def finding(*members, amount=0.1, sigma=0.01, s=None):
 
 def result_of(*findings, verdict="named"):
     gap = {"closed": None, "heldout": None}
-    return {"verdict": verdict, "findings": list(findings), "gap": gap, "seconds": 1.0}
+    return {
+        "verdict": verdict,
+        "findings": list(findings),
+        "gap": gap,
+        "next_measurement": None,
+        "seconds": 1.0,
+    }
 
 
 @pytest.fixture
