@@ -26,7 +26,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.data import FirstTurn, first_turn, readings_of, tangents
-from tmlattice.fitting.sparse import best_single
+from tmlattice.fitting.sparse import few_causes
 from tmlattice.fitting.strengths import LARGEST, ring_strengths
 from tmlattice.lattice import Ring
 from tmlattice.maps import RingMaps
@@ -402,12 +402,12 @@ def fit_map(
     tails = prior is Prior.FAULTS
     fit = _Fit(space, data, FAULT_SCALE if tails and scale is None else scale, tails)
     fit.run(iterations)
-    if tails:  # many maxima: another start is the one magnet that explains most
+    if tails:  # many maxima: another start is the few magnets that explain most
         assert isinstance(space, _Strengths)
-        single = best_single(space.design, space.known, data)
-        if single is not None:
+        few = few_causes(space.design, space.known, data)
+        if few is not None:
             start = np.zeros(len(space.layer))
-            start[single.causes[0]] = single.amounts[0] / STRENGTH_RMS
+            start[list(few.causes)] = few.amounts / STRENGTH_RMS
             other = _Fit(space, data, fit.scale, tails, start)
             other.run(iterations)
             best = min((fit, other), key=_Fit.final_cost)

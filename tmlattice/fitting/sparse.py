@@ -31,6 +31,9 @@ FAULT = 0.3
 """Prior rms of the relative change of a strength that has changed."""
 
 
+LARGEST_NUMBER, REFINED = 5, 12
+"""Of causes, and of candidates that are refined after each scan."""
+
 RARER = 10.0
 """Each cause beyond the first is so many times less likely than the one before: faults are rare,
 and with hundreds of candidates a false second one would else come in one case of a hundred."""
@@ -288,8 +291,8 @@ def fit_sparse(
     noise: float | None = None,
     launch_sigma: ArrayLike | None = None,
     fault: float = FAULT,
-    largest_number: int = 5,
-    refined: int = 12,
+    largest_number: int = LARGEST_NUMBER,
+    refined: int = REFINED,
     candidates: Sequence[str] | None = None,
     progress: bool = True,
 ) -> FitResult:
@@ -335,16 +338,7 @@ def fit_sparse(
         known = known.only(places)
     strengths = known.strengths
     search = _Search(network, known, data, fault)
-    none = search.fit((), np.zeros(0))
-    if none is None:
-        raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
-    best, chi2 = none, [none.chi2]
-    for _ in range(min(largest_number, len(strengths))):
-        grown = _best_of(search, best, refined)
-        if grown is None or grown.evidence <= best.evidence:
-            break
-        best = _exchanged(search, grown, refined)
-        chi2.append(best.chi2)
+    best, chi2 = _grown(search, largest_number, refined)
     changed = ring
     for cause, amount in zip(best.causes, best.amounts, strict=True):
         strength = strengths[cause]
@@ -380,13 +374,29 @@ def fit_sparse(
     )
 
 
-def best_single(
-    network: TaylorNetwork, strengths: RingStrengths, data: FirstTurn, refined: int = 12
+def few_causes(
+    network: TaylorNetwork, strengths: RingStrengths, data: FirstTurn
 ) -> Explanation | None:
-    """The one changed strength of greatest evidence, whether or not it is better than none."""
+    """The changed strengths that the evidence asks for; the one of greatest evidence where it asks
+    for none."""
     search = _Search(network, strengths, data, FAULT)
-    none = search.fit((), np.zeros(0))
-    return None if none is None else _best_of(search, none, refined)
+    best = _grown(search, LARGEST_NUMBER, REFINED)[0]
+    return best if best.causes else _best_of(search, best, REFINED)
+
+
+def _grown(search: _Search, largest_number: int, refined: int) -> tuple[Explanation, list[float]]:
+    """One cause after another while the evidence grows, and chi-square on the way."""
+    best = search.fit((), np.zeros(0))
+    if best is None:
+        raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
+    chi2 = [best.chi2]
+    for _ in range(min(largest_number, len(search.layer))):
+        grown = _best_of(search, best, refined)
+        if grown is None or grown.evidence <= best.evidence:
+            break
+        best = _exchanged(search, grown, refined)
+        chi2.append(best.chi2)
+    return best, chi2
 
 
 def _best_of(search: _Search, start: Explanation, number: int) -> Explanation | None:

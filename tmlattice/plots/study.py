@@ -48,8 +48,6 @@ def plot_study(ring: Ring, cases: "Sequence[Case]", figure: Figure | None = None
         ax.set_ylabel(f"|dQ{name}|")
         ax.grid(alpha=0.25)
         ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small")
-    grid[0].set_title(
-        "Tune error after fine-tuning, by the place of the changed magnet", loc="left"
-    )
+    figure.suptitle("Tune error after fine-tuning, by the place of the changed magnet")
     lattice_strip(ring, grid[2])
     return figure
