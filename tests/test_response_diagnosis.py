@@ -76,6 +76,20 @@ def test_what_is_missing_is_said(small_ring, measured):
         diagnose_response(small_ring, measured.select(correctors=measured.correctors[:2]))
 
 
+def test_a_withheld_energy_spread_is_named(small_ring):
+    """Mean orbits of particles of three energies; the fit knows the second derivative."""
+    spread = Cause("energy_spread", None, 1e-3)
+    measured = simulate_response(
+        small_ring, [spread], kick=2e-5, noise=5e-9, engine="ocelot", progress=False, seed=2
+    ).measured
+    found = diagnose_response(small_ring, measured, seed=1)
+    assert "energy_spread" in [step.effect for step in found.steps]
+    amount, sigma = found.error("energy_spread", None)
+    assert sigma < 1e-5
+    assert abs(amount - spread.amount) < 0.03 * spread.amount  # the fourth order: 1.2 % here
+    assert found.steps[-1].heldout_chi2_per_dof < 1.3
+
+
 def test_report_and_json(result):
     schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
     document = result.as_json()

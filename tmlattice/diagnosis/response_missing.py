@@ -33,8 +33,10 @@ DELTA = 1e-3
 BEND_GRADIENT = 1e-4
 """1/m2, of the differences."""
 MILLIMETRE = 1e-3
-FREE = 10.0
-"""Prior rms of a parameter that stands alone, in its unit: none to speak of."""
+FREE = 30.0
+"""Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
+FEW = 6
+"""So many amounts stand alone."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,6 @@ class Weighed:
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
-        without: the same in-plane rms with all other hypotheses and not this one, m, or nan.
         judgement: "helps", "excluded" (held-out readings do not want it) or "unphysical".
     """
 
@@ -80,12 +81,11 @@ class Weighed:
     amount_sigma: float
     heldout_rms_in_plane: float
     heldout_rms_position: float
-    without: float
     judgement: str
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
-        return {k: v for k, v in vars(self).items() if k not in ("unit", "without")}
+        return {k: v for k, v in vars(self).items() if k != "unit"}
 
 
 HELPS = 0.98
@@ -117,7 +117,7 @@ def weigh(
 def _row(fitted: "Fitted", hypothesis: Hypothesis | None, before: float) -> Weighed:
     amounts, sigma, rms, jumped = fitted.weigh(hypothesis)
     if hypothesis is None:
-        return Weighed("none", "", "", 0, 0.0, 0.0, rms, jumped, np.nan, "")
+        return Weighed("none", "", "", 0, 0.0, 0.0, rms, jumped, "")
     size = float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
     if rms > HELPS * before:
         judgement = "excluded"
@@ -125,7 +125,7 @@ def _row(fitted: "Fitted", hypothesis: Hypothesis | None, before: float) -> Weig
         judgement = "helps" if abs(size) <= hypothesis.most else "unphysical"
     return Weighed(
         hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts), size,
-        float(np.median(sigma)), rms, jumped, np.nan, judgement,
+        float(np.median(sigma)), rms, jumped, judgement,
     )  # fmt: skip
 
 
@@ -198,14 +198,16 @@ class Fitted:
         weight = self.weight.ravel()
         C = (flat * weight) @ flat.T - B.T @ half
         r = flat @ (weight * self.target.ravel()) - half.T @ self.vector
-        spread = np.full(len(H), FREE) if len(H) <= 4 else 1 / np.sqrt(np.diag(C).mean() + 1e-300)
-        spread = np.broadcast_to(spread, len(H)) * (1.0 if len(H) <= 4 else 10.0)
-        for _ in range(1 if len(H) <= 4 else 12):
+        # one or a few amounts are free; many have the scale that the evidence finds, within physics
+        many = len(H) > FEW
+        spread = np.full(len(H), hypothesis.most if many else FREE * min(hypothesis.most, 1e3))
+        for _ in range(12 if many else 1):
             inverse = np.linalg.inv(C * np.outer(spread, spread) + np.eye(len(H)))
             amounts = spread * (inverse @ (spread * r))
             variance = np.diag(inverse) * spread**2
-            if len(H) > 4:
-                spread = np.full(len(H), np.sqrt(np.mean(amounts**2 + variance)))
+            if many:
+                scale = float(np.sqrt(np.mean(amounts**2 + variance)))
+                spread = np.full(len(H), min(scale, hypothesis.most))
         moved = cho_solve(self.factor, self.vector - B @ amounts)
         change = self.change(self.spread @ moved - self.start)
         if not hypothesis.own:
@@ -265,7 +267,7 @@ def _orders(run: ResponseRun) -> tuple[Array, Array]:
         ])[:, run.at]
         for side in (1, -1)
     )  # fmt: skip
-    linear = run.beam * np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+    linear = run.orbits(model) * np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
     return (up + down) / 2 - model.readings[run.at], (up - down) / 2 - linear
 
 
@@ -287,7 +289,7 @@ def _third_order(run: ResponseRun) -> Hypothesis:
 def _corrector_energy(run: ResponseRun) -> Hypothesis:
     ring = run.model.ring
     flat = ResponseModel(ring, 4).response(run.m.correctors)[:, run.at]
-    shift = run.beam.copy()
+    shift = run.orbits(run.model)
     shift[:-1] -= flat * run.kicks[:-1, None, None]
     shift[-1] = 0
     return Hypothesis(
@@ -327,7 +329,9 @@ def _tune_drift(run: ResponseRun) -> Hypothesis:
     )  # fmt: skip
 
 
-def _energy_spread(run: ResponseRun) -> Hypothesis:
+def _energy_spread(run: ResponseRun) -> Hypothesis | None:
+    if "energy_spread" in run.allowed:
+        return None  # it is in the fit
     ring, kicks = run.model.ring, run.kicks[:-1, None, None]
     per_step = run.model.rf_start[5]
     f = DELTA / per_step
@@ -406,7 +410,7 @@ def _bend_gradient(run: ResponseRun) -> Hypothesis:
         response = np.concatenate(
             [model.response(run.m.correctors), model.rf_response()[None]]
         )[:, run.at]  # fmt: skip
-        slope = (response * run.kicks[:, None, None] - run.beam) / BEND_GRADIENT
+        slope = (response * run.kicks[:, None, None] - run.orbits(run.model)) / BEND_GRADIENT
         scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
         rows.append(_readings(run, slope * scale))
     return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
@@ -418,7 +422,7 @@ def _second_order_coupling(run: ResponseRun) -> Hypothesis | None:
     causes = [c for c in run.ring_causes() if c.effect != "skew_gradient"]
     model = ResponseModel(apply(run.ring, causes))
     plain = np.concatenate([model.response(run.m.correctors), model.rf_response()[None]])
-    change = run.beam - plain[:, run.at] * run.kicks[:, None, None]
+    change = run.orbits(run.model) - plain[:, run.at] * run.kicks[:, None, None]
     return Hypothesis(
         "coupling to second order", "beyond the model's", "0; -1: none",
         _readings(run, change)[None], most=1.1,
