@@ -57,9 +57,10 @@ ROLL_STEP = 0.02
 LARGEST_GRADIENT = 0.02
 """Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
 LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
-HELPS, SPOILS = 0.995, np.array([1.05, 1.05, 1.25])
-"""A step is kept where its judge falls to the first, and none (in-plane, coupling, RF) rises above
-the second; the RF's judge has some 25 readings and is uncertain by 14 % itself."""
+HELPS, SPOILS = 0.995, 1.25
+"""A step is kept where its judge falls to the first, the rms over both planes falls, and none
+(in-plane, coupling, RF) rises above the second; the RF's has some 25 readings, so 14 % of its
+own."""
 INNER = 0.2
 """Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
 
@@ -464,7 +465,11 @@ class ResponseRun:
                 sum(self._count(name) for name in names), *self.score(self.held, self.half),
             )  # fmt: skip
             judge = 0 if names[0] in IN_PLANE else 1
-            good = now[judge] < HELPS * inner[judge] and (now < SPOILS * inner).all()
+            good = bool(
+                now[judge] < HELPS * inner[judge]
+                and np.hypot(*now[:2]) < np.hypot(*inner[:2])
+                and (now < SPOILS * inner).all()
+            )
             log.info("%s: inner %s -> %s, kept %s", names, inner, now, good)
             if good:
                 steps.append(step)

@@ -109,7 +109,8 @@ def weigh(
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         found = HYPOTHESES[name](run)
-        if found is not None:
+        # nothing where the ring has no such places, or no reading would move
+        if found is not None and found.patterns.any():
             rows.append(_row(lattice, found, rows[0].heldout_rms_in_plane))
     return rows
 
@@ -346,6 +347,16 @@ def _energy_spread(run: ResponseRun) -> Hypothesis | None:
     )
 
 
+def _energy_offset(run: ResponseRun) -> Hypothesis:
+    """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
+    ring = run.model.ring
+    f = DELTA / run.model.rf_start[5]
+    up, down = (run.orbits(ResponseModel(ring, frequency=side * f)) for side in (1, -1))
+    scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+    slope = _readings(run, (up - down) / 2 * scale)
+    return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
+
+
 def _nonlinear(run: ResponseRun) -> Hypothesis:
     """Two-sided steps: x^3 / 4 of the whole change is left of a cubic reading."""
     cubes = pick(run.read(), run.plane) ** 3 / 4 / MILLIMETRE**2
@@ -438,6 +449,7 @@ HYPOTHESES: dict[str, Callable[[ResponseRun], Hypothesis | None]] = {
     "corrector_position_family": lambda run: _position(run, True),
     "corrector_position": lambda run: _position(run, False),
     "energy_spread": _energy_spread,
+    "energy_offset": _energy_offset,
     "monitor_nonlinearity": _nonlinear,
     "monitor_position": _monitor_position,
     "wiggler_gradient": lambda run: _gradients(

@@ -36,10 +36,10 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
         (
             step.effect,
             str(step.parameters),
-            f"{1e6 * step.heldout_rms_in_plane:.1f}",
-            f"{1e6 * step.heldout_rms_position:.1f}",
-            f"{1e6 * step.heldout_rms_coupling:.1f}",
-            f"{1e6 * step.dispersion_rms:.0f}",
+            f"{1e6 * step.heldout_rms_in_plane:.3g}",
+            f"{1e6 * step.heldout_rms_position:.3g}",
+            f"{1e6 * step.heldout_rms_coupling:.3g}",
+            f"{1e6 * step.dispersion_rms:.3g}",
             f"{step.heldout_chi2_per_dof:.3g}",
         )
         for step in steps
