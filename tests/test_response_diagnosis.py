@@ -12,7 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 from tmlattice.cli.command import tmlattice
-from tmlattice.diagnosis.response import diagnose_response
+from tmlattice.diagnosis.response import ResponseRun, diagnose_response
+from tmlattice.diagnosis.response_missing import weigh
 from tmlattice.diagnosis.response_report import response_text
 from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError
@@ -74,6 +75,30 @@ def test_what_is_missing_is_said(small_ring, measured):
         diagnose_response(small_ring, replace(measured, noise=None))
     with pytest.raises(MeasurementError, match="cannot be split"):
         diagnose_response(small_ring, measured.select(correctors=measured.correctors[:2]))
+
+
+def test_a_withheld_energy_spread_is_named(small_ring):
+    """Mean orbits of particles of three energies; the fit knows the second derivative."""
+    spread = Cause("energy_spread", None, 1e-3)
+    measured = simulate_response(
+        small_ring, [spread], kick=2e-5, noise=5e-9, engine="ocelot", progress=False, seed=2
+    ).measured
+    found = diagnose_response(small_ring, measured, seed=1)
+    assert "energy_spread" in [step.effect for step in found.steps]
+    amount, sigma = found.error("energy_spread", None)
+    assert sigma < 1e-5
+    assert abs(amount - spread.amount) < 0.03 * spread.amount  # the fourth order: 1.2 % here
+    assert found.steps[-1].heldout_chi2_per_dof < 1.3
+
+
+def test_no_hypothesis_is_wanted_where_nothing_is_missing(small_ring, measured):
+    run = ResponseRun(small_ring, measured, seed=1)
+    run.run()
+    none, *rows = weigh(run, ["one_sided_steps", "corrector_energy", "energy_offset"])
+    assert none.effect == "none"
+    assert len(rows) == 3
+    assert all(row.judgement == "excluded" for row in rows)
+    assert abs(rows[0].amount) < 4 * rows[0].amount_sigma  # the simulated steps are two-sided
 
 
 def test_report_and_json(result):

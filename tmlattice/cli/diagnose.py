@@ -64,6 +64,11 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="network.pt of `tune-fit`: read what its weights changed as physics.",
 )
+@click.option(
+    "--missing",
+    is_flag=True,
+    help="Of an orbit response: weigh on held-out readings which effect the result still lacks.",
+)
 @click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
 @click.option(
     "--seed",
@@ -97,6 +102,7 @@ def diagnose(
     effects: tuple[str, ...] | None,
     network: Path | None,
     lattice_out: Path | None,
+    missing: bool,
     json_file: Path | None,
     out: Path | None,
     quiet: bool,
@@ -132,12 +138,12 @@ def diagnose(
             )  # fmt: skip
             response = _response(
                 load_ring(lattice, sequence, energy), data, measurement, folder, extra, lattice_out,
-                0.2 if holdout is None else holdout, options["seed"], quiet,
+                0.2 if holdout is None else holdout, missing, options["seed"], quiet,
             )  # fmt: skip
             if not quiet:
                 _print_response(response, out, json_file, lattice_out)
             return
-        _refuse("first turns", lattice_out=lattice_out)
+        _refuse("first turns", lattice_out=lattice_out, missing=missing)
         options["holdout"] = 0.33 if holdout is None else holdout
         before = None if reference is None else trajectories(reference, "; give first turns")
         ring = load_ring(lattice, sequence, energy)
@@ -182,6 +188,7 @@ def _response(
     extra: Path | None,
     lattice_out: Path | None,
     holdout: float,
+    missing: bool,
     seed: int,
     quiet: bool,
 ) -> "ResponseDiagnosis":
@@ -194,7 +201,9 @@ def _response(
 
     with _progress(quiet) as progress:
         try:
-            result = diagnose_response(ring, data, holdout=holdout, seed=seed, progress=progress)
+            result = diagnose_response(
+                ring, data, holdout=holdout, missing=missing, seed=seed, progress=progress
+            )
         except (MeasurementError, UnknownNameError) as error:
             raise MeasurementError(f"{path}: {error}") from error
         document = result.as_json()

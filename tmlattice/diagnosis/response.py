@@ -19,7 +19,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,9 @@ from tmlattice.optics import matrix_tunes
 from tmlattice.response import ResponseModel, derivatives
 from tmlattice.response.calibration import CALIBRATES
 
+if TYPE_CHECKING:
+    from tmlattice.diagnosis.response_missing import Weighed
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -44,6 +47,9 @@ BAD = 5.0
 """A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
 FEW = 4
 """Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+DELTA = 1e-3
+"""Energy deviation of the differences that tell what an energy spread does; its square is also
+the unit in which the spread's is fitted."""
 STEP = 0.01
 """Trusted change of a gain, a calibration or a gradient (relative) in one round."""
 SKEW_STEP = 3e-4  # 1/m: larger steps move the tunes
@@ -51,9 +57,10 @@ ROLL_STEP = 0.02
 LARGEST_GRADIENT = 0.02
 """Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
 LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
-HELPS, SPOILS = 0.995, np.array([1.05, 1.05, 1.25])
-"""A step is kept where its judge falls to the first, and none (in-plane, coupling, RF) rises above
-the second; the RF's judge has some 25 readings and is uncertain by 14 % itself."""
+HELPS, SPOILS = 0.995, 1.25
+"""A step is kept where its judge falls to the first, the rms over both planes falls, and none
+(in-plane, coupling, RF) rises above the second; the RF's has some 25 readings, so 14 % of its
+own."""
 INNER = 0.2
 """Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
 
@@ -62,12 +69,16 @@ NOTHING = 1.3
 MISSING = 1.5
 """Held-out chi2 per reading of the result above which an effect is missing."""
 
-IN_PLANE = ("corrector_calibration", "family_gradient", "monitor_gain", "quadrupole_gradient")
+IN_PLANE = (
+    "corrector_calibration", "family_gradient", "monitor_gain", "quadrupole_gradient",
+    "energy_spread",
+)  # fmt: skip
 COUPLING = ("monitor_roll", "corrector_roll", "skew_gradient")
 ORDER: tuple[tuple[tuple[str, ...], tuple[int, int]], ...] = (
     (("corrector_calibration", "family_gradient"), (3, 0)),
     (("monitor_gain",), (2, 0)),
     (("quadrupole_gradient",), (4, 0)),
+    (("energy_spread",), (2, 0)),
     (("monitor_roll",), (0, 1)),
     (("corrector_roll",), (0, 1)),
     (("skew_gradient",), (2, 2)),
@@ -152,6 +163,7 @@ class ResponseDiagnosis:
         data: measured, the RF last, m.
         seed: of the split.
         seconds: that it took.
+        hypotheses: effects that may be missing, weighed, see `response_missing`; None: not asked.
     """
 
     ring: Ring
@@ -170,6 +182,7 @@ class ResponseDiagnosis:
     data: Array
     seed: int
     seconds: float
+    hypotheses: "tuple[Weighed, ...] | None" = None
 
     @property
     def verdict(self) -> str:
@@ -179,7 +192,8 @@ class ResponseDiagnosis:
     @property
     def repaired(self) -> Ring:
         """The ring with its errors; monitors and correctors are in `calibration`."""
-        return apply(self.ring, [c for c in self.causes if c.effect not in CALIBRATES])
+        beam = (*CALIBRATES, "energy_spread")
+        return apply(self.ring, [c for c in self.causes if c.effect not in beam])
 
     @property
     def calibration(self) -> tuple[Cause, ...]:
@@ -200,7 +214,12 @@ class ResponseDiagnosis:
         ]
         before, after = (max(m["rms"] ** 2 - sigma**2, 0.0) for m in (misfits[0], misfits[-1]))
         left = self.left
+        weighed = (
+            {} if self.hypotheses is None
+            else {"hypotheses": [row.as_json() for row in self.hypotheses]}
+        )  # fmt: skip
         return {
+            **weighed,
             "format": "tmlattice-diagnosis",
             "version": 1,
             "package": __version__,
@@ -296,7 +315,7 @@ class ResponseDiagnosis:
             "rms": float(np.sqrt(np.nanmean(miss**2))), "chi2_per_dof": float(np.nanmean(pull**2)),
         }  # fmt: skip
 
-    def error(self, effect: str, element: str) -> tuple[float, float]:
+    def error(self, effect: str, element: str | None) -> tuple[float, float]:
         """Amount and posterior rms of a cause."""
         for cause, sigma in zip(self.causes, self.errors, strict=True):
             if (cause.effect, cause.element) == (effect, element):
@@ -309,6 +328,7 @@ def diagnose_response(
     measured: OrbitResponse,
     *,
     holdout: float = 0.2,
+    missing: bool = False,
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> ResponseDiagnosis:
@@ -318,6 +338,7 @@ def diagnose_response(
         ring: the design.
         measured: with an RF step, and the noise of its readings.
         holdout: share of the correctors that is never fitted.
+        missing: weigh too which effect the result still lacks.
         seed: of the split.
         progress: called with the name of each stage.
 
@@ -325,7 +346,14 @@ def diagnose_response(
         MeasurementError: no RF step, no noise, or too few correctors.
         UnstableRingError: no closed orbit.
     """
-    return ResponseRun(ring, measured, holdout, seed, progress).run()
+    run = ResponseRun(ring, measured, holdout, seed, progress)
+    result = run.run()
+    if not missing:
+        return result
+    from tmlattice.diagnosis.response_missing import weigh
+
+    rows = tuple(weigh(run, progress=progress))
+    return replace(result, hypotheses=rows, seconds=time.perf_counter() - run.begun)
 
 
 def stem(name: str) -> str:
@@ -351,6 +379,7 @@ class _State:
     roll: Array
     gradients: Array
     skew: Array
+    spread: Array  # [1], (energy spread / DELTA)^2
 
     def copy(self) -> "_State":
         return replace(self, **{name: value.copy() for name, value in vars(self).items()})
@@ -389,7 +418,7 @@ class ResponseRun:
         self.skews = [e.name for e in ring.elements if e.kind == "quadrupole"]
         self.state = _State(
             np.tile(np.eye(2), (monitors, 1, 1)), np.zeros(columns), np.zeros(columns),
-            np.zeros(len(self.quadrupoles)), np.zeros(len(self.skews)),
+            np.zeros(len(self.quadrupoles)), np.zeros(len(self.skews)), np.zeros(1),
         )  # fmt: skip
         self.lacking = np.full(2, 1e-4)
         """What the model lacks in-plane and across, m: it lessens weights as noise does."""
@@ -436,7 +465,11 @@ class ResponseRun:
                 sum(self._count(name) for name in names), *self.score(self.held, self.half),
             )  # fmt: skip
             judge = 0 if names[0] in IN_PLANE else 1
-            good = now[judge] < HELPS * inner[judge] and (now < SPOILS * inner).all()
+            good = bool(
+                now[judge] < HELPS * inner[judge]
+                and np.hypot(*now[:2]) < np.hypot(*inner[:2])
+                and (now < SPOILS * inner).all()
+            )
             log.info("%s: inner %s -> %s, kept %s", names, inner, now, good)
             if good:
                 steps.append(step)
@@ -449,7 +482,7 @@ class ResponseRun:
                 self._set()
         self.progress("result")
         self.exploring = False
-        for block in ([1] if self._has(1) else []) + [0, 0]:
+        for block in (1, 0, 0):
             self.round(block)
         last = self.score(self.held, self.half)
         steps[-1] = Step(steps[-1].effect, steps[-1].parameters, *last)
@@ -472,6 +505,7 @@ class ResponseRun:
             "family_gradient": len(families(self.quadrupoles)[0]),
             "quadrupole_gradient": len(self.quadrupoles),
             "skew_gradient": len(self.skews),
+            "energy_spread": 1,
         }.get(name, 2 * monitors if name.startswith("monitor") else columns - 1)
         return count
 
@@ -498,8 +532,15 @@ class ResponseRun:
         ring = apply(self.ring, self.ring_causes())
         self.model = ResponseModel(ring)
         response = self.model.response(self.m.correctors)
-        whole = np.concatenate([response, self.model.rf_response()[None]])[:, self.at]
-        self.beam = whole * self.kicks[:, None, None]
+        self.beam = self.orbits(self.model)
+        self.curved = np.zeros_like(self.beam)
+        if "energy_spread" in self.allowed:
+            # a monitor reads the centroid of particles whose orbits answer each as its energy has
+            # it: half the second derivative by the energy, times the mean square
+            step = DELTA / self.model.rf_start[5]
+            up, down = (self.orbits(ResponseModel(ring, frequency=f)) for f in (step, -step))
+            self.curved = (up + down) / 2 - self.beam
+            self.beam = self.beam + self.state.spread[0] * self.curved
         self.across = np.zeros_like(self.beam)  # of a kick in the other plane
         if "corrector_roll" in self.allowed:
             turned = [Cause("corrector_roll", name, _TURN) for name in self.m.correctors]
@@ -507,6 +548,12 @@ class ResponseRun:
             slope = (model - response[:, self.at] * np.cos(_TURN)) / np.sin(_TURN)
             self.across[:-1] = slope * self.kicks[:-1, None, None]
         return self.read()
+
+    def orbits(self, model: ResponseModel) -> Array:
+        """Orbit changes of the steps, the RF's last, m, [column, monitor, 2]."""
+        response = model.response(self.m.correctors)
+        whole = np.concatenate([response, model.rf_response()[None]])[:, self.at]
+        return np.asarray(whole * self.kicks[:, None, None])
 
     def read(self) -> Array:
         """What monitors read of it, m, [column, monitor, 2]."""
@@ -543,6 +590,8 @@ class ResponseRun:
 
     def round(self, block: int) -> None:
         """Linearise the readings of one block, solve, move, and look at what is left."""
+        if not self._has(block):
+            return
         normal, start, trust = self.linear(block)
         self._put(block, solve(normal, self.priors(block), start, trust).values)
         self._set()
@@ -579,13 +628,19 @@ class ResponseRun:
             slopes = np.asarray(slopes) / (1 + ring)[:, None, None]
         if not wanted:
             ring = ring[:0]
+        trusted = [steps[2]] * len(ring)
+        if block == 0 and "energy_spread" in self.allowed:
+            curve = gain * pick(self.curved * (1 + state.calibration)[:, None, None], own)
+            slopes = np.concatenate([np.asarray(slopes).reshape(-1, *curve.shape), curve[None]])
+            ring, trusted = np.append(ring, state.spread), [*trusted, 10.0]
         residual = pick(self.data - self.read(), plane)
         self.slopes = slopes
         normal = normal_equations(
             residual, self.weight(block), plane, by_monitor, by_column, slopes
         )
         start = np.concatenate([monitors.ravel(), column, ring])
-        return normal, start, np.repeat(steps, [monitors.size, len(column), len(ring)])
+        trust = np.repeat(steps[:2], [monitors.size, len(column)])
+        return normal, start, np.append(trust, trusted)
 
     def _put(self, block: int, values: Array) -> None:
         state = self.state
@@ -594,6 +649,8 @@ class ResponseRun:
         if block == 0:
             state.monitors[:, [0, 1], [0, 1]] = 1 + monitors
             state.calibration = column
+            if "energy_spread" in self.allowed:
+                state.spread, ring = np.maximum(ring[-1:], 0.0), ring[:-1]
             state.gradients = ring if len(ring) else state.gradients
         else:
             state.monitors[:, [0, 1], [1, 0]] = monitors
@@ -608,6 +665,8 @@ class ResponseRun:
         sizes = [2 * monitors, columns]
         if ("skew_gradient" in wanted) if block else wanted - {"skew_gradient"}:
             sizes.append(len(ring))
+        if block == 0 and "energy_spread" in self.allowed:
+            sizes.append(1)
         edge = np.concatenate([[0], np.cumsum(sizes)])
 
         def group(name: str, part: int, basis: Array, rms: float, **options: Any) -> Group:
@@ -641,6 +700,9 @@ class ResponseRun:
                     "quadrupole_gradient", 2, np.eye(len(ring)), 3e-3, heavy=True,
                     most=LARGEST_GRADIENT,
                 )
+            ],
+            "energy_spread": lambda: [
+                group("energy_spread", len(sizes) - 1, np.eye(1), 10.0, fixed=True)
             ],
             "monitor_roll": lambda: [
                 group("monitor_roll", 0, np.eye(2 * monitors), 0.01, heavy=True)
@@ -749,7 +811,9 @@ class ResponseRun:
             if groups:
                 normal, start, _ = self.linear(block)
                 posterior[block] = solve(normal, groups, start, rounds=0)
-        found: list[tuple[str, str, float, float]] = []
+        if 0 not in posterior:
+            return (), (), ()
+        found: list[tuple[str, str | None, float, float]] = []
         state, monitors = self.state, self.m.monitors
         m = 2 * len(monitors)
         gain = np.diagonal(state.monitors, axis1=1, axis2=2)
@@ -760,9 +824,12 @@ class ResponseRun:
         for i, name in enumerate(self.m.correctors):
             amount = state.calibration[i]
             found.append(("corrector_calibration", name, amount, sigma[0][m + i]))
+        if state.spread[0] > 0:
+            amount = DELTA * float(np.sqrt(state.spread[0]))
+            found.append(("energy_spread", None, amount, DELTA**2 * sigma[0][-1] / (2 * amount)))
         for i, name in enumerate(self.quadrupoles):
             at = m + len(self.plane) + i
-            if at < len(sigma[0]):
+            if at < len(sigma[0]) and "family_gradient" in self.allowed:
                 found.append(("quadrupole_gradient", name, state.gradients[i], sigma[0][at]))
         if 1 in posterior:
             both = sigma[1][:m].reshape(-1, 2)
@@ -805,7 +872,7 @@ class ResponseRun:
         if "quadrupole_gradient" in self.groups and len(sigma) > m + c:
             group = self.groups["quadrupole_gradient"]
             prior = group.rms if group.each is None else group.each
-            loose = np.flatnonzero(sigma[m + c :] > 0.5 * prior)
+            loose = np.flatnonzero(sigma[m + c : m + c + len(self.quadrupoles)] > 0.5 * prior)
             names = [self.quadrupoles[i] for i in loose]
             if names:
                 said.append(

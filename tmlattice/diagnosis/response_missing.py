@@ -33,8 +33,10 @@ DELTA = 1e-3
 BEND_GRADIENT = 1e-4
 """1/m2, of the differences."""
 MILLIMETRE = 1e-3
-FREE = 10.0
-"""Prior rms of a parameter that stands alone, in its unit: none to speak of."""
+FREE = 30.0
+"""Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
+FEW = 6
+"""So many amounts stand alone."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,6 @@ class Weighed:
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
-        without: the same in-plane rms with all other hypotheses and not this one, m, or nan.
         judgement: "helps", "excluded" (held-out readings do not want it) or "unphysical".
     """
 
@@ -80,12 +81,11 @@ class Weighed:
     amount_sigma: float
     heldout_rms_in_plane: float
     heldout_rms_position: float
-    without: float
     judgement: str
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
-        return {k: v for k, v in vars(self).items() if k not in ("unit", "without")}
+        return {k: v for k, v in vars(self).items() if k != "unit"}
 
 
 HELPS = 0.98
@@ -109,7 +109,8 @@ def weigh(
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         found = HYPOTHESES[name](run)
-        if found is not None:
+        # nothing where the ring has no such places, or no reading would move
+        if found is not None and found.patterns.any():
             rows.append(_row(lattice, found, rows[0].heldout_rms_in_plane))
     return rows
 
@@ -117,7 +118,7 @@ def weigh(
 def _row(fitted: "Fitted", hypothesis: Hypothesis | None, before: float) -> Weighed:
     amounts, sigma, rms, jumped = fitted.weigh(hypothesis)
     if hypothesis is None:
-        return Weighed("none", "", "", 0, 0.0, 0.0, rms, jumped, np.nan, "")
+        return Weighed("none", "", "", 0, 0.0, 0.0, rms, jumped, "")
     size = float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
     if rms > HELPS * before:
         judgement = "excluded"
@@ -125,7 +126,7 @@ def _row(fitted: "Fitted", hypothesis: Hypothesis | None, before: float) -> Weig
         judgement = "helps" if abs(size) <= hypothesis.most else "unphysical"
     return Weighed(
         hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts), size,
-        float(np.median(sigma)), rms, jumped, np.nan, judgement,
+        float(np.median(sigma)), rms, jumped, judgement,
     )  # fmt: skip
 
 
@@ -198,14 +199,16 @@ class Fitted:
         weight = self.weight.ravel()
         C = (flat * weight) @ flat.T - B.T @ half
         r = flat @ (weight * self.target.ravel()) - half.T @ self.vector
-        spread = np.full(len(H), FREE) if len(H) <= 4 else 1 / np.sqrt(np.diag(C).mean() + 1e-300)
-        spread = np.broadcast_to(spread, len(H)) * (1.0 if len(H) <= 4 else 10.0)
-        for _ in range(1 if len(H) <= 4 else 12):
+        # one or a few amounts are free; many have the scale that the evidence finds, within physics
+        many = len(H) > FEW
+        spread = np.full(len(H), hypothesis.most if many else FREE * min(hypothesis.most, 1e3))
+        for _ in range(12 if many else 1):
             inverse = np.linalg.inv(C * np.outer(spread, spread) + np.eye(len(H)))
             amounts = spread * (inverse @ (spread * r))
             variance = np.diag(inverse) * spread**2
-            if len(H) > 4:
-                spread = np.full(len(H), np.sqrt(np.mean(amounts**2 + variance)))
+            if many:
+                scale = float(np.sqrt(np.mean(amounts**2 + variance)))
+                spread = np.full(len(H), min(scale, hypothesis.most))
         moved = cho_solve(self.factor, self.vector - B @ amounts)
         change = self.change(self.spread @ moved - self.start)
         if not hypothesis.own:
@@ -265,7 +268,7 @@ def _orders(run: ResponseRun) -> tuple[Array, Array]:
         ])[:, run.at]
         for side in (1, -1)
     )  # fmt: skip
-    linear = run.beam * np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+    linear = run.orbits(model) * np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
     return (up + down) / 2 - model.readings[run.at], (up - down) / 2 - linear
 
 
@@ -287,7 +290,7 @@ def _third_order(run: ResponseRun) -> Hypothesis:
 def _corrector_energy(run: ResponseRun) -> Hypothesis:
     ring = run.model.ring
     flat = ResponseModel(ring, 4).response(run.m.correctors)[:, run.at]
-    shift = run.beam.copy()
+    shift = run.orbits(run.model)
     shift[:-1] -= flat * run.kicks[:-1, None, None]
     shift[-1] = 0
     return Hypothesis(
@@ -327,7 +330,9 @@ def _tune_drift(run: ResponseRun) -> Hypothesis:
     )  # fmt: skip
 
 
-def _energy_spread(run: ResponseRun) -> Hypothesis:
+def _energy_spread(run: ResponseRun) -> Hypothesis | None:
+    if "energy_spread" in run.allowed:
+        return None  # it is in the fit
     ring, kicks = run.model.ring, run.kicks[:-1, None, None]
     per_step = run.model.rf_start[5]
     f = DELTA / per_step
@@ -340,6 +345,16 @@ def _energy_spread(run: ResponseRun) -> Hypothesis:
     return Hypothesis(
         "energy spread of the beam", "(1.2e-3)^2", "1", _readings(run, curved)[None], most=3.0
     )
+
+
+def _energy_offset(run: ResponseRun) -> Hypothesis:
+    """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
+    ring = run.model.ring
+    f = DELTA / run.model.rf_start[5]
+    up, down = (run.orbits(ResponseModel(ring, frequency=side * f)) for side in (1, -1))
+    scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+    slope = _readings(run, (up - down) / 2 * scale)
+    return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
 
 
 def _nonlinear(run: ResponseRun) -> Hypothesis:
@@ -406,7 +421,7 @@ def _bend_gradient(run: ResponseRun) -> Hypothesis:
         response = np.concatenate(
             [model.response(run.m.correctors), model.rf_response()[None]]
         )[:, run.at]  # fmt: skip
-        slope = (response * run.kicks[:, None, None] - run.beam) / BEND_GRADIENT
+        slope = (response * run.kicks[:, None, None] - run.orbits(run.model)) / BEND_GRADIENT
         scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
         rows.append(_readings(run, slope * scale))
     return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
@@ -418,7 +433,7 @@ def _second_order_coupling(run: ResponseRun) -> Hypothesis | None:
     causes = [c for c in run.ring_causes() if c.effect != "skew_gradient"]
     model = ResponseModel(apply(run.ring, causes))
     plain = np.concatenate([model.response(run.m.correctors), model.rf_response()[None]])
-    change = run.beam - plain[:, run.at] * run.kicks[:, None, None]
+    change = run.orbits(run.model) - plain[:, run.at] * run.kicks[:, None, None]
     return Hypothesis(
         "coupling to second order", "beyond the model's", "0; -1: none",
         _readings(run, change)[None], most=1.1,
@@ -434,6 +449,7 @@ HYPOTHESES: dict[str, Callable[[ResponseRun], Hypothesis | None]] = {
     "corrector_position_family": lambda run: _position(run, True),
     "corrector_position": lambda run: _position(run, False),
     "energy_spread": _energy_spread,
+    "energy_offset": _energy_offset,
     "monitor_nonlinearity": _nonlinear,
     "monitor_position": _monitor_position,
     "wiggler_gradient": lambda run: _gradients(

@@ -36,10 +36,10 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
         (
             step.effect,
             str(step.parameters),
-            f"{1e6 * step.heldout_rms_in_plane:.1f}",
-            f"{1e6 * step.heldout_rms_position:.1f}",
-            f"{1e6 * step.heldout_rms_coupling:.1f}",
-            f"{1e6 * step.dispersion_rms:.0f}",
+            f"{1e6 * step.heldout_rms_in_plane:.3g}",
+            f"{1e6 * step.heldout_rms_position:.3g}",
+            f"{1e6 * step.heldout_rms_coupling:.3g}",
+            f"{1e6 * step.dispersion_rms:.3g}",
             f"{step.heldout_chi2_per_dof:.3g}",
         )
         for step in steps
@@ -49,11 +49,33 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
 HEAD = ("step", "parameters", "in-plane", "with jump", "coupling", "RF", "chi2")
 
 
+HYPOTHESIS = ("hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "so")
+
+
+def hypothesis_rows(result: ResponseDiagnosis) -> list[tuple[str, ...]]:
+    """Each hypothesis: amount and its error (of several: rms, typical error), held-out figures."""
+    return [
+        (
+            row.effect,
+            str(row.parameters),
+            f"{row.amount:.2g} ± {row.amount_sigma:.1g}" if row.parameters else "",
+            row.unit,
+            row.expected,
+            f"{1e6 * row.heldout_rms_in_plane:.2f}",
+            f"{1e6 * row.heldout_rms_position:.2f}",
+            row.judgement,
+        )
+        for row in result.hypotheses or ()
+    ]
+
+
 def largest(result: ResponseDiagnosis, effect: str) -> list[str]:
     """The errors of an effect that are furthest from zero, with their posterior rms."""
     rows = [(c, s) for c, s in zip(result.causes, result.errors, strict=True) if c.effect == effect]
     rows.sort(key=lambda row: -abs(row[0].amount))
-    return [f"{c.element} {amount_text(c.effect, c.amount, s)}" for c, s in rows[:SHOWN]]
+    return [
+        f"{c.element or 'the beam'} {amount_text(c.effect, c.amount, s)}" for c, s in rows[:SHOWN]
+    ]
 
 
 def left_sentence(result: ResponseDiagnosis) -> str:
@@ -83,6 +105,9 @@ def response_text(result: ResponseDiagnosis, width: int = WIDTH) -> str:
         lines += ["", *_wrapped(f"{words(effect)}: {len(amounts)}, rms {rms}; largest:", width)]
         lines += _wrapped("; ".join(largest(result, effect)), width, "   ")
     lines += ["", *_wrapped(left_sentence(result), width)]
+    if result.hypotheses:
+        lines += ["", "What may be missing, each on top of the result, held-out rms in µm:"]
+        lines += _columns([HYPOTHESIS, *hypothesis_rows(result)])
     for said in result.degenerate:
         lines += _wrapped(f"Not settled by the data: {said}.", width)
     for warning in result.warnings:

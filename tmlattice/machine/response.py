@@ -1,6 +1,6 @@
 """A simulated orbit response: closed orbits of a machine whose errors are known."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,7 +115,7 @@ def simulate_response(
     if rf_step:
         relative = rf_step / frequency
         steps.append((None, 0.0, relative) if one_sided else (None, -relative / 2, relative / 2))
-    orbits = (_at_orbits if engine == "at" else _map_orbits)(ring, every, steps)
+    orbits = _centroids(ring, every, steps, _at_orbits if engine == "at" else _map_orbits)
     monitors = monitors_with(ring, every)
     changes = np.stack(
         [
@@ -148,18 +148,40 @@ def simulate_response(
 
 
 Step = tuple[str | None, float, float]
+Orbits = Iterator[tuple[Array, Array]]
+Engine = Callable[[Ring, Sequence[Cause], Sequence[Step], float], Orbits]
+
+
+def _centroids(
+    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], engine: Engine
+) -> Orbits:
+    """Orbits of the beam's centroid: particles that differ in energy have orbits that do.
+
+    Three nodes of Gauss and Hermite; a particle's energy is that of another RF frequency.
+    """
+    spread = float(np.sqrt(sum(c.amount**2 for c in causes if c.effect == "energy_spread")))
+    if spread == 0:
+        yield from engine(ring, causes, steps, 0.0)
+        return
+    per_energy = 1 / ResponseModel(apply(ring, causes)).rf_start[5]
+    nodes = np.sqrt(3) * spread * per_energy * np.array([-1, 0, 1])
+    each = [engine(ring, causes, steps, float(node)) for node in nodes]
+    for orbits in zip(*each, strict=True):
+        down, up = np.tensordot([1 / 6, 2 / 3, 1 / 6], np.array(orbits), 1)
+        yield down, up
 
 
 def _at_orbits(
-    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step]
-) -> Iterator[tuple[Array, Array]]:
+    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], frequency: float
+) -> Orbits:
     """The orbits below and above each step of a corrector, or of the RF (None)."""
     engine = AtEngine(ring, causes)
 
     def setting(name: str | None, amount: float) -> Settings:
         if name is None:
-            return {"rf": {"frequency_relative": amount}}
-        return {name: {"kick": ring[name].angle + amount}}
+            return {"rf": {"frequency_relative": frequency + amount}}
+        kick = {name: {"kick": ring[name].angle + amount}}
+        return {**kick, "rf": {"frequency_relative": frequency}} if frequency else kick
 
     for name, low, high in steps:
         down, up = engine.closed_orbits([setting(name, low), setting(name, high)])
@@ -167,14 +189,14 @@ def _at_orbits(
 
 
 def _map_orbits(
-    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step]
-) -> Iterator[tuple[Array, Array]]:
+    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], frequency: float
+) -> Orbits:
     """The same from the second-order maps."""
     wrong = apply(ring, causes)
-    model = ResponseModel(wrong)
+    model = ResponseModel(wrong, frequency=frequency)
     for name, low, high in steps:
         if name is None:
-            down, up = (ResponseModel(wrong, frequency=f).readings for f in (low, high))
+            down, up = (ResponseModel(wrong, frequency=frequency + f).readings for f in (low, high))
         else:
             (scale,) = corrector_scales(ring, causes, [name])
             down, up = model.closed_orbits([name, name], [scale * low, scale * high])
