@@ -109,9 +109,9 @@ class Oracle:
             name, place = self.hypotheses[h]
             power = find(name).power
             for _ in range(2):
-                size = amount[h] if power == 1 else np.sqrt(max(amount[h], 1e-300))
-                if not abs(size) > 0:
+                if amount[h] == 0 or (power == 2 and amount[h] < 0):
                     break
+                size = amount[h] if power == 1 else np.sqrt(amount[h])
                 causes = [*self.small, Cause(name, place, float(size))]
                 change = (self.model.readings(self.launches, causes) - base) * active
                 row = self.whitening.signature(np.nan_to_num(change) / amount[h])

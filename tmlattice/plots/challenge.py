@@ -56,8 +56,10 @@ def plot_calibration(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
         ax.errorbar([b["stated"] for b in bins], share, error, fmt="o", color="C0", capsize=2,
                     label="members of credible sets (95 % interval)")  # fmt: skip
         for b, y in zip(bins, share, strict=True):
-            ax.annotate(str(b["true"]["cases"]), (b["stated"], y), xytext=(5, -9),
-                        textcoords="offset points", fontsize=7, color="0.35")  # fmt: skip
+            left = b["stated"] > 0.95
+            ax.annotate(str(b["true"]["cases"]), (b["stated"], y), xytext=(-5 if left else 5, -10),
+                        ha="right" if left else "left", textcoords="offset points", fontsize=7,
+                        color="0.35")  # fmt: skip
     ax.set(xlabel="stated probability", ylabel="share that is true", xlim=(-0.02, 1.02),
            ylim=(-0.02, 1.02))  # fmt: skip
     ax.grid(alpha=0.25)
