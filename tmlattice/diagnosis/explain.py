@@ -281,7 +281,7 @@ class _Search:
             full = len(state.fit.causes) + len(state.fit.kicks) + len(self.monitors) >= self.most
             over = full or len(self.spikes) > SPIKES
             options = [] if over else self._options(state.fit, about, found, kicks)
-            # whether anything is there is for the false alarms' rate to say; what more, for evidence
+            # the rate of false alarms says whether anything is there; evidence says what more
             options = [o for o in options if o.gain > 0 or (steps == 0 and o.kind == "named")]
             seen.add(_names(state.fit))
             if not options:
