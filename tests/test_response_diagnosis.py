@@ -18,6 +18,7 @@ from tmlattice.diagnosis.response_report import response_text
 from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
+from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.response.calibration import calibrated_response, read_calibration
@@ -58,6 +59,27 @@ def test_gradients_close_the_held_out_gap(result):
     assert {"QD::5", "QF::9"} <= {c.element for c in strongest}
     assert result.verdict == "distributed"
     assert not result.bad_monitors
+
+
+def test_gradients_alone_are_found_too(small_ring):
+    """Where families and calibrations do not help, single gradients are kept without them."""
+    simulation = simulate_response(
+        small_ring, [], background={"quadrupole_gradient": 2e-3}, noise=(2e-6, 1.2e-6),
+        progress=False, seed=0,
+    )  # fmt: skip
+    found = diagnose_response(small_ring, simulation.measured, seed=0)
+    kept = [step.effect for step in found.steps]
+    assert "quadrupole_gradient" in kept
+    assert not any("family_gradient" in effect for effect in kept)
+    drawn = draw_background(small_ring, {"quadrupole_gradient": 2e-3}, 0)
+    true = {cause.element: cause.amount for cause in drawn}
+    pulls = []
+    for cause, sigma in zip(found.causes, found.errors, strict=True):
+        assert cause.effect == "quadrupole_gradient"
+        pulls.append((cause.amount - true[cause.element]) / sigma)
+    assert len(pulls) == 32
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.7
+    assert not any("nan" in text for text in found.degenerate)
 
 
 def test_a_bad_monitor_is_named_and_left_out(small_ring, measured, rng):

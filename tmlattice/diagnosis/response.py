@@ -829,7 +829,7 @@ class ResponseRun:
             found.append(("energy_spread", None, amount, DELTA**2 * sigma[0][-1] / (2 * amount)))
         for i, name in enumerate(self.quadrupoles):
             at = m + len(self.plane) + i
-            if at < len(sigma[0]) and "family_gradient" in self.allowed:
+            if not {"family_gradient", "quadrupole_gradient"}.isdisjoint(self.allowed):
                 found.append(("quadrupole_gradient", name, state.gradients[i], sigma[0][at]))
         if 1 in posterior:
             both = sigma[1][:m].reshape(-1, 2)
@@ -863,12 +863,13 @@ class ResponseRun:
         draws = spread @ factor
         scale = draws[:m].mean(axis=0)
         kick = draws[m : m + c - 1].mean(axis=0)
-        both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
-        said.append(
-            f"mean monitor gain against mean corrector scale: known to "
-            f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
-            f"{both:+.2f}"
-        )
+        if scale.any() and kick.any():  # both are fitted
+            both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
+            said.append(
+                f"mean monitor gain against mean corrector scale: known to "
+                f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
+                f"{both:+.2f}"
+            )
         if "quadrupole_gradient" in self.groups and len(sigma) > m + c:
             group = self.groups["quadrupole_gradient"]
             prior = group.rms if group.each is None else group.each
