@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from tmlattice.diagnosis.response import ResponseDiagnosis
 from tmlattice.network.network import TaylorNetwork
@@ -89,6 +90,9 @@ def plot_steps(result: ResponseDiagnosis, ax: Axes | None = None) -> Axes:
     sigma = 1e6 * float(np.sqrt(np.mean(noise[result.good] ** 2)))
     ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
     ax.set_ylabel("held-out rms [µm]")
     ax.set_xticks(at, [s.effect.replace(", ", ",\n") for s in steps], fontsize=7)
     ax.grid(alpha=0.25)
