@@ -9,8 +9,8 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
-    BackgroundText,
     NameList,
+    background_option,
     console,
     json_option,
     lattice_options,
@@ -20,7 +20,7 @@ from tmlattice.cli.options import (
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
-    from tmlattice.diagnosis.response import ResponseDiagnosis
+    from tmlattice.diagnosis.response_result import ResponseDiagnosis
     from tmlattice.diagnosis.weights import WeightReading
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement, OrbitResponse
@@ -43,13 +43,7 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="A measurement of the same machine before the fault: static errors cancel.",
 )
-@click.option(
-    "--background",
-    type=BackgroundText(),
-    multiple=True,
-    help="Small errors that the machine has everywhere, with this rms or the catalogue's; "
-    "`all`, or `all=SCALE`, for every usual one.",
-)
+@background_option("Small errors that the machine has everywhere")
 @click.option(
     "--max-effects", type=click.IntRange(1), default=8, show_default=True, help="Findings at most."
 )

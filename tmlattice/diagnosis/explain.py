@@ -115,6 +115,11 @@ class Explanation:
     full: bool
     problem: Problem
 
+    @property
+    def count(self) -> int:
+        """Findings: causes with a name, free kicks, and monitors set aside."""
+        return len(self.named) + len(self.kicks) + len(self.monitors)
+
 
 class _Search:
     def __init__(
@@ -524,8 +529,8 @@ def explain(
     found = search.run(before)
     if not (search.passed_over and found.kicks):
         return found
-    count = len(found.named) + len(found.kicks) + len(found.monitors)
-    again = _Search(problem, hypotheses, min(most, count + 1), *arguments, names_first=True)
+    few = min(most, found.count + 1)
+    again = _Search(problem, hypotheses, few, *arguments, names_first=True)
     other = again.run(before)
     return other if _weighed(other, found, remake) > _weighed(found, other, remake) else found
 

@@ -21,16 +21,14 @@ from tmlattice.diagnosis.model import Hypothesis, Model
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.noise import estimate, local_misfit
 from tmlattice.diagnosis.refine import Fit, Problem, fit
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, Member
+from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, Member, ring_tunes
 from tmlattice.diagnosis.scan import FreeScan, look_elsewhere
 from tmlattice.diagnosis.small_errors import SmallErrors, small_errors
 from tmlattice.diagnosis.whitening import Whitening
 from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
-from tmlattice.errors import MeasurementError, TmlatticeError, UnstableRingError
+from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.lattice import Element, Ring
-from tmlattice.maps.magnets import ring_matrix
 from tmlattice.measurement import Measurement
-from tmlattice.optics import matrix_tunes
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -204,7 +202,7 @@ def diagnose(
         heldout=gap,
         heldout_shots=() if heldout is None else heldout.shots,
         unexplained=_unexplained(model, left, p_value),
-        tunes={"before": _tunes(ring), "after": _tunes(repaired)},
+        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=_next(ring, data, explanation, known, seed),
         sensitivity=_sensitivity(explanation),
         warnings=tuple(dict.fromkeys(warnings)),
@@ -316,11 +314,10 @@ def _check_lattice(ring: Ring, data: Data, start: Fit) -> None:
 
 def _misled(small: SmallErrors, explanation: Explanation) -> bool:
     """Whether a fault is so strong that small errors along its orbit look like further faults."""
-    count = len(explanation.named) + len(explanation.kicks) + len(explanation.monitors)
     if not explanation.fit.causes:
         return False
     freedom = _freedom(explanation.problem.data, explanation.fit)
-    return count > 1 or bool(stats.chi2.sf(explanation.fit.chi2, freedom) < 0.01)
+    return explanation.count > 1 or bool(stats.chi2.sf(explanation.fit.chi2, freedom) < 0.01)
 
 
 # --- after the search ----
@@ -492,13 +489,6 @@ def _unexplained(model: Model, left: FreeScan, p_value: float) -> dict[str, Any]
             taken.append(start)
             places.append({"s_from": start, "s_to": end, "statistic": statistic})
     return {"p_value": p_value, "places": places}
-
-
-def _tunes(ring: Ring) -> list[float] | None:
-    try:
-        return [float(q) for q in matrix_tunes(ring_matrix(ring))]
-    except (UnstableRingError, np.linalg.LinAlgError):
-        return None
 
 
 def _next(

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from tmlattice.diagnosis.response import ResponseRun, families, pick, rms_of
+from tmlattice.diagnosis.response import ResponseRun, families, rms_of
+from tmlattice.diagnosis.response_result import pick
 from tmlattice.effects import apply
 from tmlattice.lattice import Ring
 from tmlattice.response import ResponseModel, derivatives

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from tmlattice.diagnosis.report import amount_text, words
-from tmlattice.diagnosis.response import ResponseDiagnosis, Step
+from tmlattice.diagnosis.response_result import ResponseDiagnosis, Step
 
 WIDTH = 100
 SHOWN = 8

@@ -11,7 +11,10 @@ from tmlattice.diagnosis.gap import Gap, Misfit
 from tmlattice.diagnosis.model import Model
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.effects import Cause
+from tmlattice.errors import UnstableRingError
 from tmlattice.lattice import Ring
+from tmlattice.maps.magnets import ring_matrix
+from tmlattice.optics import matrix_tunes
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
@@ -183,3 +186,11 @@ class Diagnosis:
             "warnings": list(self.warnings),
             "provenance": self.provenance,
         }
+
+
+def ring_tunes(ring: Ring) -> list[float] | None:
+    """Fractions of Qx, Qy about the axis; None where there are none."""
+    try:
+        return [float(q) for q in matrix_tunes(ring_matrix(ring))]
+    except (UnstableRingError, np.linalg.LinAlgError):
+        return None

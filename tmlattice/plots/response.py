@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from tmlattice.diagnosis.response import ResponseDiagnosis
+from tmlattice.diagnosis.response_result import ResponseDiagnosis
 from tmlattice.network.network import TaylorNetwork
 from tmlattice.optics import twiss
 from tmlattice.plots.strip import lattice_strip

@@ -5,14 +5,17 @@
 
 import json
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tmlattice.diagnosis import Diagnosis, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DPI = 130
 
@@ -31,30 +34,40 @@ class Picture:
         return f"data:image/png;base64,{b64encode(self.path.read_bytes()).decode('ascii')}"
 
 
-def templates() -> Environment:
-    """Where the pages' templates are."""
-    return Environment(
+def render(template: str, provenance: Mapping[str, Any], **context: Any) -> str:
+    """A page of this folder's template; what the provenance holds beside texts is shown as JSON."""
+    environment = Environment(
         loader=PackageLoader("tmlattice.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    stated = {
+        key: value if isinstance(value, str) else json.dumps(value)
+        for key, value in provenance.items()
+    }
+    return environment.get_template(template).render(provenance=stated, **context)
 
 
-def draw(diagnosis: Diagnosis, folder: Path) -> list[Picture]:
-    """Every figure of a diagnosis as a PNG file in the folder."""
+def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Picture]:
+    """Figures (name, caption, figure) as PNG files in the folder, one open at a time."""
     import matplotlib.pyplot as plt
 
-    from tmlattice.plots.diagnosis import figures
-
     pictures = []
-    for name, caption, figure in figures(diagnosis):
+    for name, caption, figure in figures:
         path = folder / f"{name}.png"
         figure.savefig(path, dpi=DPI)
         plt.close(figure)
         pictures.append(Picture(name, caption, path))
     return pictures
+
+
+def draw(diagnosis: Diagnosis, folder: Path) -> list[Picture]:
+    """Every figure of a diagnosis as a PNG file in the folder."""
+    from tmlattice.plots.diagnosis import figures
+
+    return save(figures(diagnosis), folder)
 
 
 def page(
@@ -67,17 +80,10 @@ def page(
         pictures: of `draw`.
         provenance: where it should state more than the diagnosis' own.
     """
-    stated = diagnosis.provenance if provenance is None else provenance
-    return (
-        templates()
-        .get_template("diagnosis.html")
-        .render(
-            diagnosis=diagnosis,
-            report=report,
-            pictures={picture.name: picture for picture in pictures},
-            provenance={
-                key: value if isinstance(value, str) else json.dumps(value)
-                for key, value in stated.items()
-            },
-        )
+    return render(
+        "diagnosis.html",
+        diagnosis.provenance if provenance is None else provenance,
+        diagnosis=diagnosis,
+        report=report,
+        pictures={picture.name: picture for picture in pictures},
     )
