@@ -10,9 +10,10 @@ import pytest
 from conftest import SMALL
 
 from tmlattice.challenge import make, read_case, read_truth, run, score
-from tmlattice.challenge.case import Truth
-from tmlattice.challenge.oracle import Oracle
-from tmlattice.challenge.record import Places, exact
+from tmlattice.challenge.baselines import baselines
+from tmlattice.challenge.case import Truth, ring_of
+from tmlattice.challenge.oracle import Oracle, judge
+from tmlattice.challenge.record import Places, baseline_answer, exact
 from tmlattice.challenge.score import calibration, confusion, pulls, row_of, summary
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
@@ -114,7 +115,8 @@ def test_run_needs_no_truth_and_score_does(made, tmp_path):
     assert not result["failed"]
     schema = resources.files("tmlattice") / "schemas" / "challenge.schema.json"
     jsonschema.validate(json.loads(json.dumps(result)), json.loads(schema.read_text()))
-    assert {"tool", "oracle", "omp", "lasso", "svd_gradients"} <= set(result["rows"][0]["answers"])
+    methods = {"tool", "oracle", "omp", "lasso", "svd_gradients", "weight_change"}
+    assert methods <= set(result["rows"][0]["answers"])
 
 
 def test_the_oracle_finds_something_in_noise_at_the_stated_rate(tmp_path):
@@ -126,6 +128,46 @@ def test_the_oracle_finds_something_in_noise_at_the_stated_rate(tmp_path):
         for clean in oracle.projection.out(draws)
     )
     assert 6 <= found <= 45  # 20 expected; Poisson, and N known to 15 %
+
+
+def test_the_oracle_of_several_causes_is_told_the_others(tmp_path):
+    make("C", 1, 2, tmp_path, lattice=LATTICE, effects=EFFECTS, signal=(30, 60), progress=False)
+    case, truth = read_case(tmp_path, "0000"), read_truth(tmp_path, "0000")
+    judged = judge((case, truth))
+    assert len(judged["oracles"]) == len(truth.causes) > 1
+    for cause, said in zip(truth.causes, judged["oracles"], strict=True):
+        assert (cause.effect, cause.element) in {
+            (member["effect"], member["element"]) for member in said["class"]
+        }
+    # what the others do is gone from its data: the rest is noise
+    oracle = Oracle(case, truth, truth.causes[1:])
+    rest = oracle.residual(case.fit.readings[:, 0])
+    left = float(rest @ rest) - oracle.refined(rest)[0].max()
+    untold = Oracle(case, truth)
+    rest = untold.residual(case.fit.readings[:, 0])
+    freedom = untold.whitening.rows
+    assert left == pytest.approx(freedom, abs=6 * np.sqrt(2 * freedom))
+    assert float(rest @ rest) - untold.refined(rest)[0].max() > left + 100
+
+
+def test_plain_methods_name_three_and_no_more(made):
+    guesses = baselines(read_case(made, "0000"))
+    assert set(guesses) == {"svd_gradients", "omp", "lasso", "weight_change"}
+    ring = ring_of(LATTICE)
+    layers = {magnet.name for magnet in ring.magnets}
+    assert len({guess["element"] for guess in guesses["weight_change"]}) == 3
+    assert {guess["element"] for guess in guesses["weight_change"]} <= layers
+    assert all(guess["effect"] is None for guess in guesses["weight_change"])
+    assert all(len(found) <= 3 for found in guesses.values())
+
+
+def test_baselines_of_several_causes_give_a_finding_each():
+    guesses = [{"effect": "a", "element": str(i)} for i in range(3)]
+    assert len(baseline_answer(guesses)["findings"]) == 1
+    assert len(baseline_answer(guesses)["findings"][0]["credible_set"]) == 3
+    apart = baseline_answer(guesses, apart=2)
+    assert [f["element"] for f in apart["findings"]] == ["0", "1"]
+    assert baseline_answer([], apart=2) == {"verdict": "nothing", "findings": []}
 
 
 def test_unknowns_and_a_reduced_catalogue_share_tier_d(tmp_path):
@@ -191,7 +233,7 @@ def rows_by_hand(small_ring, quads):
         result_of(verdict="nothing"),
         result_of(finding(("quadrupole_gradient", other, 0.9))),
     ]
-    rows = [row_of(result, truth, None, places) for result in results]
+    rows = [row_of(result, truth, None, None, places) for result in results]
     for row in rows:
         row |= {"clean_before": 1.0, "clean_after": 0.04}
     rows[3]["clean_after"] = 1.0
@@ -284,7 +326,7 @@ def test_a_fixed_set_without_a_fault_stays_silent(tmp_path):
 
 
 def test_a_fixed_set_of_several_faults_is_taken_apart(tmp_path):
-    assert scored(tmp_path, "C", 3, signal=(20.0, 100.0))["exact"]["share"] >= 2 / 3
+    assert scored(tmp_path, "C", 3, signal=(20.0, 100.0))["exact"]["tool"]["share"] >= 2 / 3
 
 
 def test_a_fixed_set_of_unknown_faults_is_refused(tmp_path):

@@ -1,14 +1,13 @@
-"""What the data allow, and what plain methods make of them.
+"""What the data allow.
 
 The oracle knows the statistics exactly: the true launches (the point about which it is linear; what
 is known of launches beforehand it takes as everybody else), the true noise and background, and the
 largest fault. It weighs every hypothesis by its likelihood ratio, the leading ones by the finite
 change of the readings. Its class is every hypothesis within a chi-square of 9 of the best.
 
-The baselines know the design and fit the launches first.
+Of several causes it is asked one by one, and told all the others: no method can do better.
 """
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,10 +40,11 @@ class Oracle:
 
     Args:
         case, truth: both parts of it.
+        told: causes that it knows.
         seed: of the simulated null.
     """
 
-    def __init__(self, case: Case, truth: Truth, seed: int = 0) -> None:
+    def __init__(self, case: Case, truth: Truth, told: Sequence[Cause] = (), seed: int = 0) -> None:
         ring = ring_of(case.lattice)
         data = of_measurement(ring, case.fit)
         launches = truth.launches["fit"]
@@ -59,7 +59,7 @@ class Oracle:
         small = draw_background(ring, truth.background, truth.seed)
         set_there = {name for setting in data.settings for name in setting}
         known, self.small = [], []  # in the ring for good, and with every reading
-        for cause in small:
+        for cause in (*small, *told):
             if cause.effect == "corrector_calibration":  # acts on what a shot has set
                 self.small += [cause] * (cause.element in set_there)
             elif isinstance(find(cause.effect), RingEffect):
@@ -160,18 +160,33 @@ def _without_dead(data: Data, truth: Truth, monitors: Sequence[str]) -> Data:
 
 
 def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
-    """What the oracle and the baselines say of a case, as JSON."""
+    """What the oracle says of a case, as JSON: {"oracles": one for each cause, "residual"}.
+
+    A case of an unknown, or of none, has one oracle and, of an unknown, the residual after the best
+    member of the catalogue, in sigma.
+    """
     case, truth = argument
+    causes = truth.causes
+    if len(causes) > 1:
+        told = [tuple(c for c in causes if c is not cause) for cause in causes]
+        return {
+            "oracles": [_said(Oracle(case, truth, others), case) for others in told],
+            "residual": None,
+        }
     oracle = Oracle(case, truth)
-    clean = oracle.residual(case.fit.in_order_of(oracle.model.maps.monitors).readings[:, 0])
-    statistic, amount = oracle.refined(clean)
-    quiet = oracle.residual(truth.clean["fit"])
-    if case.reference is not None:  # the reference's noise is in it: only the change counts
-        quiet = quiet - oracle.residual(truth.clean["before"])
     left = None
     if truth.unknown is not None:
+        quiet = oracle.residual(truth.clean["fit"])
+        if case.reference is not None:  # the reference's noise is in it: only the change counts
+            quiet = quiet - oracle.residual(truth.clean["before"])
         best = oracle.refined(quiet)[0].max()
         left = float(np.sqrt(max(float(quiet @ quiet) - best, 0.0)))
+    return {"oracles": [_said(oracle, case)], "residual": left}
+
+
+def _said(oracle: Oracle, case: Case) -> dict[str, Any]:
+    clean = oracle.residual(case.fit.in_order_of(oracle.model.maps.monitors).readings[:, 0])
+    statistic, amount = oracle.refined(clean)
     weight = statistic / 2 + np.array(_priors(oracle.hypotheses))
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
@@ -192,16 +207,12 @@ def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
 
     top = float(statistic.max())
     return {
-        "oracle": {
-            "statistic": top,
-            "threshold": oracle.threshold,
-            "detected": bool(top > oracle.threshold),
-            "class_size": int((statistic > top - CLASS).sum()),
-            "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
-            "posterior": listed(order),
-        },
-        "residual": left,
-        "baselines": baselines(case),
+        "statistic": top,
+        "threshold": oracle.threshold,
+        "detected": bool(top > oracle.threshold),
+        "class_size": int((statistic > top - CLASS).sum()),
+        "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
+        "posterior": listed(order),
     }
 
 
@@ -215,58 +226,3 @@ def _priors(hypotheses: Sequence[Hypothesis]) -> list[float]:
     for name, _ in hypotheses:
         count[name] = count.get(name, 0) + 1
     return [-float(np.log(len(count) * count[name])) for name, _ in hypotheses]
-
-
-# --- plain methods --------------------------------------------------------------------------------
-def baselines(case: Case) -> dict[str, list[dict[str, Any]]]:
-    """First guesses (three at most) of the SVD over all gradients, of OMP and of the LASSO."""
-    from sklearn.linear_model import Lasso, orthogonal_mp
-
-    ring = ring_of(case.lattice)
-    data = of_measurement(ring, case.fit)
-    model = Model(ring, data.settings)
-    whitening = Whitening(data)
-    launches = data.launches
-    for _ in range(4):
-        paths = model.paths(launches)
-        difference = np.where(data.valid, data.readings - paths.readings, 0.0)
-        residual = whitening.residual(difference, launches)
-        projection = Projection(whitening.launch(paths.launch))
-        moved = projection.coordinates(residual).reshape(data.shots, -1)
-        launches = launches.copy()
-        launches[:, whitening.columns] += moved
-    residual = projection.out(residual)
-    chosen = names(case.options.get("effects"))
-    hypotheses = model.hypotheses([n for n in chosen if n != "monitor_dead"])
-    parts = []
-    for start in range(0, len(hypotheses), CHUNK):
-        some = hypotheses[start : start + CHUNK]
-        change = np.nan_to_num(model.signatures(paths, some, launches))
-        parts.append(whitening.signature(change))
-    rows = np.concatenate(parts)
-    size = np.sqrt(np.einsum("hr,hr->h", rows, rows))
-    seen = np.flatnonzero(size > 0)
-    unit = (rows[seen] / size[seen, None]).T
-
-    def guess(order: Sequence[int]) -> list[dict[str, Any]]:
-        found = [hypotheses[i] for i in order]
-        return [{"effect": effect, "element": element} for effect, element in found]
-
-    out = {}
-    gradients = [i for i, (name, _) in enumerate(hypotheses) if name == "quadrupole_gradient"]
-    if gradients:
-        solved = np.linalg.pinv(rows[gradients].T, rcond=1e-2) @ residual
-        out["svd_gradients"] = guess([gradients[i] for i in np.argsort(-np.abs(solved))[:3]])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # nearly equal columns: that is what makes them baselines
-        atoms = orthogonal_mp(unit, residual, n_nonzero_coefs=3)
-        level = np.sqrt(2 * np.log(len(seen)))  # the universal threshold
-        weights = np.zeros(len(seen))
-        strong = np.flatnonzero(np.abs(unit.T @ residual) >= level)  # the others stay out at first
-        if len(strong):
-            lasso = Lasso(alpha=level / len(residual), fit_intercept=False, max_iter=100, tol=1e-3)
-            weights[strong] = lasso.fit(unit[:, strong], residual).coef_
-    for name, values in (("omp", atoms), ("lasso", weights)):
-        order = np.argsort(-np.abs(values))[:3]
-        out[name] = guess([int(seen[i]) for i in order if values[i] != 0])
-    return out

@@ -87,9 +87,11 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
         pull = float((found - amount) / sigma)
     return {
         "place": place,
-        "element_first": named and finding["element"] == cause.element,
-        "element_in_three": named and cause.element in elements[:3],
-        "element_in_set": named and cause.element in elements,
+        # a baseline may name an element and no effect
+        "element_first": (named or cause.element is not None)
+        and finding["element"] == cause.element,
+        "element_in_three": cause.element in elements[:3],
+        "element_in_set": cause.element in elements,
         "effect_first": finding["effect"] == cause.effect,
         "effect_in_set": cause.effect in effects,
         "first": first == true,
@@ -146,28 +148,41 @@ def oracle_answer(judged: Mapping[str, Any], ranking: str) -> dict[str, Any]:
         judged: see `judge`.
         ranking: "class", all within a chi-square of 9, or "posterior", a 95 % credible set.
     """
-    oracle = judged["oracle"]
+    findings = [_oracle_finding(o, ranking) for o in judged["oracles"] if o["detected"]]
+    if not findings:
+        return {"verdict": "nothing", "findings": []}
+    several = any(len(finding["credible_set"]) > 1 for finding in findings)
+    return {"verdict": "equivalent" if several else "named", "findings": findings}
+
+
+def _oracle_finding(oracle: Mapping[str, Any], ranking: str) -> dict[str, Any]:
     members = list(oracle[ranking])
     if ranking == "posterior":
         total = np.cumsum([m["probability"] or 0.0 for m in members])  # null: it sees nothing
         members = members[: int(np.searchsorted(total, 0.95)) + 1]
-    if not oracle["detected"]:
-        return {"verdict": "nothing", "findings": []}
     first = members[0]
-    finding = {
+    return {
         **{key: first[key] for key in ("effect", "element", "amount", "probability")},
         "s": None,
         "amount_sigma": float(abs(first["amount"]) / np.sqrt(max(first["statistic"], 1e-300))),
         "credible_set": members,
         "mass": float(sum(m["probability"] for m in members)),
     }
-    return {"verdict": "named" if len(members) == 1 else "equivalent", "findings": [finding]}
 
 
-def baseline_answer(guesses: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A baseline in the words of a diagnosis; it always finds something."""
-    if not guesses:
-        return {"verdict": "nothing", "findings": []}
-    members = [{**g, "probability": 1 / len(guesses)} for g in guesses]
-    finding = {**guesses[0], "s": None, "amount": None, "credible_set": members}
-    return {"verdict": "named", "findings": [finding]}
+def baseline_answer(
+    guesses: Sequence[Mapping[str, Any]], apart: int | None = None
+) -> dict[str, Any]:
+    """A baseline in the words of a diagnosis; it always finds something.
+
+    Args:
+        guesses: see `baselines`.
+        apart: so many guesses are findings of their own; None: all are of one finding.
+    """
+    parts = [list(guesses)] if apart is None else [[guess] for guess in guesses[:apart]]
+    findings = []
+    for part in parts:
+        members = [{**g, "probability": 1 / len(part)} for g in part]
+        if part:
+            findings.append({**part[0], "s": None, "amount": None, "credible_set": members})
+    return {"verdict": "named" if findings else "nothing", "findings": findings}

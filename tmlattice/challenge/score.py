@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from tmlattice.batch import finished, run_batch
+from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import (
     Case,
     Truth,
@@ -81,34 +82,35 @@ def score(
         raise TmlatticeError(f"'{folder}' has no results; `tmlattice challenge run` makes them")
     truths = {name: read_truth(folder, name) for name in names}
     judged: dict[str, dict[str, Any]] = {}
+    guessed: dict[str, dict[str, Any]] = {}
     if oracle:
 
         def load(name: str) -> Callable[[], tuple[Case, Truth]]:
             return lambda: (read_case(folder, name), truths[name])
 
-        todo = {name: load(name) for name in names if described["tier"] != "C"}
-        judged = run_batch(
-            judge,
-            todo,
-            folder / "oracle",
-            jobs=jobs,
-            scheduler=scheduler,
-            progress=progress,
-        )
+        def load_case(name: str) -> Callable[[], Case]:
+            return lambda: read_case(folder, name)
+
+        where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
+        judged = run_batch(judge, {n: load(n) for n in names}, folder / "oracle", **where)
+        if described["tier"] != "E":  # they always find something
+            cases = {n: load_case(n) for n in names}
+            guessed = run_batch(baselines, cases, folder / "baselines", **where)
     ring = ring_of(described["lattice"])
     places = Places(ring)
     rows = []
     for name in names:
         if "error" in results[name]:
             continue
-        row = row_of(results[name], truths[name], judged.get(name), places)
+        row = row_of(results[name], truths[name], judged.get(name), guessed.get(name), places)
         row |= clean_gap(ring, read_case(folder, name).heldout, truths[name], results[name])
         rows.append(row)
     failed = {n: results[n]["error"] for n in names if "error" in results[n]}
     failed |= {f"oracle {n}": r["error"] for n, r in judged.items() if "error" in r}
+    failed |= {f"baselines {n}": r["error"] for n, r in guessed.items() if "error" in r}
     return {
         "format": FORMAT,
-        "version": 1,
+        "version": 2,
         "package": __version__,
         **{key: described[key] for key in ("tier", "lattice", "reference", "shots", "amount")},
         "cases": len(names),
@@ -123,6 +125,7 @@ def row_of(
     result: Mapping[str, Any],
     truth: Truth,
     judged: Mapping[str, Any] | None,
+    guessed: Mapping[str, Any] | None,
     places: Places,
 ) -> Row:
     """One case: what was there, what the diagnosis said, and oracle and baselines likewise."""
@@ -147,16 +150,21 @@ def row_of(
     if judged is not None and "error" not in judged:
         for ranking, name in (("class", "oracle"), ("posterior", "bayes_oracle")):
             answers[name] = oracle_answer(judged, ranking)
-        for name, guesses in judged["baselines"].items():
-            answers[name] = baseline_answer(guesses)
         row["residual"] = judged["residual"]
         if unknown is not None and judged["residual"] is not None:
             row["aliased"] = bool(judged["residual"] < ALIASED)
+    if guessed is not None and "error" not in guessed:
+        for name, guesses in guessed.items():
+            if name != "seconds":
+                # of several causes they are told how many there are
+                apart = len(causes) if len(causes) > 1 else None
+                answers[name] = baseline_answer(guesses, apart)
     row["answers"] = {name: _answer(answer, truth, places) for name, answer in answers.items()}
     if len(causes) == 1:
         row["column"] = column(result, causes[0])
     if len(causes) > 1:
-        row["exact"] = exact(result, causes)
+        row["exact"] = {name: exact(answer, causes) for name, answer in answers.items()}
+        row["weakest"] = min(truth.signal_to_noise)
     return row
 
 
@@ -261,7 +269,8 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
         return out
     out["detection"] = detection(rows)
     if tier == "C":
-        out["exact"] = rate([bool(row["exact"]) for row in rows])
+        out["exact"] = _exact(rows)
+        out["exact_above_10"] = _exact([row for row in rows if row["weakest"] >= 10])
         out["clean_gap_closed"] = _closed(rows)
         return out
     if tier == "D":
@@ -291,6 +300,12 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["relative_to_oracle"] = _relative(clear)
     out["classes"] = classes(rows)
     return out
+
+
+def _exact(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Share of cases in which all causes were found, by method."""
+    found = dict.fromkeys(name for row in rows for name in row["exact"])
+    return {n: rate([row["exact"][n] for row in rows if n in row["exact"]]) for n in found}
 
 
 def _effect(row: Row) -> str | None:
@@ -404,18 +419,22 @@ def _closed(rows: Sequence[Row]) -> dict[str, Any]:
     """Where something is to be seen: error on clean held-out readings at most 5 % of before.
 
     An amount known to 1 / (signal to noise) leaves that share of the gap: nobody reaches 5 % at a
-    signal to noise of 10. `of_the_floor` is the share left in units of that.
+    signal to noise of 10. `of_the_floor` is the share left in units of that, and
+    `expected_within_5_percent` what a least squares fit reaches that knows the cause and only its
+    amount not.
     """
-    ratios, floors = [], []
+    ratios, floors, expected = [], [], []
     for row in rows:
         oracle = row["answers"].get("oracle")
         if row["clean_before"] and (oracle is None or oracle["detected"]):
             ratios.append(row["clean_after"] / row["clean_before"])
             if row["signal_to_noise"]:
                 floors.append(ratios[-1] * row["signal_to_noise"])
+                expected.append(float(2 * stats.norm.cdf(0.05 * row["signal_to_noise"]) - 1))
     return {
         "within_5_percent": rate([ratio <= 0.05 for ratio in ratios]),
         "within_10_percent": rate([ratio <= 0.10 for ratio in ratios]),
+        "expected_within_5_percent": _mean(expected),
         "ratio": _quantiles(ratios),
         "of_the_floor": _quantiles(floors),
         "chi2_per_dof": _quantiles([r["heldout_chi2_per_dof"] for r in rows if r["findings"]]),
@@ -442,9 +461,15 @@ def _unknowns(rows: Sequence[Row]) -> dict[str, Any]:
             "aliased": rate([bool(row.get("aliased", False)) for row in some]),
         }
 
+    def placed(some: Sequence[Row]) -> dict[str, dict[str, Any]]:
+        found = dict.fromkeys(name for row in some for name in row["answers"])
+        rows = {n: [r["answers"][n] for r in some if n in r["answers"]] for n in found}
+        return {n: rate([row.get("place", False) for row in rows[n]]) for n in found}
+
     kinds = dict.fromkeys(kind(row) for row in rows)
     return {
         "unknown": both(rows),
+        "place_by_method": placed([row for row in rows if not row.get("aliased", False)]),
         "kinds": {name: both([row for row in rows if kind(row) == name]) for name in kinds},
     }
 
@@ -456,6 +481,10 @@ def _relative(rows: Sequence[Row]) -> dict[str, Any]:
         own = [r for r in rows if "oracle" in r["answers"] and r["answers"]["oracle"][key]]
         out[key] = rate([row["answers"]["tool"][key] for row in own])
     return out
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
 
 
 def _quantiles(values: Sequence[float | None]) -> dict[str, float | None]:

@@ -25,6 +25,7 @@ METHODS = {
     "svd_gradients": "SVD, gradients",
     "omp": "matching pursuit",
     "lasso": "LASSO",
+    "weight_change": "largest weight change",
 }
 
 
@@ -176,12 +177,17 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
     for key, title in (
         ("false_alarms", "false alarms"),
         ("oracle_false_alarms", "false alarms of the oracle"),
-        ("exact", "all causes found, up to equivalence"),
         ("false_refusals", "false refusals"),
         ("more_than_one_finding", "more than one finding"),
     ):
         if key in result:
             screen.print(f"{title}: {_share(result[key])} of {result[key]['cases']}")
+    if "exact" in result:
+        shown = table("all causes found, up to equivalence", "all cases", "each above 10")
+        for name in (name for name in METHODS if name in result["exact"]):
+            above = result["exact_above_10"].get(name)
+            shown.add_row(METHODS[name], _share(result["exact"][name]), _share(above))
+        screen.print(shown)
     for title, methods in _method_tables(result):
         _print_methods(screen, title, methods)
     if "detection" in result:
@@ -212,6 +218,10 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
         for name, entry in {"all": result["unknown"], **result["kinds"]}.items():
             shown.add_row(name, _share(entry["refused"]), _share(entry["place"]),
                           _plain(entry["aliased"]), str(entry["aliased"]["cases"]))  # fmt: skip
+        screen.print(shown)
+        shown = table("not aliased, within one monitor gap", "place")
+        for name in (name for name in METHODS if name in result["place_by_method"]):
+            shown.add_row(METHODS[name], _share(result["place_by_method"][name]))
         screen.print(shown)
 
 
@@ -253,8 +263,9 @@ def _print_sets(screen: "Console", result: dict[str, Any]) -> None:
     )
     screen.print(
         f"error on held-out readings without noise: median {_number(closed['ratio']['median'])} of "
-        f"that before; at most 5 % in {_share(closed['within_5_percent'])}; with noise it is "
-        f"noise, within 99 %, in {_share(closed['as_noise'])}"
+        f"that before; at most 5 % in {_share(closed['within_5_percent'])}, "
+        f"{_number(closed['expected_within_5_percent'], '{:.1%}')} expected of the data; with "
+        f"noise it is noise, within 99 %, in {_share(closed['as_noise'])}"
     )
     own = result["relative_to_oracle"]["element_first"]
     screen.print(f"element first where the oracle has it first: {_share(own)}")
