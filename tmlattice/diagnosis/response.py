@@ -19,7 +19,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,6 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.response import ResponseModel, derivatives
-
-if TYPE_CHECKING:
-    pass
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -59,6 +56,8 @@ HELPS, SPOILS = 0.995, 1.25
 """A step is kept where its judge falls to the first, the rms over both planes falls, and none
 (in-plane, coupling, RF) rises above the second; the RF's has some 25 readings, so 14 % of its
 own."""
+TYPICAL = 10.0
+"""The median misfit of all columns counts as so many readings of each one's own."""
 INNER = 0.2
 """Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
 
@@ -181,8 +180,9 @@ class ResponseRun:
             np.tile(np.eye(2), (monitors, 1, 1)), np.zeros(columns), np.zeros(columns),
             np.zeros(len(self.quadrupoles)), np.zeros(len(self.skews)), np.zeros(1),
         )  # fmt: skip
-        self.lacking = np.full(2, 1e-4)
-        """What the model lacks in-plane and across, m: it lessens weights as noise does."""
+        self.lacking = np.full((2, columns), 1e-4)
+        """What the model lacks in-plane and across in each column, m: it lessens weights as noise
+        does, so that one corrector whose field is not where the model has it spoils no magnet."""
         self.exploring = True
         self.allowed: list[str] = []
         self.groups: dict[str, Group] = {}
@@ -299,7 +299,7 @@ class ResponseRun:
             # a monitor reads the centroid of particles whose orbits answer each as its energy has
             # it: half the second derivative by the energy, times the mean square
             step = DELTA / self.model.rf_start[5]
-            up, down = (self.orbits(ResponseModel(ring, frequency=f)) for f in (step, -step))
+            up, down = (self.orbits(self.model.at_frequency(f)) for f in (step, -step))
             self.curved = (up + down) / 2 - self.beam
             self.beam = self.beam + self.state.spread[0] * self.curved
         self.across = np.zeros_like(self.beam)  # of a kick in the other plane
@@ -311,17 +311,23 @@ class ResponseRun:
         return self.read()
 
     def orbits(self, model: ResponseModel) -> Array:
-        """Orbit changes of the steps, the RF's last, m, [column, monitor, 2]."""
-        response = model.response(self.m.correctors)
-        whole = np.concatenate([response, model.rf_response()[None]])[:, self.at]
-        return np.asarray(whole * self.kicks[:, None, None])
+        """Orbit changes of the steps, the RF's last, m, [column, monitor, 2].
+
+        The RF's is as large as the dispersion: a step of half a per cent in energy has a third
+        order that is several times the readings' noise.
+        """
+        steps = model.response(self.m.correctors) * self.kicks[:-1, None, None]
+        return np.concatenate([steps, model.rf_change(self.kicks[-1])[None]])[:, self.at]
 
     def read(self) -> Array:
         """What monitors read of it, m, [column, monitor, 2]."""
+        return np.asarray(np.einsum("mij,cmj->cmi", self.state.monitors, self.kicked()))
+
+    def kicked(self) -> Array:
+        """The beam's orbit changes with the correctors as they are, m, [column, monitor, 2]."""
         state = self.state
         beam = (1 + state.calibration)[:, None, None] * self.beam
-        beam = beam + state.roll[:, None, None] * self.across
-        return np.asarray(np.einsum("mij,cmj->cmi", state.monitors, beam))
+        return np.asarray(beam + state.roll[:, None, None] * self.across)
 
     def slopes_of(self, effect: str, places: Sequence[str], plane: Indices) -> Array:
         """What the readings in `plane` do for each error, [error, column, monitor]."""
@@ -343,7 +349,7 @@ class ResponseRun:
         if self.exploring:
             use &= ~self.inner[:, None]
             use[-1] &= ~self.inner_rf
-        variance = self.noise[:, plane].T ** 2 + self.lacking[block] ** 2
+        variance = self.noise[:, plane].T ** 2 + self.lacking[block][:, None] ** 2
         return np.where(use, 1 / variance, 0.0)
 
     def _has(self, block: int) -> bool:
@@ -361,7 +367,7 @@ class ResponseRun:
                 self._look(seen)
         log.info(
             "lacking %s m, %s",
-            self.lacking,
+            np.median(self.lacking, axis=1),
             {name: f"{group.rms:.1e}" for name, group in self.groups.items()},
         )
 
@@ -369,8 +375,7 @@ class ResponseRun:
         """Normal equations where the fit stands, the parameters there, and the trusted change."""
         state, own = self.state, self.plane
         plane = own if block == 0 else 1 - own
-        beam = (1 + state.calibration)[:, None, None] * self.beam
-        beam = beam + state.roll[:, None, None] * self.across
+        beam = self.kicked()
         gain = np.diagonal(state.monitors, axis1=1, axis2=2)[:, plane].T
         if block == 0:
             by_monitor, by_column = pick(beam, own), gain * pick(self.beam, own)
@@ -488,7 +493,11 @@ class ResponseRun:
         left = np.where(weight > 0, pick(self.data - read, plane), np.nan)[:-1]
         typical = float(np.nanmedian(np.abs(left[:, self.good]))) / 0.6745
         noise = float(np.median(self.noise))
-        self.lacking[block] = np.sqrt(max(typical**2 - noise**2, (noise / 5) ** 2))
+        squares = np.full(len(self.plane), typical**2)  # the RF's readings are few
+        count = (weight[:-1] > 0).sum(axis=1)
+        shared = TYPICAL * typical**2 + np.nansum(left**2, axis=1)
+        squares[:-1] = shared / (TYPICAL + count)
+        self.lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
         if block == 0:
             self._find_bad(pick(read, plane))
 

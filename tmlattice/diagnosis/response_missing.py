@@ -11,13 +11,14 @@ the machine's drift while it was stepped) is taken from a held-out corrector's n
 kick is.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from tmlattice.diagnosis.response import ResponseRun, families, rms_of
 from tmlattice.diagnosis.response_result import pick
@@ -26,6 +27,7 @@ from tmlattice.lattice import Ring
 from tmlattice.response import ResponseModel, derivatives
 
 Array = NDArray[np.float64]
+Patterns: TypeAlias = Array | csr_array
 
 ENERGY_SPREAD = 1.2e-3
 """Relative rms energy spread of PETRA III's beam; the scale of the hypothesis."""
@@ -38,6 +40,8 @@ FREE = 30.0
 """Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
 FEW = 6
 """So many amounts stand alone."""
+SPARSE = 0.1
+"""Patterns are kept sparse where fewer of their readings are not zero."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,9 @@ class Weighed:
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
-        judgement: "helps", "excluded" (held-out readings do not want it) or "unphysical".
+        on_top_in_plane, on_top_position: with it and all others that are wanted together, m.
+        judgement: "helps", "excluded" (held-out readings do not want it), "unphysical"; "helps, not
+            on top" where others that help leave nothing for it.
     """
 
     effect: str
@@ -82,6 +88,8 @@ class Weighed:
     amount_sigma: float
     heldout_rms_in_plane: float
     heldout_rms_position: float
+    on_top_in_plane: float
+    on_top_position: float
     judgement: str
 
     def as_json(self) -> dict[str, Any]:
@@ -98,37 +106,71 @@ def weigh(
     wanted: Iterable[str] | None = None,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> list[Weighed]:
-    """Every hypothesis alone on top of the fit; the first row is the fit without any.
+    """Every hypothesis alone and on top of the others; the first row is the fit without any.
+
+    Those that help are taken together, the best first, as long as each lowers the held-out rms
+    on top of those before it; then every hypothesis is weighed once more beside them.
 
     Args:
         run: after its fit.
         wanted: names of `HYPOTHESES`; None: all.
         progress: called with each name.
     """
-    lattice = Fitted(run)
-    rows = [_row(lattice, None, np.inf)]
+    fitted = Fitted(run)
+    base = fitted.weigh([])
+    rows: list[tuple[Hypothesis, Answer, str]] = []
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         found = HYPOTHESES[name](run)
         # nothing where the ring has no such places, or no reading would move
         if found is not None and found.patterns.any():
-            rows.append(_row(lattice, found, rows[0].heldout_rms_in_plane))
-    return rows
+            answer = fitted.weigh([found])
+            rows.append((found, answer, _judgement(found, answer, base)))
+    progress("hypotheses together")
+    helpers = [hypothesis for hypothesis, _, judgement in rows if judgement == "helps"]
+    together, chosen = base, list[Hypothesis]()
+    while helpers:
+        answers = [fitted.weigh([*chosen, one]) for one in helpers]
+        best = int(np.argmin([answer.in_plane for answer in answers]))
+        if answers[best].in_plane > HELPS * together.in_plane:
+            break
+        together = answers[best]
+        chosen.append(helpers.pop(best))
+    out = [Weighed("none", "", "", 0, 0.0, 0.0, *base[2:], *together[2:], "")]
+    for hypothesis, answer, judgement in rows:
+        on_top = together
+        if not any(one is hypothesis for one in chosen):
+            on_top = fitted.weigh([*chosen, hypothesis])
+            if judgement == "helps":
+                judgement = "helps, not on top"  # noqa: PLW2901
+        amounts, sigma, in_plane, position = answer
+        out.append(
+            Weighed(
+                hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
+                _size(amounts), float(np.median(sigma)), in_plane, position, on_top.in_plane,
+                on_top.position, judgement,
+            )
+        )  # fmt: skip
+    return out
 
 
-def _row(fitted: "Fitted", hypothesis: Hypothesis | None, before: float) -> Weighed:
-    amounts, sigma, rms, jumped = fitted.weigh(hypothesis)
-    if hypothesis is None:
-        return Weighed("none", "", "", 0, 0.0, 0.0, rms, jumped, "")
-    size = float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
-    if rms > HELPS * before:
-        judgement = "excluded"
-    else:
-        judgement = "helps" if abs(size) <= hypothesis.most else "unphysical"
-    return Weighed(
-        hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts), size,
-        float(np.median(sigma)), rms, jumped, judgement,
-    )  # fmt: skip
+def _size(amounts: Array) -> float:
+    return float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
+
+
+def _judgement(hypothesis: Hypothesis, answer: "Answer", base: "Answer") -> str:
+    if answer.in_plane > HELPS * base.in_plane:
+        return "excluded"
+    return "helps" if abs(_size(answer.amounts)) <= hypothesis.most else "unphysical"
+
+
+class Answer(NamedTuple):
+    """Amounts of the last hypothesis, their errors, held-out rms without and with a jump, m."""
+
+    amounts: Array
+    sigma: Array
+    in_plane: float
+    position: float
 
 
 class Fitted:
@@ -148,13 +190,25 @@ class Fitted:
         self.factor = cho_factor(A + np.eye(len(A)), lower=True)
         self.vector = self.spread.T @ (normal.vector + normal.matrix @ self.start)
         self.weight = run.weight(0)
-        state, own = run.state, run.plane
-        beam = (1 + state.calibration)[:, None, None] * run.beam
-        gain = np.diagonal(state.monitors, axis1=1, axis2=2)[:, own].T
-        self.by_monitor = pick(beam, own)
+        own = run.plane
+        gain = np.diagonal(run.state.monitors, axis1=1, axis2=2)[:, own].T
+        self.by_monitor = pick(run.kicked(), own)
         self.by_column = gain * pick(run.beam, own)
         self.by_column[-1] = 0
         self.read = pick(run.read(), own)
+        # readings by the monitors' and the columns' own parameters, [reading, parameter]
+        columns, monitors = self.weight.shape
+        reading = np.arange(self.weight.size)
+        by_monitor = 2 * (reading % monitors) + np.repeat(own, monitors)
+        by_column = 2 * monitors + reading // monitors
+        self.own = csr_array(
+            (
+                np.concatenate([self.by_monitor.ravel(), self.by_column.ravel()]),
+                (np.tile(reading, 2), np.concatenate([by_monitor, by_column])),
+            ),
+            shape=(len(reading), 2 * monitors + columns),
+        )
+        self._parts: dict[int, _Part] = {}
         residual = np.where(self.weight > 0, pick(run.data, own) - self.read, 0.0)
         self.target = residual + self.change(self.start)
 
@@ -168,54 +222,67 @@ class Fitted:
             out = out + np.tensordot(values[m + c :], self.slopes, 1)
         return np.asarray(out)
 
-    def across(self, patterns: Array) -> Array:
-        """J^T W H, [base parameter, pattern]."""
-        run = self.run
-        m, c = 2 * len(run.at), len(run.plane)
-        out = np.zeros((len(self.start), len(patterns)))
-        flat = self.slopes.reshape(len(self.slopes), -1)
-        for k, pattern in enumerate(patterns):
-            weighted = self.weight * pattern
-            both = weighted * self.by_monitor
-            for p in (0, 1):
-                out[p:m:2, k] = both[run.plane == p].sum(axis=0)
-            out[m : m + c, k] = (weighted * self.by_column).sum(axis=1)
-        if len(flat):
-            out[m + c :] = flat @ (self.weight * patterns).reshape(len(patterns), -1).T
-        return out
+    def across(self, flat: Patterns) -> Array:
+        """J^T W H, [base parameter, pattern], of patterns [pattern, reading]."""
+        weighted = _scaled(flat, self.weight.ravel())
+        ring = self.slopes.reshape(len(self.slopes), -1).T
+        own = _dense(weighted @ self.own)
+        return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
 
-    def weigh(self, hypothesis: Hypothesis | None) -> tuple[Array, Array, float, float]:
-        """Amounts, their errors, and held-out rms in-plane without and with a position jump."""
-        if hypothesis is None:
-            return (np.zeros(0), np.zeros(0), *self._score(np.zeros(0), None))
-        H = hypothesis.patterns
-        if hypothesis.own:
-            H = _by_column(H)
-        size = np.sqrt((self.weight * H**2).sum(axis=(1, 2)))
-        kept = size > 0
-        H = H[kept]
-        B = self.spread.T @ self.across(H)
+    def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
+        """What held-out readings say of these hypotheses together."""
+        if not hypotheses:
+            return Answer(np.zeros(0), np.zeros(0), *self._score(np.zeros(0), None))
+        parts = [self._part(hypothesis) for hypothesis in hypotheses]
+        edge = np.cumsum([0, *(part.across.shape[1] for part in parts)])
+        B = np.concatenate([part.across for part in parts], axis=1)
         half = cho_solve(self.factor, B)
-        flat = H.reshape(len(H), -1)
         weight = self.weight.ravel()
-        C = (flat * weight) @ flat.T - B.T @ half
-        r = flat @ (weight * self.target.ravel()) - half.T @ self.vector
+        C = np.empty((edge[-1],) * 2)
+        for i, one in enumerate(parts):
+            for k, other in enumerate(parts[: i + 1]):
+                both = _dense(_scaled(one.flat, weight) @ other.flat.T)
+                C[edge[i] : edge[i + 1], edge[k] : edge[k + 1]] = both
+                C[edge[k] : edge[k + 1], edge[i] : edge[i + 1]] = both.T
+        C -= B.T @ half
+        target = weight * self.target.ravel()
+        r = np.concatenate([part.flat @ target for part in parts]) - half.T @ self.vector
         # one or a few amounts are free; many have the scale that the evidence finds, within physics
-        many = len(H) > FEW
-        spread = np.full(len(H), hypothesis.most if many else FREE * min(hypothesis.most, 1e3))
-        for _ in range(12 if many else 1):
-            inverse = np.linalg.inv(C * np.outer(spread, spread) + np.eye(len(H)))
+        owner = np.repeat(np.arange(len(parts)), np.diff(edge))
+        many = [len(part.across.T) > FEW for part in parts]
+        most = [one.most if m else FREE * min(one.most, 1e3)
+                for one, m in zip(hypotheses, many, strict=True)]  # fmt: skip
+        spread = np.array(most)[owner]
+        for _ in range(12 if any(many) else 1):
+            inverse = np.linalg.inv(C * np.outer(spread, spread) + np.eye(len(C)))
             amounts = spread * (inverse @ (spread * r))
             variance = np.diag(inverse) * spread**2
-            if many:
-                scale = float(np.sqrt(np.mean(amounts**2 + variance)))
-                spread = np.full(len(H), min(scale, hypothesis.most))
+            for i in (i for i, m in enumerate(many) if m):
+                mine = owner == i
+                scale = float(np.sqrt(np.mean(amounts[mine] ** 2 + variance[mine])))
+                spread[mine] = min(scale, most[i])
         moved = cho_solve(self.factor, self.vector - B @ amounts)
         change = self.change(self.spread @ moved - self.start)
-        if not hypothesis.own:
-            change = change + np.tensordot(amounts, H, 1)
-        rms, jumped = self._score(change, hypothesis.patterns if hypothesis.own else None)
-        return amounts, np.sqrt(variance), rms, jumped
+        for i, (hypothesis, part) in enumerate(zip(hypotheses, parts, strict=True)):
+            if not hypothesis.own:
+                change = change + (amounts[owner == i] @ part.flat).reshape(change.shape)
+        own = [hypothesis.patterns for hypothesis in hypotheses if hypothesis.own]
+        last = owner == len(parts) - 1
+        rms, jumped = self._score(change, np.concatenate(own) if own else None)
+        return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped)
+
+    def _part(self, hypothesis: Hypothesis) -> "_Part":
+        """Its patterns that fitted readings see."""
+        key = id(hypothesis)
+        if key not in self._parts:
+            flat = hypothesis.patterns.reshape(len(hypothesis.patterns), -1)
+            if hypothesis.own:
+                flat = _by_column(hypothesis.patterns)
+            elif np.count_nonzero(flat) < SPARSE * flat.size:
+                flat = csr_array(flat)
+            flat = flat[np.flatnonzero(abs(flat) @ self.weight.ravel() > 0)]
+            self._parts[key] = _Part(hypothesis, flat, self.spread.T @ self.across(flat))
+        return self._parts[key]
 
     def _score(self, change: Array, own: Array | None) -> tuple[float, float]:
         run = self.run
@@ -237,15 +304,31 @@ class Fitted:
         return rms_of(inside), rms_of(jumped)
 
 
-def _by_column(patterns: Array) -> Array:
-    """One parameter for each column that a pattern is not zero in."""
-    rows = []
-    for pattern in patterns:
-        for c in np.flatnonzero(np.abs(pattern).max(axis=1) > 0):
-            row = np.zeros_like(pattern)
-            row[c] = pattern[c]
-            rows.append(row)
-    return np.array(rows)
+@dataclass(frozen=True)
+class _Part:
+    """A hypothesis as rows of readings, and what they share with the fit."""
+
+    hypothesis: Hypothesis
+    flat: Patterns  # [pattern, reading]
+    across: Array
+
+
+def _scaled(flat: Patterns, by: Array) -> Patterns:
+    """Every reading times a number of its own."""
+    return csr_array(flat.multiply(by)) if isinstance(flat, csr_array) else flat * by
+
+
+def _dense(values: Patterns) -> Array:
+    return values.toarray() if isinstance(values, csr_array) else np.asarray(values)
+
+
+def _by_column(patterns: Array) -> csr_array:
+    """One parameter for each column that a pattern is not zero in, [parameter, reading]."""
+    count, columns, monitors = patterns.shape
+    rows = np.repeat(np.arange(count * columns), monitors)
+    at = np.tile(np.arange(columns * monitors), count)
+    whole = csr_array((patterns.ravel(), (rows, at)), shape=(count * columns, columns * monitors))
+    return whole[np.flatnonzero(abs(patterns).max(axis=2).ravel() > 0)]
 
 
 # --- the hypotheses -------------------------------------------------------------------------------
@@ -265,7 +348,7 @@ def _orders(run: ResponseRun) -> tuple[Array, Array]:
     up, down = (
         np.concatenate([
             model.closed_orbits(run.m.correctors, side * kicks),
-            ResponseModel(model.ring, frequency=side * f).readings[None],
+            model.at_frequency(side * f).readings[None],
         ])[:, run.at]
         for side in (1, -1)
     )  # fmt: skip
@@ -282,10 +365,11 @@ def _one_sided(run: ResponseRun) -> Hypothesis:
 
 
 def _third_order(run: ResponseRun) -> Hypothesis:
+    third = _orders(run)[1]
+    third[-1] = 0  # the model has the RF's
     return Hypothesis(
-        "third order of two-sided steps", "share", "1", _readings(run, _orders(run)[1])[None] / 4,
-        most=2.0,
-    )  # fmt: skip
+        "third order of two-sided steps", "share", "1", _readings(run, third)[None] / 4, most=2.0
+    )
 
 
 def _corrector_energy(run: ResponseRun) -> Hypothesis:
@@ -334,11 +418,11 @@ def _tune_drift(run: ResponseRun) -> Hypothesis:
 def _energy_spread(run: ResponseRun) -> Hypothesis | None:
     if "energy_spread" in run.allowed:
         return None  # it is in the fit
-    ring, kicks = run.model.ring, run.kicks[:-1, None, None]
+    kicks = run.kicks[:-1, None, None]
     per_step = run.model.rf_start[5]
     f = DELTA / per_step
     up, down = (
-        ResponseModel(ring, frequency=side * f).response(run.m.correctors)[:, run.at] * kicks
+        run.model.at_frequency(side * f).response(run.m.correctors)[:, run.at] * kicks
         for side in (1, -1)
     )
     curved = np.zeros_like(run.beam)
@@ -350,9 +434,8 @@ def _energy_spread(run: ResponseRun) -> Hypothesis | None:
 
 def _energy_offset(run: ResponseRun) -> Hypothesis:
     """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
-    ring = run.model.ring
     f = DELTA / run.model.rf_start[5]
-    up, down = (run.orbits(ResponseModel(ring, frequency=side * f)) for side in (1, -1))
+    up, down = (run.orbits(run.model.at_frequency(side * f)) for side in (1, -1))
     scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
     slope = _readings(run, (up - down) / 2 * scale)
     return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
@@ -419,10 +502,7 @@ def _bend_gradient(run: ResponseRun) -> Hypothesis:
             if round(ring.elements[i].length, 3) == kind
         }
         model = ResponseModel(ring.with_elements(changed))
-        response = np.concatenate(
-            [model.response(run.m.correctors), model.rf_response()[None]]
-        )[:, run.at]  # fmt: skip
-        slope = (response * run.kicks[:, None, None] - run.orbits(run.model)) / BEND_GRADIENT
+        slope = (run.orbits(model) - run.orbits(run.model)) / BEND_GRADIENT
         scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
         rows.append(_readings(run, slope * scale))
     return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
@@ -432,9 +512,7 @@ def _second_order_coupling(run: ResponseRun) -> Hypothesis | None:
     if not run.state.skew.any():
         return None
     causes = [c for c in run.ring_causes() if c.effect != "skew_gradient"]
-    model = ResponseModel(apply(run.ring, causes))
-    plain = np.concatenate([model.response(run.m.correctors), model.rf_response()[None]])
-    change = run.orbits(run.model) - plain[:, run.at] * run.kicks[:, None, None]
+    change = run.orbits(run.model) - run.orbits(ResponseModel(apply(run.ring, causes)))
     return Hypothesis(
         "coupling to second order", "beyond the model's", "0; -1: none",
         _readings(run, change)[None], most=1.1,

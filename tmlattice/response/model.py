@@ -11,6 +11,7 @@ energy's: without losses it is conserved, and what is lost is given back at the 
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -69,7 +70,7 @@ class ResponseModel:
             closed; six coordinates.
 
     Attributes:
-        ring, layers, maps: what it was made from.
+        ring, layers, maps, frequency: what it was made from.
         state: the closed orbit at the start of the ring, [n].
         path: at the start, at the layers' exits and at the end of the ring, [layer + 2, n].
         tangents: matrices from the start to there, [layer + 2, n, n].
@@ -87,13 +88,30 @@ class ResponseModel:
     maps: RingMaps
 
     def __init__(self, ring: Ring, dimension: int = 6, frequency: float = 0.0) -> None:
-        if frequency and dimension != 6:
-            raise ValueError("the RF moves the energy, which four coordinates do not have")
         self.ring = ring
         self.layers = LayerMaps(_without_rf(ring), dimension)
         self.maps = ring_maps(self.layers.ring, dimension, self.layers)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
         self._network = TaylorNetwork(self.maps)
+        self._close(frequency)
+
+    def at_frequency(self, frequency: float) -> "ResponseModel":
+        """The same ring, its maps not made again, at another RF frequency (relative change).
+
+        Raises:
+            UnstableRingError: no closed orbit.
+        """
+        other = copy(self)
+        for name in ("closing", "rf_start"):  # cached for this orbit
+            other.__dict__.pop(name, None)
+        other._close(frequency)
+        return other
+
+    def _close(self, frequency: float) -> None:
+        dimension = self.dimension
+        if frequency and dimension != 6:
+            raise ValueError("the RF moves the energy, which four coordinates do not have")
+        self.frequency = frequency
         self._turn = np.zeros(len(self.free))
         if dimension == 6:
             self._turn[4] = self.slip * frequency / (1 + frequency)
@@ -240,6 +258,16 @@ class ResponseModel:
     def rf_response(self) -> Array:
         """d (closed orbit) / d (relative RF frequency), m, [monitor, 2]."""
         return np.asarray(self.reading_slopes @ self.rf_start)
+
+    def rf_change(self, step: float) -> Array:
+        """The closed orbit's change for a relative step of the RF frequency, from half a step below
+        to half a step above, not linearised, m, [monitor, 2].
+
+        Raises:
+            UnstableRingError: no closed orbit within reach.
+        """
+        up, down = (self.at_frequency(self.frequency + side * step / 2) for side in (1, -1))
+        return up.readings - down.readings
 
     def _kick(self, place: int, layer: int) -> tuple[Array, Array]:
         """The corrector's kick at its layer's exit, and how it depends on the state there."""
