@@ -511,6 +511,7 @@ def explain(
     rate: float = FALSE_ALARM,
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
+    names_first: bool = False,
 ) -> Explanation:
     """Search for the causes of what the launches leave unexplained.
 
@@ -523,9 +524,11 @@ def explain(
         rate: of false alarms on a data set of pure noise, all kinds together.
         seed: of the threshold's simulation.
         progress: told what was found.
+        names_first: what has a name goes before a free kick. Else that is tried where a free kick
+            took what a name nearly explains, and the evidence decides.
     """
     arguments = (rate, seed, remake, progress)
-    search = _Search(problem, hypotheses, most, *arguments)
+    search = _Search(problem, hypotheses, most, *arguments, names_first=names_first)
     found = search.run(before)
     if not (search.passed_over and found.kicks):
         return found

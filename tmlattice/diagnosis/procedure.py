@@ -41,6 +41,8 @@ SILENT_SHARE = 0.2
 
 ALIEN = 0.35
 """A local misfit above this share of the orbit: the data are of another ring."""
+RETAKEN = 2
+"""How often small errors are taken again along the orbit of a strong fault, at most."""
 
 
 def diagnose(
@@ -120,7 +122,7 @@ def diagnose(
     small: SmallErrors | None = None
     fitted = data
 
-    def search() -> Explanation:
+    def search(most: int = max_effects, *, names_first: bool = False) -> Explanation:
         def problem_without(dropped: NDArray[np.bool_]) -> Problem:
             if small is not None and not dropped.any():
                 return Problem(model, fitted, small.whitening, places)
@@ -137,26 +139,34 @@ def diagnose(
             hypotheses,
             before,
             problem_without,
-            most=max_effects,
+            most=most,
             rate=false_alarm,
             seed=seed,
             progress=progress,
+            names_first=names_first,
         )
 
     if rms:
         progress("background")
         small = small_errors(ring, data, known, rms, before.launches)
         model, fitted, before = small.model, small.data, small.before
-    explanation = search()
-    if small is not None and _misled(small, explanation):
-        progress("background with what was found")
-        found = explanation.fit
-        errors = small.estimate(found, explanation.problem.whitening)
-        clear = [named.detection.statistic for named in explanation.named]
-        strongest = found.causes[int(np.argmax(clear))]  # the others may be the background's
-        small = small_errors(ring, data, known, rms, found.launches, [strongest], errors)
-        model, fitted, before = small.model, small.data, small.before
+    if small is None:
         explanation = search()
+    else:  # two findings say already whether the small errors have to be taken again
+        explanation = search(min(2, max_effects), names_first=True)
+        for _ in range(RETAKEN):
+            if not _misled(explanation):
+                break
+            progress("background with what was found")
+            found = explanation.fit
+            errors = small.estimate(found, explanation.problem.whitening)
+            clear = [named.detection.statistic for named in explanation.named]
+            strongest = found.causes[int(np.argmax(clear))]  # the others may be the background's
+            small = small_errors(ring, data, known, rms, found.launches, [strongest], errors)
+            model, fitted, before = small.model, small.data, small.before
+            explanation = search(min(2, max_effects), names_first=True)
+        if explanation.full and max_effects > 1:
+            explanation = search()
     progress("report")
     result = explanation.fit
     causes = result.causes
@@ -312,7 +322,7 @@ def _check_lattice(ring: Ring, data: Data, start: Fit) -> None:
         )
 
 
-def _misled(small: SmallErrors, explanation: Explanation) -> bool:
+def _misled(explanation: Explanation) -> bool:
     """Whether a fault is so strong that small errors along its orbit look like further faults."""
     if not explanation.fit.causes:
         return False

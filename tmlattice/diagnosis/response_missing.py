@@ -352,7 +352,9 @@ def _orders(run: ResponseRun) -> tuple[Array, Array]:
         ])[:, run.at]
         for side in (1, -1)
     )  # fmt: skip
-    linear = run.orbits(model) * np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
+    linear = (run.orbits(model) - run.bent) * np.append(1 + run.state.calibration[:-1], 1)[
+        :, None, None
+    ]
     return (up + down) / 2 - model.readings[run.at], (up - down) / 2 - linear
 
 
@@ -366,10 +368,11 @@ def _one_sided(run: ResponseRun) -> Hypothesis:
 
 def _third_order(run: ResponseRun) -> Hypothesis:
     third = _orders(run)[1]
-    third[-1] = 0  # the model has the RF's
+    third[-1] = 0
     return Hypothesis(
-        "third order of two-sided steps", "share", "1", _readings(run, third)[None] / 4, most=2.0
-    )
+        "third order of two-sided steps", "beyond the model's", "0; -1: none",
+        _readings(run, third)[None] / 4, most=2.0,
+    )  # fmt: skip
 
 
 def _corrector_energy(run: ResponseRun) -> Hypothesis:
