@@ -15,12 +15,15 @@ from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.response import ResponseRun, diagnose_response
 from tmlattice.diagnosis.response_missing import weigh
 from tmlattice.diagnosis.response_report import response_text
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
 from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
+from tmlattice.network import TaylorNetwork
+from tmlattice.optics import twiss
+from tmlattice.response import ResponseModel
 from tmlattice.response.calibration import calibrated_response, read_calibration
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
@@ -121,6 +124,104 @@ def test_no_hypothesis_is_wanted_where_nothing_is_missing(small_ring, measured):
     assert len(rows) == 3
     assert all(row.judgement == "excluded" for row in rows)
     assert abs(rows[0].amount) < 4 * rows[0].amount_sigma  # the simulated steps are two-sided
+
+
+# --- effects that the fit does not have: made without its patterns, withheld, named ---
+STEP = 1e-4
+
+
+def drifting(ring, rng):
+    """Between the readings of every step something kicks the beam: another place each time."""
+    model = ResponseModel(ring)
+    names = model.correctors
+    kicks = np.full(len(names), STEP / 2)
+    up, down = (model.closed_orbits(names, side * kicks) for side in (1, -1))
+    place = rng.permutation(len(names))
+    wind = model.closed_orbits([names[i] for i in place], rng.normal(0, 2e-8, len(names)))
+    return up - down + wind - model.readings
+
+
+def off_energy(ring, rng):
+    """The magnets are set for another energy."""
+    model = ResponseModel(ring, frequency=5e-5 / ResponseModel(ring).rf_start[5])
+    kicks = np.full(len(model.correctors), STEP / 2)
+    up, down = (model.closed_orbits(model.correctors, side * kicks) for side in (1, -1))
+    return up - down
+
+
+def cubic(ring, rng):
+    """A monitor reads x + x^3 times 8e-4 / mm^2."""
+    model = ResponseModel(ring)
+    kicks = np.full(len(model.correctors), STEP / 2)
+    up, down = (model.closed_orbits(model.correctors, side * kicks) for side in (1, -1))
+    return (up + 8e2 * up**3) - (down + 8e2 * down**3)
+
+
+@pytest.mark.parametrize(
+    ("made", "effect"),
+    [
+        (drifting, "drift of the orbit (betatron waves)"),
+        (off_energy, "energy offset of the beam"),
+        (cubic, "nonlinear monitors (cubic)"),
+    ],
+)
+def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
+    measured = simulate_response(
+        small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
+    ).measured
+    response = made(small_ring, rng) + rng.normal(0, 1e-9, measured.response.shape)
+    run = ResponseRun(small_ring, replace(measured, response=response), seed=1)
+    run.run()
+    rows = {row.effect: row for row in weigh(run)}
+    assert rows[effect].judgement == "helps"
+    assert rows[effect] == min(rows.values(), key=lambda row: row.heldout_rms_in_plane)
+    expected = {"energy offset of the beam": 0.05, "nonlinear monitors (cubic)": 8e-4}
+    if effect in expected:
+        assert rows[effect].amount == pytest.approx(expected[effect], rel=0.15)
+    together = rows["none"].on_top_in_plane
+    assert together < 0.98 * rows["none"].heldout_rms_in_plane
+
+
+def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
+    measured = simulate_response(
+        small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4,
+        one_sided=True,
+    ).measured  # fmt: skip
+    run = ResponseRun(small_ring, measured, seed=1)
+    run.run()
+    row = weigh(run, ["one_sided_steps"])[1]
+    assert row.amount_sigma < 0.01
+    assert abs(row.amount - 1) < 4 * row.amount_sigma  # two-sided ones: 0
+
+
+def test_the_errors_of_a_known_machine_are_those_stated(small_ring):
+    """Finite steps of correctors and RF; gradients, gains, calibrations: pulls, beta beat."""
+    background = {
+        "quadrupole_gradient": 2e-3, "monitor_gain_x": 1e-2, "monitor_gain_y": 1e-2,
+        "corrector_calibration": 2e-2,
+    }  # fmt: skip
+    measured = simulate_response(
+        small_ring, background=background, kick=1e-4, noise=1e-7, engine="ocelot", seed=5,
+        progress=False,
+    ).measured  # fmt: skip
+    found = diagnose_response(small_ring, measured, seed=1)
+    drawn = draw_background(small_ring, background, 5)
+    true = {(cause.effect, cause.element): cause.amount for cause in drawn}
+    held = {n for n, out in zip(measured.correctors, found.held, strict=False) if out}
+    pulls = {}
+    for cause, sigma in zip(found.causes, found.errors, strict=True):
+        if (cause.effect, cause.element) in true and cause.element not in held:
+            miss = cause.amount - true[cause.effect, cause.element]
+            pulls.setdefault(cause.effect, []).append(miss / sigma)
+    assert set(pulls) == set(background)
+    size = {effect: np.sqrt(np.mean(np.square(own))) for effect, own in pulls.items()}
+    assert max(size.values()) < 1.5
+    assert size["quadrupole_gradient"] > 0.5  # of gains the common scale is the largest error
+    sick = apply(small_ring, [c for c in drawn if c.effect == "quadrupole_gradient"])
+    beta, expected, design = (
+        twiss(TaylorNetwork.from_ring(ring)).beta for ring in (found.repaired, sick, small_ring)
+    )
+    assert np.std(beta / expected - 1) < 0.1 * np.std(design / expected - 1)
 
 
 def test_report_and_json(result):

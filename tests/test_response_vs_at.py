@@ -192,3 +192,19 @@ def test_design_vs_measured_petra3():
     assert_allclose(np.sqrt(np.nanmean(difference**2)), 160.8e-6, rtol=1e-3)
     rf = measured.rf.orbit - design.rf.orbit
     assert np.sqrt(np.nanmean(rf**2)) < 0.15 * np.sqrt(np.nanmean(measured.rf.orbit**2))
+
+
+def test_the_rf_s_finite_step_in_maps_already_made(small_ring):
+    model = ResponseModel(small_ring)
+    step = 2e-3 / model.rf_start[5]
+    whole = [ResponseModel(small_ring, frequency=f) for f in (-step / 2, step / 2)]
+    assert_allclose(model.rf_change(step), whole[1].readings - whole[0].readings, atol=1e-15)
+    there = model.at_frequency(step)
+    assert_allclose(there.response(), ResponseModel(small_ring, frequency=step).response(),
+                    rtol=1e-12, atol=1e-12)  # fmt: skip
+    # and from there: the change goes on where the model stands
+    assert_allclose(
+        there.rf_change(step),
+        ResponseModel(small_ring, frequency=1.5 * step).readings - whole[1].readings, atol=1e-15,
+    )  # fmt: skip
+    assert np.abs(model.rf_change(step) - model.rf_response() * step).max() > 1e-8

@@ -47,6 +47,8 @@ LayerParts = tuple[Weights, list[Weights]]
 MADE = 10_000
 """Changed layers that a model remembers: some 20 MB."""
 
+KEPT = 4
+"""Models with something known that are kept with a ring."""
 FEW = 10
 """Known causes of which a model is worth keeping."""
 
@@ -99,6 +101,9 @@ def _base(ring: Ring, known: tuple[Cause, ...], dimension: int) -> _Base:
     layers = LayerMaps(with_known, dimension)
     maps = ring_maps(with_known, dimension, layers)
     if len(known) < FEW:
+        others = [k for k in ring.memory if k[0] == "model" and k[1]]
+        if len(others) >= KEPT:  # a study that tells each case something would fill the memory
+            del ring.memory[others[0]]
         ring.memory[key] = _Base(with_known, layers, maps, {})
         return _base(ring, known, dimension)
     # small errors everywhere turn a hypothesis's direction by as little as they are large

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.diagnosis.response import ResponseRun, families, rms_of
@@ -40,6 +41,8 @@ FREE = 30.0
 """Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
 FEW = 6
 """So many amounts stand alone."""
+WAVES = 4
+"""Of the leading closed orbits of random kicks in a plane."""
 SPARSE = 0.1
 """Patterns are kept sparse where fewer of their readings are not zero."""
 
@@ -76,8 +79,9 @@ class Weighed:
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
         on_top_in_plane, on_top_position: with it and all others that are wanted together, m.
-        judgement: "helps", "excluded" (held-out readings do not want it), "unphysical"; "helps, not
-            on top" where others that help leave nothing for it.
+        judgement: "helps", on top of all that help more; "helps, not on top", where those leave it
+            nothing; "unphysical" (it would help, by more than physics allows); "excluded"
+            (held-out readings do not want it).
     """
 
     effect: str
@@ -108,8 +112,8 @@ def weigh(
 ) -> list[Weighed]:
     """Every hypothesis alone and on top of the others; the first row is the fit without any.
 
-    Those that help are taken together, the best first, as long as each lowers the held-out rms
-    on top of those before it; then every hypothesis is weighed once more beside them.
+    Those that physics allows are taken together, the best first, as long as each lowers the
+    held-out rms on top of those before it; then every other is weighed once more beside them.
 
     Args:
         run: after its fit.
@@ -118,50 +122,75 @@ def weigh(
     """
     fitted = Fitted(run)
     base = fitted.weigh([])
-    rows: list[tuple[Hypothesis, Answer, str]] = []
+    found: list[Hypothesis] = []
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
-        found = HYPOTHESES[name](run)
+        hypothesis = HYPOTHESES[name](run)
         # nothing where the ring has no such places, or no reading would move
-        if found is not None and found.patterns.any():
-            answer = fitted.weigh([found])
-            rows.append((found, answer, _judgement(found, answer, base)))
+        if hypothesis is not None and hypothesis.patterns.any():
+            found.append(hypothesis)
+    alone = [fitted.weigh([hypothesis]) for hypothesis in found]
     progress("hypotheses together")
-    helpers = [hypothesis for hypothesis, _, judgement in rows if judgement == "helps"]
-    together, chosen = base, list[Hypothesis]()
-    while helpers:
-        answers = [fitted.weigh([*chosen, one]) for one in helpers]
-        best = int(np.argmin([answer.in_plane for answer in answers]))
-        if answers[best].in_plane > HELPS * together.in_plane:
-            break
-        together = answers[best]
-        chosen.append(helpers.pop(best))
+    together, chosen = base, list[int]()
+
+    def take(candidates: list[int]) -> None:
+        """The best of them, as long as it helps on top of those that were taken."""
+        nonlocal together
+        left = list(candidates)
+        while left:
+            beside = [found[k] for k in chosen]
+            answers = {i: fitted.weigh([*beside, found[i]]) for i in left}
+            left = [i for i in left if _helps(found[i], answers[i], together)]
+            if left:
+                best = min(left, key=lambda i, said=answers: said[i].in_plane)  # type: ignore[misc]
+                together = answers[best]
+                chosen.append(best)
+                left.remove(best)
+
+    helpers = [i for i, answer in enumerate(alone) if _helps(found[i], answer, base)]
+    take(helpers)
+    first = [found[k] for k in chosen]
+    on_top = {
+        i: fitted.weigh([*first, hypothesis])
+        for i, hypothesis in enumerate(found)
+        if i not in chosen
+    }
+    before = together
+    take([i for i, answer in on_top.items() if _helps(found[i], answer, before)])
     out = [Weighed("none", "", "", 0, 0.0, 0.0, *base[2:], *together[2:], "")]
-    for hypothesis, answer, judgement in rows:
-        on_top = together
-        if not any(one is hypothesis for one in chosen):
-            on_top = fitted.weigh([*chosen, hypothesis])
-            if judgement == "helps":
-                judgement = "helps, not on top"  # noqa: PLW2901
-        amounts, sigma, in_plane, position = answer
+    for i, hypothesis in enumerate(found):
+        beside = together if i in chosen else on_top[i]
+        if i in chosen:
+            judgement = "helps"
+        elif i in helpers:
+            judgement = "helps, not on top"
+        elif min(
+            alone[i].in_plane / base.in_plane, beside.in_plane / before.in_plane
+        ) < HELPS and not _sensible(hypothesis, beside):
+            judgement = "unphysical"
+        else:
+            judgement = "excluded"
+        amounts, sigma, in_plane, position = alone[i]
         out.append(
             Weighed(
                 hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
-                _size(amounts), float(np.median(sigma)), in_plane, position, on_top.in_plane,
-                on_top.position, judgement,
+                _size(amounts), float(np.median(sigma)), in_plane, position, beside.in_plane,
+                beside.position, judgement,
             )
         )  # fmt: skip
     return out
+
+
+def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
+    return answer.in_plane < HELPS * before.in_plane and _sensible(hypothesis, answer)
 
 
 def _size(amounts: Array) -> float:
     return float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
 
 
-def _judgement(hypothesis: Hypothesis, answer: "Answer", base: "Answer") -> str:
-    if answer.in_plane > HELPS * base.in_plane:
-        return "excluded"
-    return "helps" if abs(_size(answer.amounts)) <= hypothesis.most else "unphysical"
+def _sensible(hypothesis: Hypothesis, answer: "Answer") -> bool:
+    return abs(_size(answer.amounts)) < hypothesis.most
 
 
 class Answer(NamedTuple):
@@ -181,10 +210,11 @@ class Fitted:
         normal, self.start, _ = run.linear(0)
         groups = run.priors(0)
         self.slopes = np.asarray(run.slopes).reshape(-1, *run.data.shape[:2])
-        basis = np.concatenate([g.basis for g in groups], axis=1)
-        prior = np.concatenate(
-            [np.full(g.basis.shape[1], g.rms) if g.each is None else g.each for g in groups]
-        )
+        # one that does nothing stands there where no family of errors was kept
+        basis = np.zeros((len(self.start), 1))
+        basis = np.concatenate([basis, *(g.basis for g in groups)], axis=1)
+        scales = [np.full(g.basis.shape[1], g.rms) if g.each is None else g.each for g in groups]
+        prior = np.concatenate([np.ones(1), *scales])
         self.spread = basis * prior
         A = self.spread.T @ normal.matrix @ self.spread
         self.factor = cho_factor(A + np.eye(len(A)), lower=True)
@@ -225,7 +255,7 @@ class Fitted:
     def across(self, flat: Patterns) -> Array:
         """J^T W H, [base parameter, pattern], of patterns [pattern, reading]."""
         weighted = _scaled(flat, self.weight.ravel())
-        ring = self.slopes.reshape(len(self.slopes), -1).T
+        ring = self.slopes.reshape(len(self.slopes), self.weight.size).T
         own = _dense(weighted @ self.own)
         return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
 
@@ -254,9 +284,10 @@ class Fitted:
                 for one, m in zip(hypotheses, many, strict=True)]  # fmt: skip
         spread = np.array(most)[owner]
         for _ in range(12 if any(many) else 1):
-            inverse = np.linalg.inv(C * np.outer(spread, spread) + np.eye(len(C)))
-            amounts = spread * (inverse @ (spread * r))
-            variance = np.diag(inverse) * spread**2
+            # in units of the priors, so that the matrix is well scaled
+            root = cho_factor(C * np.outer(spread, spread) + np.eye(len(C)), lower=True)
+            amounts = spread * cho_solve(root, spread * r)
+            variance = np.diag(dpotri(root[0], lower=1)[0]) * spread**2
             for i in (i for i, m in enumerate(many) if m):
                 mine = owner == i
                 scale = float(np.sqrt(np.mean(amounts[mine] ** 2 + variance[mine])))
@@ -407,6 +438,21 @@ def _energy_drift(run: ResponseRun) -> Hypothesis:
     )
 
 
+def _orbit_drift(run: ResponseRun) -> Hypothesis:
+    """The orbit moves between the readings of a step: whatever kicks it, in each column anew."""
+    orbits = _readings(run, run.orbits(run.model))
+    waves = np.zeros((WAVES, *orbits.shape))
+    for p in (0, 1):
+        mine = run.plane == p
+        mine[-1] = False
+        per_kick = np.nan_to_num(orbits[mine]) / run.kicks[mine, None]
+        found = np.linalg.svd(per_kick, full_matrices=False)[2][:WAVES]
+        waves[: len(found), mine] = found[:, None] * np.sqrt(found.shape[1])
+    return Hypothesis(
+        "drift of the orbit (betatron waves)", "m", "< 1e-5", waves, own=True, most=1e-5
+    )
+
+
 def _tune_drift(run: ResponseRun) -> Hypothesis:
     total = np.zeros((2, len(run.plane), len(run.at)))
     focusing = [int(run.ring[name].k1 < 0) for name in run.quadrupoles]
@@ -526,6 +572,7 @@ HYPOTHESES: dict[str, Callable[[ResponseRun], Hypothesis | None]] = {
     "one_sided_steps": _one_sided,
     "third_order": _third_order,
     "energy_drift": _energy_drift,
+    "orbit_drift": _orbit_drift,
     "gradient_drift": _tune_drift,
     "corrector_energy": _corrector_energy,
     "corrector_position_family": lambda run: _position(run, True),
