@@ -544,8 +544,8 @@ class ResponseRun:
     # --- the judges -------------------------------------------------------------------------------
     def score(
         self, judges: Flags, half: Flags, rf: Flags | None = None
-    ) -> tuple[float, float, float, float, float]:
-        """In-plane and coupling rms, chi2, dispersion rms, in-plane rms with a position jump.
+    ) -> tuple[float, float, float, float, float, float]:
+        """In-plane and coupling rms, chi2, dispersion rms, in-plane with jumps, coupling with rolls.
 
         Args:
             judges: the correctors that judge, [column].
@@ -558,8 +558,9 @@ class ResponseRun:
         straight, across = pick(read, own), pick(read, other)
         data, data_across = pick(self.data, own), pick(self.data, other)
         jumps = pick(np.einsum("mij,cmj->cmi", gains, self.jumps()), own)
+        rolls = pick(np.einsum("mij,cmj->cmi", gains, self.across), other)
         variance = self.noise[:, own].T ** 2
-        inside, jumped, outside, squares = [], [], [], []
+        inside, jumped, outside, rolled, squares = [], [], [], [], []
         for c in np.flatnonzero(judges):
             seen = np.isfinite(data[c]) & self.good
             near, far = seen & half[c], seen & ~half[c]
@@ -568,9 +569,11 @@ class ResponseRun:
             inside.append(miss)
             squares.append(miss**2 / variance[c, far])
             jumped.append(_fitted(np.stack([straight[c], jumps[c]], 1), data[c], near, far)[1])
-            outside.append(
-                (data_across[c] - kick[0] * across[c])[far & np.isfinite(data_across[c])]
-            )
+            left = data_across[c] - kick[0] * across[c]
+            there = np.isfinite(left)
+            outside.append(left[far & there])
+            if rolls[c].any():
+                rolled.append(_fitted(rolls[c][:, None], left, near & there, far & there)[1])
         judge = self.good & np.isfinite(data[-1]) & (~half[-1] if rf is None else rf)
         left = (data[-1] - straight[-1])[judge]
         return (
@@ -579,6 +582,7 @@ class ResponseRun:
             float(np.mean(np.concatenate(squares))),
             rms_of([left]),
             rms_of(jumped),
+            rms_of(rolled) if rolled else float("nan"),
         )
 
     def jumps(self) -> Array:

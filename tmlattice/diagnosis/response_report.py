@@ -39,6 +39,7 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
             f"{1e6 * step.heldout_rms_in_plane:.3g}",
             f"{1e6 * step.heldout_rms_position:.3g}",
             f"{1e6 * step.heldout_rms_coupling:.3g}",
+            f"{1e6 * step.heldout_rms_roll:.3g}" if np.isfinite(step.heldout_rms_roll) else "",
             f"{1e6 * step.dispersion_rms:.3g}",
             f"{step.heldout_chi2_per_dof:.3g}",
         )
@@ -46,10 +47,12 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
     ]
 
 
-HEAD = ("step", "parameters", "in-plane", "with jump", "coupling", "RF", "chi2")
+HEAD = ("step", "parameters", "in-plane", "with jump", "coupling", "with roll", "RF", "chi2")
 
 
-HYPOTHESIS = ("hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "so")
+HYPOTHESIS = (
+    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "so",
+)  # fmt: skip
 
 
 def hypothesis_rows(result: ResponseDiagnosis) -> list[tuple[str, ...]]:
@@ -63,6 +66,7 @@ def hypothesis_rows(result: ResponseDiagnosis) -> list[tuple[str, ...]]:
             row.expected,
             f"{1e6 * row.heldout_rms_in_plane:.2f}",
             f"{1e6 * row.heldout_rms_position:.2f}",
+            f"{1e6 * row.on_top_in_plane:.2f}",
             row.judgement,
         )
         for row in result.hypotheses or ()
@@ -106,7 +110,10 @@ def response_text(result: ResponseDiagnosis, width: int = WIDTH) -> str:
         lines += _wrapped("; ".join(largest(result, effect)), width, "   ")
     lines += ["", *_wrapped(left_sentence(result), width)]
     if result.hypotheses:
-        lines += ["", "What may be missing, each on top of the result, held-out rms in µm:"]
+        lines += [
+            "",
+            "What may be missing: held-out rms in µm, each alone, and on top of those that help:",
+        ]
         lines += _columns([HYPOTHESIS, *hypothesis_rows(result)])
     for said in result.degenerate:
         lines += _wrapped(f"Not settled by the data: {said}.", width)

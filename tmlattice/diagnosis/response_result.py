@@ -35,6 +35,8 @@ class Step:
         parameters: how many it has.
         heldout_rms_in_plane, heldout_rms_coupling: m, over held-out correctors.
         heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
+        heldout_rms_roll: coupling, with the roll of each held-out corrector from the monitors that
+            gave its kick, m; NaN before rolls are fitted.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
         dispersion_rms: of the RF's orbit in x on the half of the monitors not fitted, m.
         kept: whether it helped those who choose; the figures of one that was not are its own.
@@ -47,6 +49,7 @@ class Step:
     heldout_chi2_per_dof: float
     dispersion_rms: float
     heldout_rms_position: float = float("nan")
+    heldout_rms_roll: float = float("nan")
     kept: bool = True
 
     def as_json(self) -> dict[str, Any]:
