@@ -545,7 +545,7 @@ class ResponseRun:
     def score(
         self, judges: Flags, half: Flags, rf: Flags | None = None
     ) -> tuple[float, float, float, float, float, float]:
-        """In-plane and coupling rms, chi2, dispersion rms, in-plane with jumps, coupling with rolls.
+        """In-plane and coupling rms, chi2, dispersion rms, in-plane with jumps, coupling with roll.
 
         Args:
             judges: the correctors that judge, [column].
