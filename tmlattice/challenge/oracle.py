@@ -168,7 +168,9 @@ def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
     case, truth = argument
     causes = truth.causes
     if len(causes) > 1:
-        told = [tuple(c for c in causes if c is not cause) for cause in causes]
+        # a monitor without a signal is known to everybody
+        asked = [cause for cause in causes if cause.effect != "monitor_dead"]
+        told = [tuple(c for c in causes if c is not cause) for cause in asked]
         return {
             "oracles": [_said(Oracle(case, truth, others), case) for others in told],
             "residual": None,
