@@ -261,8 +261,10 @@ class Fitted:
 
     def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
         """What held-out readings say of these hypotheses together."""
-        if not hypotheses:
-            return Answer(np.zeros(0), np.zeros(0), *self._score(np.zeros(0), None))
+        if not hypotheses:  # the same linear step as with one: the fit itself may still move
+            moved = cho_solve(self.factor, self.vector)
+            in_plane, position = self._score(self.change(self.spread @ moved - self.start), None)
+            return Answer(np.zeros(0), np.zeros(0), in_plane, position)
         parts = [self._part(hypothesis) for hypothesis in hypotheses]
         edge = np.cumsum([0, *(part.across.shape[1] for part in parts)])
         B = np.concatenate([part.across for part in parts], axis=1)
@@ -317,7 +319,7 @@ class Fitted:
 
     def _score(self, change: Array, own: Array | None) -> tuple[float, float]:
         run = self.run
-        read = self.read + change if len(change) else self.read
+        read = self.read + change
         data = pick(run.data, run.plane)
         jumps = pick(np.einsum("mij,cmj->cmi", run.state.monitors, run.jumps()), run.plane)
         inside: list[Array] = []
