@@ -157,9 +157,24 @@ def cubic(ring, rng):
     return (up + 8e2 * up**3) - (down + 8e2 * down**3)
 
 
+def wandering_gradients(ring, rng):
+    """While each corrector is stepped all focusing, and all defocusing, gradients are elsewhere."""
+    focusing, defocusing = (
+        [e.name for e in ring.elements if e.kind == "quadrupole" and sign * e.k1 > 0]
+        for sign in (1, -1)
+    )
+    rows = []
+    for name in ResponseModel(ring).correctors:
+        both = zip((focusing, defocusing), rng.normal(0, 5e-5, 2), strict=True)
+        causes = [Cause("quadrupole_gradient", q, a) for names, a in both for q in names]
+        rows.append(ResponseModel(apply(ring, causes)).response([name])[0] * STEP)
+    return np.array(rows)
+
+
 @pytest.mark.parametrize(
     ("made", "effect"),
     [
+        (wandering_gradients, "drift of the gradients (focusing, defocusing)"),
         (drifting, "drift of the orbit (betatron waves)"),
         (off_energy, "energy offset of the beam"),
         (cubic, "nonlinear monitors (cubic)"),
@@ -180,6 +195,20 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
         assert rows[effect].amount == pytest.approx(expected[effect], rel=0.15)
     together = rows["none"].on_top_in_plane
     assert together < 0.98 * rows["none"].heldout_rms_in_plane
+
+
+def test_a_wiggler_that_focuses_is_named(small_ring):
+    (wiggler,) = (e.name for e in small_ring.elements if e.kind == "wiggler")
+    measured = simulate_response(
+        small_ring, [Cause("insertion_device_focusing", wiggler, 2e-4)], kick=STEP, noise=1e-9,
+        engine="ocelot", progress=False, seed=4,
+    ).measured  # fmt: skip
+    run = ResponseRun(small_ring, measured, seed=1)
+    run.run()
+    rows = weigh(run)
+    best = min(rows, key=lambda row: row.heldout_rms_in_plane)
+    assert (best.effect, best.judgement) == ("gradients of damping wigglers", "helps")
+    assert best.amount == pytest.approx(2e-4, abs=3 * best.amount_sigma)
 
 
 def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
