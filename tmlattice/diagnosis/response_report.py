@@ -64,9 +64,9 @@ def hypothesis_rows(result: ResponseDiagnosis) -> list[tuple[str, ...]]:
             f"{row.amount:.2g} ± {row.amount_sigma:.1g}" if row.parameters else "",
             row.unit,
             row.expected,
-            f"{1e6 * row.heldout_rms_in_plane:.2f}",
-            f"{1e6 * row.heldout_rms_position:.2f}",
-            f"{1e6 * row.on_top_in_plane:.2f}",
+            f"{1e6 * row.heldout_rms_in_plane:.3g}",
+            f"{1e6 * row.heldout_rms_position:.3g}",
+            f"{1e6 * row.on_top_in_plane:.3g}",
             row.judgement,
         )
         for row in result.hypotheses or ()
