@@ -11,12 +11,12 @@ import time
 import numpy as np
 
 import tmlattice
-from tmlattice.diagnosis.data import of_measurement
-from tmlattice.diagnosis.metric import metric
-from tmlattice.diagnosis.model import Model
-from tmlattice.diagnosis.refine import Problem, fit
-from tmlattice.diagnosis.scan import scan
-from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.beam.model import Model
+from tmlattice.inference.metric import metric
+from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.scan import scan
+from tmlattice.inference.whitening import Whitening
+from tmlattice.observe.data import of_measurement
 
 
 def median_time(call, repeats=5):

@@ -12,12 +12,12 @@ import numpy as np
 
 import tmlattice
 from tmlattice.diagnosis.response import diagnose_response
-from tmlattice.diagnosis.response_report import response_text
 from tmlattice.effects import apply, background_rms
 from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response
 from tmlattice.network import TaylorNetwork
 from tmlattice.optics import twiss
+from tmlattice.report.response_text import response_text
 
 BACKGROUND = {
     "quadrupole_gradient": 2e-3,

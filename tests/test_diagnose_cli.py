@@ -14,17 +14,17 @@ import pytest
 
 from tmlattice.cli.command import main
 from tmlattice.diagnosis import diagnose
-from tmlattice.diagnosis.report import (
+from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.files import write_json
+from tmlattice.machine import simulate
+from tmlattice.measurement import OrbitResponse, write_measurement
+from tmlattice.report.text import (
     WORDS,
     amount_text,
     least_text,
     probability_text,
     report_text,
 )
-from tmlattice.effects import CATALOGUE, Cause
-from tmlattice.files import write_json
-from tmlattice.machine import simulate
-from tmlattice.measurement import OrbitResponse, write_measurement
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}

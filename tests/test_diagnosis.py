@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
-from tmlattice.diagnosis.data import of_measurement
-from tmlattice.diagnosis.model import Model
-from tmlattice.diagnosis.refine import Problem, amount_prior, fit
-from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.newton import Problem, amount_prior, fit
+from tmlattice.inference.whitening import Whitening
+from tmlattice.observe.data import of_measurement
 
 
 def measured(ring, causes, shots=6, seed=1, **options):

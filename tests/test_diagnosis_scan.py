@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tmlattice.diagnosis import scan as scanning
-from tmlattice.diagnosis.data import of_measurement
-from tmlattice.diagnosis.metric import metric
-from tmlattice.diagnosis.model import Model
-from tmlattice.diagnosis.noise import estimate
-from tmlattice.diagnosis.refine import Problem, fit
-from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.inference import scan as scanning
+from tmlattice.inference.metric import metric
+from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import simulate
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.noise import estimate
 
 SETTINGS = [
     {"hcor_sw_4": {"kick": 1e-4}},

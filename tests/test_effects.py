@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.model import Model
+from tmlattice.beam.model import Model
 from tmlattice.effects import (
     CATALOGUE,
     Cause,

@@ -10,15 +10,16 @@ from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
 from tmlattice import Cause, load_ring, read_measurement
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.machine.response import simulate_response
-from tmlattice.response import ResponseModel, predict
-from tmlattice.response.calibration import (
+from tmlattice.observe.calibration import (
     calibrated_response,
     read_calibration,
     write_calibration,
 )
+from tmlattice.observe.predict import predict
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 CAUSES = [

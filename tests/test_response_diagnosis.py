@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.response import ResponseRun, diagnose_response
 from tmlattice.diagnosis.response_missing import weigh
-from tmlattice.diagnosis.response_report import response_text
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
@@ -22,9 +22,9 @@ from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
+from tmlattice.observe.calibration import calibrated_response, read_calibration
 from tmlattice.optics import twiss
-from tmlattice.response import ResponseModel
-from tmlattice.response.calibration import calibrated_response, read_calibration
+from tmlattice.report.response_text import response_text
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"

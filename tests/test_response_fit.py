@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.diagnosis.response_fit import Group, normal_equations, solve
+from tmlattice.inference.priors import Group, normal_equations, solve
 
 
 @pytest.fixture

@@ -10,10 +10,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tmlattice import Cause, read_measurement
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.effects import CATALOGUE, RingEffect, apply
 from tmlattice.errors import EffectError, MeasurementError, UnknownNameError
 from tmlattice.machine.at_engine import AtEngine
-from tmlattice.response import ResponseModel, derivatives, predict
+from tmlattice.observe.predict import predict
 
 REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
 real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no PETRA III response")

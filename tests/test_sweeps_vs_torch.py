@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from tmlattice import TaylorNetwork
+from tmlattice.beam import sweeps
 from tmlattice.errors import BeamLostError
-from tmlattice.network import sweeps
 from tmlattice.network.reference import plain_readings
 
 

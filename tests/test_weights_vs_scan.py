@@ -12,22 +12,22 @@ import torch
 from click.testing import CliRunner
 
 from tmlattice import TaylorMap, TaylorNetwork, fine_tune
-from tmlattice.diagnosis.data import of_measurement
-from tmlattice.diagnosis.metric import metric
-from tmlattice.diagnosis.model import Model
-from tmlattice.diagnosis.refine import Problem, fit
-from tmlattice.diagnosis.scan import scan
-from tmlattice.diagnosis.weights import (
+from tmlattice.beam.model import Model
+from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.errors import LatticeError, MeasurementError
+from tmlattice.fitting.weights import (
     layer_effects,
     read_gradient,
     read_network,
     symplectic_directions,
 )
-from tmlattice.diagnosis.whitening import Whitening
-from tmlattice.effects import CATALOGUE, Cause
-from tmlattice.errors import LatticeError, MeasurementError
+from tmlattice.inference.metric import metric
+from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.scan import scan
+from tmlattice.inference.whitening import Whitening
 from tmlattice.machine import simulate
 from tmlattice.network.reference import plain_readings
+from tmlattice.observe.data import of_measurement
 
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 FAULT = Cause("quadrupole_gradient", "QD::7", 0.03)

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.chain import LayerChain, chain
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import symplectic_form
-from tmlattice.network.network import LayerChain, chain
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

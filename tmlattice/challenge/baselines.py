@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.model import Model, Paths
 from tmlattice.challenge.case import Case, ring_of
-from tmlattice.diagnosis.data import Data, of_measurement
-from tmlattice.diagnosis.model import Model, Paths
-from tmlattice.diagnosis.whitening import Projection, Whitening
 from tmlattice.effects import names
 from tmlattice.fitting import fine_tune
+from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
+from tmlattice.observe.data import Data, of_measurement
 
 Array = NDArray[np.float64]
 Guesses = list[dict[str, Any]]

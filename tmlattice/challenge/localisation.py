@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
-from tmlattice.diagnosis.weights import LayerEffects, layer_effects, read_gradient, read_network
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.fitting import fine_tune
+from tmlattice.fitting.weights import LayerEffects, layer_effects, read_gradient, read_network
 from tmlattice.lattice import Ring
 from tmlattice.machine import simulate
 from tmlattice.measurement import Measurement

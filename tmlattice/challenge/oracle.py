@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.challenge.case import Case, Truth, ring_of
-from tmlattice.diagnosis.data import Data, joined, of_measurement
-from tmlattice.diagnosis.explain import FALSE_ALARM
-from tmlattice.diagnosis.model import Hypothesis, Model
-from tmlattice.diagnosis.scan import effective_number, free_threshold
-from tmlattice.diagnosis.small_errors import background_signatures
-from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.diagnosis.background import background_signatures
 from tmlattice.effects import Cause, RingEffect, find, names
+from tmlattice.inference.scan import effective_number, free_threshold
+from tmlattice.inference.search import FALSE_ALARM
+from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import draw_background
+from tmlattice.observe.data import Data, joined, of_measurement
 
 Array = NDArray[np.float64]
 

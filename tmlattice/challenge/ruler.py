@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.model import Model
-from tmlattice.diagnosis.small_errors import background_signatures
-from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.beam.model import Model
+from tmlattice.diagnosis.background import background_signatures
 from tmlattice.effects import Cause, Settings
+from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.lattice import Ring
+from tmlattice.observe.data import Data
 
 Array = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from tmlattice.batch import finished, run_batch
+from tmlattice.beam.model import Model
 from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import (
     Case,
@@ -32,13 +33,12 @@ from tmlattice.challenge.record import (
     oracle_answer,
     stated,
 )
-from tmlattice.diagnosis.data import of_measurement
 from tmlattice.diagnosis.gap import held_out_gap
-from tmlattice.diagnosis.model import Model
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
+from tmlattice.observe.data import of_measurement
 
 FORMAT = "tmlattice-challenge"
 

@@ -21,7 +21,7 @@ from tmlattice.cli.options import (
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.response_result import ResponseDiagnosis
-    from tmlattice.diagnosis.weights import WeightReading
+    from tmlattice.fitting.weights import WeightReading
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement, OrbitResponse
 
@@ -191,7 +191,7 @@ def _response(
     from tmlattice.errors import MeasurementError, UnknownNameError
     from tmlattice.files import write_json
     from tmlattice.lattice import save_ring
-    from tmlattice.response.calibration import write_calibration
+    from tmlattice.observe.calibration import write_calibration
 
     with _progress(quiet) as progress:
         try:
@@ -223,8 +223,8 @@ def _write_response(result: "ResponseDiagnosis", folder: Path, provenance: dict[
     import matplotlib as mpl
 
     mpl.use("Agg")
-    from tmlattice.diagnosis.response_report import response_text
     from tmlattice.report.response import draw_response, response_page
+    from tmlattice.report.response_text import response_text
 
     html = response_page(result, draw_response(result, folder), provenance)
     (folder / "report.html").write_text(html, encoding="utf-8")
@@ -234,7 +234,7 @@ def _write_response(result: "ResponseDiagnosis", folder: Path, provenance: dict[
 def _print_response(
     result: "ResponseDiagnosis", out: Path | None, json_file: Path | None, lattice_out: Path | None
 ) -> None:
-    from tmlattice.diagnosis.response_report import response_text
+    from tmlattice.report.response_text import response_text
 
     screen = console()
     screen.print(response_text(result, min(screen.width, 120)), soft_wrap=True)
@@ -252,7 +252,7 @@ def _print_response(
 
 
 def _weights(ring: "Ring", path: Path, data: "Measurement") -> "WeightReading":
-    from tmlattice.diagnosis.weights import read_network
+    from tmlattice.fitting.weights import read_network
     from tmlattice.network import load_network
 
     return read_network(ring, load_network(ring, path), data)
@@ -319,8 +319,8 @@ def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any])
     import matplotlib as mpl
 
     mpl.use("Agg")
-    from tmlattice.diagnosis.report import report_text
-    from tmlattice.report import draw, page
+    from tmlattice.report.page import draw, page
+    from tmlattice.report.text import report_text
 
     pictures = draw(result, folder)
     html = page(result, pictures, provenance)
@@ -329,7 +329,7 @@ def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any])
 
 
 def _print(result: "Diagnosis", out: Path | None, json_file: Path | None) -> None:
-    from tmlattice.diagnosis.report import report_text
+    from tmlattice.report.text import report_text
 
     screen = console()
     screen.print(report_text(result, min(screen.width, 120)), soft_wrap=True)

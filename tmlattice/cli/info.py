@@ -30,9 +30,9 @@ def info(
 
 def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str, Any]:
     from tmlattice import __version__
+    from tmlattice.beam.chain import Chain
     from tmlattice.errors import UnstableRingError
     from tmlattice.lattice import load_ring
-    from tmlattice.network import TaylorNetwork
     from tmlattice.optics import off_momentum, twiss
 
     ring = load_ring(lattice, sequence, energy)
@@ -54,10 +54,10 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "problem": None,
     }
     try:
-        functions = twiss(TaylorNetwork.from_ring(ring))
+        functions = twiss(Chain.from_ring(ring))
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
-        energy_effects = off_momentum(TaylorNetwork.from_ring(ring, 6), ring.length)
+        energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
         facts["chromaticity"] = energy_effects.chromaticity.tolist()
         facts["dispersion_max"] = abs(energy_effects.dispersion).max(axis=0).tolist()
         facts["momentum_compaction"] = energy_effects.momentum_compaction

@@ -45,7 +45,7 @@ def predict(
     from tmlattice.files import output_file
     from tmlattice.lattice import load_ring
     from tmlattice.measurement.folder import write_response_table
-    from tmlattice.response.calibration import calibrated_response, read_calibration
+    from tmlattice.observe.calibration import calibrated_response, read_calibration
 
     if kick == 0 or not abs(kick) < float("inf"):
         raise click.BadParameter(f"a kick of {kick:g} rad; it is finite and not zero")

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.explain import Rival
-from tmlattice.diagnosis.model import LAUNCH, Model
-from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.beam.chain import Chain
+from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference.search import Rival
+from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.lattice import Ring
-from tmlattice.network import TaylorNetwork
+from tmlattice.observe.data import Data
 from tmlattice.optics import one_turn_optics
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ def _candidates(
     measured = data.launches[data.active]
     launches = list(measured[:2])
     try:
-        modes = one_turn_optics(TaylorNetwork.from_ring(ring)).modes
+        modes = one_turn_optics(Chain.from_ring(ring)).modes
         random = np.random.default_rng([seed, 3])
         size = np.linalg.norm(measured[:, :4] / np.abs(modes).max(axis=1), axis=1).mean()
         for scale in (1.0, 2.0):

@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from tmlattice.diagnosis.data import Data, joined, of_measurement
-from tmlattice.diagnosis.explain import FALSE_ALARM, Detection, Explanation, Rival, explain
+from tmlattice.beam.model import Hypothesis, Model
+from tmlattice.diagnosis.background import SmallErrors, small_errors
 from tmlattice.diagnosis.gap import held_out_gap, misfit
-from tmlattice.diagnosis.model import Hypothesis, Model
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.noise import estimate, local_misfit
-from tmlattice.diagnosis.refine import Fit, Problem, fit
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, Member, ring_tunes
-from tmlattice.diagnosis.scan import FreeScan, look_elsewhere
-from tmlattice.diagnosis.small_errors import SmallErrors, small_errors
-from tmlattice.diagnosis.whitening import Whitening
 from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
 from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.inference.newton import Fit, Problem, fit
+from tmlattice.inference.scan import FreeScan, look_elsewhere
+from tmlattice.inference.search import FALSE_ALARM, Detection, Explanation, Rival, explain
+from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Element, Ring
 from tmlattice.measurement import Measurement
+from tmlattice.observe.data import Data, joined, of_measurement
+from tmlattice.observe.noise import estimate, local_misfit
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)

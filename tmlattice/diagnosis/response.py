@@ -24,13 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response_fit import Group, Normal, Posterior, normal_equations, solve
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.diagnosis.response_result import ResponseDiagnosis, Step, pick
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.priors import Group, Normal, Posterior, normal_equations, solve
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.response import ResponseModel, derivatives
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

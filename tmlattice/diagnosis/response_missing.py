@@ -21,11 +21,12 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.diagnosis.response import ResponseRun, families, rms_of
 from tmlattice.diagnosis.response_result import pick
 from tmlattice.effects import apply
 from tmlattice.lattice import Ring
-from tmlattice.response import ResponseModel, derivatives
 
 Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array

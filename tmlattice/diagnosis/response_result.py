@@ -11,7 +11,7 @@ from tmlattice.diagnosis.result import ring_tunes
 from tmlattice.effects import Cause, apply
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.response.calibration import CALIBRATES
+from tmlattice.observe.calibration import CALIBRATES
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response_missing import Weighed

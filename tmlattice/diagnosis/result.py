@@ -5,15 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.explain import Detection, Explanation
+from tmlattice.beam.model import Model
 from tmlattice.diagnosis.gap import Gap, Misfit
-from tmlattice.diagnosis.model import Model
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference.search import Detection, Explanation
 from tmlattice.lattice import Ring
 from tmlattice.maps.magnets import ring_matrix
+from tmlattice.observe.data import Data
 from tmlattice.optics import matrix_tunes
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
-from tmlattice.network.network import LayerChain
+from tmlattice.network.network import NetworkChain
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class FirstTurn:
 
 
 def first_turn(
-    network: LayerChain,
+    network: NetworkChain,
     measurement: Measurement,
     noise: float | None,
     launch_sigma: ArrayLike | None,
@@ -70,7 +70,7 @@ def first_turn(
     return FirstTurn(launches, np.where(present, readings, 0.0), present, sigma, width)
 
 
-def readings_of(network: LayerChain, launches: Array) -> Array:
+def readings_of(network: NetworkChain, launches: Array) -> Array:
     """Readings [shot, monitor, 2] without a gradient."""
     return np.asarray(network(launches).detach().numpy())
 

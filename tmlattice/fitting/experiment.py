@@ -21,7 +21,7 @@ from tmlattice.lattice import Ring, middle_of_first_arc
 from tmlattice.maps import element_map, ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
-from tmlattice.network.network import LayerChain
+from tmlattice.network.network import NetworkChain
 from tmlattice.optics import matrix_tunes, one_turn_optics
 
 Array = NDArray[np.float64]
@@ -365,7 +365,7 @@ def _fit_and_track(
     }
 
 
-def network_tunes(network: LayerChain, launch: Array, turns: int) -> tuple[Array, Array, float]:
+def network_tunes(network: NetworkChain, launch: Array, turns: int) -> tuple[Array, Array, float]:
     """Tunes of a network by tracking it, at a vanishing part of the launch [n].
 
     Returns:

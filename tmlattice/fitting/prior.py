@@ -23,6 +23,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from tmlattice.beam.chain import chain
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.data import FirstTurn, first_turn, readings_of, tangents
@@ -34,7 +35,6 @@ from tmlattice.maps.taylor import symplectic_form
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
 from tmlattice.network.generators import exponents, field_matrix
-from tmlattice.network.network import chain
 from tmlattice.optics import normal_modes, one_turn_optics
 
 Array = NDArray[np.float64]

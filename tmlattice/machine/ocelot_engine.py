@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.readouts import positions
 from tmlattice.effects import Cause, RingEffect, Settings, apply, find, set_elements
 from tmlattice.effects.settings import groups
 from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps, ring_maps
 from tmlattice.maps.magnets import Weights
-from tmlattice.network.monitors import positions
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.constants import c as SPEED_OF_LIGHT
 from tqdm.auto import tqdm
 
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import Cause, Settings, apply, background_rms, check, monitors_with
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.lattice import Ring
@@ -16,8 +17,7 @@ from tmlattice.machine.at_engine import PETRA_HARMONIC, PETRA_LENGTH, AtEngine
 from tmlattice.machine.machine import ENGINES, true_causes
 from tmlattice.machine.shots import draw_background, stream
 from tmlattice.measurement import OrbitResponse, RfStep
-from tmlattice.response import ResponseModel
-from tmlattice.response.calibration import corrector_scales
+from tmlattice.observe.calibration import corrector_scales
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.chain import Chain
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.lattice import Ring
-from tmlattice.network import TaylorNetwork
 from tmlattice.optics import one_turn_optics
 
 Array = NDArray[np.float64]
@@ -86,17 +86,17 @@ def draw_shots(
         raise TmlatticeError(
             f"the launches' rms {sigma} should be five numbers (x, px, y, py, delta), none negative"
         )
-    network = TaylorNetwork.from_ring(ring)
-    modes = one_turn_optics(network).modes
+    chain = Chain.from_ring(ring)
+    modes = one_turn_optics(chain).modes
     phases = stream(seed, "launches").uniform(0, 2 * np.pi, (shots, 2))
     turned = np.exp(1j * phases)[:, :, None] * modes.T  # [shot, plane, 4]
     planes = 1e-6 * np.real(turned)
     for plane in (0, 1):  # each alone to the same rms, then both together
-        planes[:, plane] /= _rms(network, planes[:, plane])[:, None]
+        planes[:, plane] /= _rms(chain, planes[:, plane])[:, None]
     launch = 1e-6 * planes.sum(axis=1)
     try:
         for _ in range(3):
-            launch *= (amplitude / _rms(network, launch))[:, None]
+            launch *= (amplitude / _rms(chain, launch))[:, None]
     except BeamLostError as error:
         raise BeamLostError(
             f"an orbit of {amplitude:g} m rms is lost in the design; ask for a smaller amplitude"
@@ -109,8 +109,8 @@ def draw_shots(
     return Shots(nominal, launches, spread, _draw_settings(ring, shots, kicks, settings, seed))
 
 
-def _rms(network: TaylorNetwork, launch: Array) -> Array:
-    readings = network(launch).detach().numpy()
+def _rms(chain: Chain, launch: Array) -> Array:
+    readings = chain.readings(launch)
     return np.asarray(np.sqrt((readings**2).mean(axis=(1, 2))))
 
 

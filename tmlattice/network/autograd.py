@@ -7,41 +7,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tmlattice.errors import BeamLostError
+from tmlattice.beam import sweeps
+from tmlattice.beam.chain import first_pass
+from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
-from tmlattice.network import sweeps
 
 Array = NDArray[np.float64]
-
-APERTURE = 1.0
-"""m and rad: far outside any beam pipe, and where second-order maps have lost all meaning."""
-
-
-def curved(W2: Array) -> NDArray[np.bool_]:
-    """Which layers have a second-order part at all: the sweeps skip it where it is zero."""
-    return np.asarray(W2.any(axis=(1, 2)))
-
-
-def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) -> None:
-    """Raise where a trajectory of states [block, layer + 1, n, lane] has left the aperture.
-
-    Raises:
-        BeamLostError: names the trajectory and the layer where it was lost.
-    """
-    last = states[:, -1]
-    if np.isfinite(last).all() and np.abs(last).max(initial=0.0) < APERTURE:
-        return
-    alive = np.abs(states) < APERTURE  # false for NaN too
-    lost = ~np.all(alive, axis=2)  # [block, layer + 1, lane]
-    anywhere = np.any(lost, axis=1)
-    block, lane = np.unravel_index(int(anywhere.argmax()), anywhere.shape)
-    exit_ = int(lost[block, :, lane].argmax())
-    trajectory = int(block) * len(size[1]) + int(lane)
-    where = f"in layer {exit_ - 1} ('{maps.layers[exit_ - 1]}')" if exit_ else "at the launch"
-    raise BeamLostError(
-        f"trajectory {trajectory} is lost {where}: a coordinate exceeds {APERTURE:g} m or rad; "
-        "launch closer to the axis, or lower the learning rate"
-    )
 
 
 class Sweep(torch.autograd.Function):
@@ -58,19 +29,8 @@ class Sweep(torch.autograd.Function):
         """Readings of one pass through all layers."""
         w0, w1, w2 = (w.detach().numpy() for w in (W0, W1, W2))
         batch, n = launch.shape
-        size = sweeps.size_of(n, batch)
-        start = sweeps.pack(launch.detach().numpy(), len(size[1]))
-        states = np.empty((len(start), len(w0) + 1, n, len(size[1])))
-        states[:, 0] = start
-        bends = curved(w2)
-        sweeps.run(sweeps.forward, len(start), size, w0, w1, w2, bends, states)
-        check_alive(states, maps, size, batch)
-        readings = np.empty((len(start), len(maps.at), 2, len(size[1])))
-        bent = curved(maps.R2)
-        sweeps.run(
-            sweeps.read, len(start), size, maps.R0, maps.R1, maps.R2, bent, maps.at, states,
-            readings,
-        )  # fmt: skip
+        states, readings = first_pass((w0, w1, w2), maps, launch.detach().numpy())
+        size, bends, bent = sweeps.size_of(n, batch), curved(w2), curved(maps.R2)
         ctx.save_for_backward(W1, W2)
         ctx.kept = (maps, size, states, bends, bent, batch)
         return torch.from_numpy(sweeps.unpack(readings, batch))

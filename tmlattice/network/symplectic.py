@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tmlattice.network.threads import share
+from tmlattice.beam.threads import share
 
 Array = NDArray[np.float64]
 

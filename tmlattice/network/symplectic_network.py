@@ -7,10 +7,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from tmlattice.beam import flows, sweeps
+from tmlattice.beam.aperture import check_alive
+from tmlattice.beam.chain import chain
+from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
 from tmlattice.maps.taylor import second_derivatives, symplectic_form
-from tmlattice.network import flows, sweeps
-from tmlattice.network.autograd import check_alive, curved
 from tmlattice.network.generators import (
     cubic_generator,
     field,
@@ -19,7 +21,7 @@ from tmlattice.network.generators import (
     nearest_symplectic,
     pull_field,
 )
-from tmlattice.network.network import LayerChain, TaylorNetwork, chain
+from tmlattice.network.network import NetworkChain, TaylorNetwork
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -93,7 +95,7 @@ def _flat(c: Array, A: Array, Q: Array) -> Flags:
     return np.asarray(~(c.any(axis=1) | A.any(axis=(1, 2)) | Q[:, _SKEW].any(axis=1)))
 
 
-class SymplecticNetwork(LayerChain):
+class SymplecticNetwork(NetworkChain):
     """A ring as a chain of symplectic layers: a matrix, then the flow of a generator.
 
     Layer k sends x to W0[k] + the flow, by one implicit-midpoint step, of generator[k] from

@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.explain import SHARES
-from tmlattice.diagnosis.report import words
 from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.diagnosis.scan import free_threshold
+from tmlattice.inference.scan import free_threshold
+from tmlattice.inference.search import SHARES
 from tmlattice.plots.strip import lattice_strip
+from tmlattice.report.text import words
 
 Array = NDArray[np.float64]
 

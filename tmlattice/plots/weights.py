@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from tmlattice.plots.strip import lattice_strip
 
 if TYPE_CHECKING:
-    from tmlattice.diagnosis.weights import WeightReading
+    from tmlattice.fitting.weights import WeightReading
 
 BINS = 120
 """Along s, in which the squares of layers' parts are added up for their shares."""
@@ -27,7 +27,7 @@ def plot_weights(
         figure: an empty one; else a new one.
         mark: an element to show, such as the true cause.
     """
-    from tmlattice.diagnosis.weights import PARTS
+    from tmlattice.fitting.weights import PARTS
 
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
     raw, score, size, share, strip = figure.subplots(

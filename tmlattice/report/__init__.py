@@ -1,5 +1,4 @@
-"""Reports for people: one HTML page that holds everything and opens offline."""
+"""What a person reads of a diagnosis: words, text, one page that holds everything.
 
-from tmlattice.report.page import draw, page
-
-__all__ = ["draw", "page"]
+Nothing is imported here: the text needs no template, and the page no figures before they are drawn.
+"""

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from tmlattice.diagnosis import Diagnosis, report
+from tmlattice.diagnosis import Diagnosis
+from tmlattice.report import text as report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

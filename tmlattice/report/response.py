@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tmlattice.diagnosis import response_report
 from tmlattice.diagnosis.response_result import ResponseDiagnosis
+from tmlattice.report import response_text as response_report
 from tmlattice.report.page import Picture, render, save
 
 

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis import kernels
+from tmlattice.beam import tangents as kernels
+from tmlattice.beam.readouts import positions
+from tmlattice.beam.sweeps import curved
+from tmlattice.beam.threads import share
 from tmlattice.effects import (
     CATALOGUE,
     Cause,
@@ -33,9 +36,6 @@ from tmlattice.effects.settings import groups
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 from tmlattice.maps.magnets import Weights
-from tmlattice.network.autograd import curved
-from tmlattice.network.monitors import positions
-from tmlattice.network.threads import share
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]

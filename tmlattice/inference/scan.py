@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logsumexp
 
-from tmlattice.diagnosis.metric import Metric
-from tmlattice.diagnosis.model import Hypothesis
+from tmlattice.beam.model import Hypothesis
 from tmlattice.effects import find
+from tmlattice.inference.metric import Metric
 
 Array = NDArray[np.float64]
 

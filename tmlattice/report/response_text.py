@@ -8,8 +8,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from tmlattice.diagnosis.report import amount_text, words
 from tmlattice.diagnosis.response_result import ResponseDiagnosis, Step
+from tmlattice.report.text import amount_text, words
 
 WIDTH = 100
 SHOWN = 8

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.closed_orbit import Columns, ResponseModel
 from tmlattice.effects import Cause, apply, check, find, monitors_with
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import located, read_document
-from tmlattice.response.model import Columns, ResponseModel
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.model import Hypothesis, Kicks, Model, Paths
-from tmlattice.diagnosis.scan import evidence_of_scale
-from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.beam.model import Hypothesis, Kicks, Model, Paths
 from tmlattice.effects import Cause, find
+from tmlattice.inference.scan import evidence_of_scale
+from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.observe.data import Data
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.network import sweeps
-from tmlattice.network.autograd import curved
+from tmlattice.beam import sweeps
+from tmlattice.beam.sweeps import curved
 
 Array = NDArray[np.float64]
 

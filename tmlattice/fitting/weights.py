@@ -32,21 +32,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis import kernels
-from tmlattice.diagnosis.data import of_measurement
-from tmlattice.diagnosis.metric import behind
-from tmlattice.diagnosis.model import Hypothesis, Model
-from tmlattice.diagnosis.noise import estimate
-from tmlattice.diagnosis.refine import Problem, fit
-from tmlattice.diagnosis.scan import BLIND
-from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.beam import tangents as kernels
+from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.effects import CATALOGUE, RingEffect, directions, names
 from tmlattice.errors import LatticeError, MeasurementError
+from tmlattice.inference.metric import behind
+from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.scan import BLIND
+from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps
 from tmlattice.maps.taylor import kronecker_exponents, symplectic_form
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.noise import estimate
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import physical_constants
 
+from tmlattice.beam.chain import Chain
+from tmlattice.beam.settle import settle
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 from tmlattice.maps.taylor import second_derivatives
-from tmlattice.network.network import TaylorNetwork
-from tmlattice.response.kernels import settle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -92,7 +92,7 @@ class ResponseModel:
         self.layers = LayerMaps(_without_rf(ring), dimension)
         self.maps = ring_maps(self.layers.ring, dimension, self.layers)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
-        self._network = TaylorNetwork(self.maps)
+        self._chain = Chain(self.maps)
         self._close(frequency)
 
     def at_frequency(self, frequency: float) -> "ResponseModel":
@@ -229,7 +229,7 @@ class ResponseModel:
             UnstableRingError: no closed orbit within reach.
         """
         n, ring = self.dimension, self.layers.ring
-        W0, W1, W2 = self._network.one_turn_weights()
+        W0, W1, W2 = self._chain.one_turn_weights()
         layer = np.empty(len(correctors), dtype=np.int64)
         replaced = []
         paths = np.empty((len(correctors), len(W0) + 1, n))
@@ -297,7 +297,7 @@ class ResponseModel:
         x = np.zeros(self.dimension)
         rows = np.arange(len(self.free))
         for _ in range(30):
-            path, steps = self._network.jacobians(x)
+            path, steps = self._chain.jacobians(x)
             turn = np.eye(self.dimension)
             for step in steps:
                 turn = step @ turn
@@ -307,7 +307,7 @@ class ResponseModel:
             change = self._solver(turn) @ miss
             x = x + change
             if np.abs(change).max() < max(1e-15, 1e-12 * np.abs(x).max()):
-                path, steps = self._network.jacobians(x)
+                path, steps = self._chain.jacobians(x)
                 return x, path, steps
         raise UnstableRingError(_NO_ORBIT)
 

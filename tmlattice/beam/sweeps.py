@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.network.threads import share
+from tmlattice.beam.threads import share
 
 Array = NDArray[np.float64]
 Size = tuple[tuple[None, ...], tuple[None, ...]]
@@ -181,6 +181,11 @@ def weights(first, last, size, states, adjoint, G0, G1, G2):  # type: ignore[no-
                             total += up[v] * x[i, v] * x[j, v]
                         G2[k, a, m] += total
                         m += 1
+
+
+def curved(W2: Array) -> NDArray[np.bool_]:
+    """Which layers have a second-order part at all: the sweeps skip it where it is zero."""
+    return np.asarray(W2.any(axis=(1, 2)))
 
 
 def size_of(n: int, batch: int) -> Size:

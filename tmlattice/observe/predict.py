@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import OrbitResponse
-from tmlattice.response.model import ResponseModel
 
 
 def predict(model: ResponseModel, measured: OrbitResponse) -> OrbitResponse:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky
 from scipy.linalg.lapack import dtrtri
 
-from tmlattice.diagnosis.data import Data
+from tmlattice.observe.data import Data
 
 Array = NDArray[np.float64]
 

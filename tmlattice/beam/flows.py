@@ -17,7 +17,7 @@ rule.
 import numba
 import numpy as np
 
-from tmlattice.network.sweeps import _polynomial, _pull
+from tmlattice.beam.sweeps import _polynomial, _pull
 
 _jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.model import Hypothesis, Model, Paths
-from tmlattice.diagnosis.whitening import Projection, Whitening
+from tmlattice.beam.model import Hypothesis, Model, Paths
 from tmlattice.effects import ReadingEffect, find
+from tmlattice.inference.whitening import Projection, Whitening
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -8,8 +8,8 @@ median over all monitors does not see a few errors.
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.model import Paths
+from tmlattice.beam.model import Paths
+from tmlattice.observe.data import Data
 
 Array = NDArray[np.float64]
 

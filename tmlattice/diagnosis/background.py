@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.data import Data
-from tmlattice.diagnosis.model import Hypothesis, Model, Paths
-from tmlattice.diagnosis.refine import Fit, Problem, fit
-from tmlattice.diagnosis.whitening import Whitening
+from tmlattice.beam.model import Hypothesis, Model, Paths
 from tmlattice.effects import Cause
+from tmlattice.inference.newton import Fit, Problem, fit
+from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
+from tmlattice.observe.data import Data
 
 Array = NDArray[np.float64]
 

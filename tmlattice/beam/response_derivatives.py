@@ -17,11 +17,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.closed_orbit import KICK, Columns, ResponseModel
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions
 from tmlattice.errors import EffectError
 from tmlattice.maps.taylor import second_derivatives
-from tmlattice.response.model import KICK, Columns, ResponseModel
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.metric import Metric, metric
-from tmlattice.diagnosis.model import Hypothesis
-from tmlattice.diagnosis.refine import Fit, Problem, fit
-from tmlattice.diagnosis.scan import (
+from tmlattice.beam.model import Hypothesis
+from tmlattice.effects import Cause, find
+from tmlattice.inference.metric import Metric, metric
+from tmlattice.inference.newton import Fit, Problem, fit
+from tmlattice.inference.scan import (
     FreeScan,
     Scan,
     free_threshold,
@@ -25,7 +26,6 @@ from tmlattice.diagnosis.scan import (
     scan_kicks,
     scan_monitors,
 )
-from tmlattice.effects import Cause, find
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)

@@ -1,0 +1,246 @@
+"""The ring as a chain of layers: states, turns, the map of a turn, without torch.
+
+>>> chain = Chain(ring_maps(ring))
+>>> chain.readings([[1e-3, 0, 1e-3, 0]])                # [1, monitor, 2], m
+>>> chain.track([[1e-5, 0, 1e-5, 0]], turns=500)        # [1, 501, 4]
+"""
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tmlattice.beam import sweeps
+from tmlattice.beam.aperture import APERTURE, check_alive
+from tmlattice.beam.sweeps import curved
+from tmlattice.errors import BeamLostError
+from tmlattice.lattice.ring import Ring
+from tmlattice.maps import RingMaps, TaylorMap, ring_maps
+from tmlattice.maps.taylor import second_derivatives
+
+Array = NDArray[np.float64]
+
+
+def chain(matrices: Array) -> Array:
+    """The product of matrices [step, n, n] in beam order: the last one stands on the left."""
+    total = np.eye(matrices.shape[1])
+    for matrix in matrices:
+        total = matrix @ total
+    return total
+
+
+def first_pass(
+    weights: tuple[Array, Array, Array], maps: RingMaps, start: Array
+) -> tuple[Array, Array]:
+    """States [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of one pass.
+
+    Raises:
+        BeamLostError: names the layer where a trajectory was lost.
+    """
+    W0, W1, W2 = weights
+    size = sweeps.size_of(start.shape[1], len(start))
+    packed = sweeps.pack(start, len(size[1]))
+    states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
+    states[:, 0] = packed
+    sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
+    check_alive(states, maps, size, len(start))
+    readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
+    out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
+    sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
+    return states, readings
+
+
+class LayerChain:
+    """What every chain of layers has: names, launches, tracking, the map of a turn.
+
+    A chain says how its layers send states (`_forward`, `_track`) and what their Jacobians are.
+
+    Attributes:
+        maps: what it was made from; names and places of layers and monitors.
+        ring: the ring of these maps, where it is known.
+    """
+
+    maps: RingMaps
+    ring: Ring | None = None
+
+    def _forward(self, size: sweeps.Size, states: Array) -> None:
+        """Fill states [block, 1:, n, lane] from states[:, 0]: every exit of one pass."""
+        raise NotImplementedError
+
+    def _track(self, size: sweeps.Size, history: Array) -> None:
+        """Fill history [block, 1:, n, lane] from history[:, 0]: the start of every turn."""
+        raise NotImplementedError
+
+    def jacobians(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
+        the layers and of the closing way there [layer + 1, n, n]."""
+        raise NotImplementedError
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates n."""
+        return self.maps.dimension
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the magnets, one a layer."""
+        return self.maps.layers
+
+    @property
+    def monitors(self) -> tuple[str, ...]:
+        """Names of the monitors, in the order of the readings."""
+        return self.maps.monitors
+
+    def _start(self, launch: ArrayLike) -> Array:
+        start = np.ascontiguousarray(launch, dtype=float)
+        if start.ndim != 2 or start.shape[1] != self.dimension:
+            raise ValueError(
+                f"launch has the shape {start.shape}; it should be [batch, {self.dimension}]"
+            )
+        return start
+
+    def states(self, launch: ArrayLike) -> Array:
+        """States at the launch and at the exit of every layer on one pass, [batch, layer + 1, n].
+
+        Lost trajectories are not reported: their states grow or become infinite.
+        """
+        start = self._start(launch)
+        size = sweeps.size_of(self.dimension, len(start))
+        packed = sweeps.pack(start, len(size[1]))
+        states = np.empty((len(packed), len(self.layers) + 1, *packed.shape[1:]))
+        states[:, 0] = packed
+        self._forward(size, states)
+        return sweeps.unpack(states, len(start))
+
+    def track(self, launch: ArrayLike, turns: int, *, keep_lost: bool = False) -> Array:
+        """States at the start of the ring after 0, 1, ..., turns turns.
+
+        Args:
+            launch: states at the start, [batch, n].
+            turns: at least 1.
+            keep_lost: do not raise for a lost trajectory; its states are NaN from then on.
+
+        Returns:
+            [batch, turns + 1, n]; no gradient.
+
+        Raises:
+            BeamLostError: names the trajectory, the turn and the layer where it was lost.
+            ValueError: a launch of another shape, or no turn.
+        """
+        if turns < 1:
+            raise ValueError(f"{turns} turns cannot be tracked; one at least can")
+        start = self._start(launch)
+        size = sweeps.size_of(self.dimension, len(start))
+        packed = sweeps.pack(start, len(size[1]))
+        history = np.empty((len(packed), turns + 1, *packed.shape[1:]))
+        history[:, 0] = packed
+        self._track(size, history)
+        states = sweeps.unpack(history, len(start))
+        if keep_lost:
+            lost = ~np.all(np.abs(states) < APERTURE, axis=2)
+            states[np.logical_or.accumulate(lost, axis=1)] = np.nan
+        else:
+            self._check_alive(states)
+        return states
+
+    def _check_alive(self, states: Array) -> None:
+        lost = ~np.all(np.abs(states) < APERTURE, axis=2)  # [batch, turn], true for NaN
+        if not lost.any():
+            return
+        trajectory = int(np.any(lost, axis=1).argmax())
+        turn = int(lost[trajectory].argmax())
+        if turn == 0:
+            raise BeamLostError(
+                f"trajectory {trajectory} starts outside {APERTURE:g} m or rad; launch closer"
+            )
+        inside = self.states(states[trajectory, turn - 1][None])[0]
+        gone = ~np.all(np.abs(inside) < APERTURE, axis=1)
+        layer = max(int(gone.argmax()) - 1, 0) if gone.any() else len(self.layers) - 1
+        raise BeamLostError(
+            f"trajectory {trajectory} is lost in turn {turn}, in layer {layer} "
+            f"('{self.layers[layer]}'): its motion grows; launch closer to the axis, or check "
+            "that the ring is stable"
+        )
+
+    def one_turn_map(self, x: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Image and Jacobian of one turn at the state x [n] (else the origin): [n], [n, n].
+
+        The product of the layers' own Jacobians along the trajectory: exact for the chain, where
+        a composed second-order map of the turn would not be.
+        """
+        x = np.zeros(self.dimension) if x is None else np.asarray(x, dtype=float)
+        path, matrices = self.jacobians(x)
+        return path[-1], chain(matrices)
+
+
+class Chain(LayerChain):
+    """Second-order layers, one per magnet, read by the ring's monitors.
+
+    Layer k sends the state x at the exit of magnet k - 1 to W0[k] + W1[k] x + W2[k] x^[2] at the
+    exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and units
+    of the reference momentum.
+
+    Args:
+        maps: weights and read-outs of a ring.
+    """
+
+    def __init__(self, maps: RingMaps) -> None:
+        self.maps = maps
+
+    @classmethod
+    def from_ring(cls, ring: Ring, dimension: int = 4) -> Self:
+        """The chain of a ring's design, from OCELOT's maps.
+
+        Args:
+            ring: see `load_ring`.
+            dimension: 4, or 6 for OCELOT's six coordinates.
+        """
+        made = cls(ring_maps(ring, dimension))
+        made.ring = ring
+        return made
+
+    def weights(self) -> tuple[Array, Array, Array]:
+        """W0 [layer, n], W1 [layer, n, n], W2 [layer, n, n (n + 1) / 2]: do not change them."""
+        return self.maps.W0, self.maps.W1, self.maps.W2
+
+    def readings(self, launch: ArrayLike) -> Array:
+        """(x, y) of every monitor on one pass, [batch, monitor, 2], m.
+
+        Raises:
+            BeamLostError: names the layer where a trajectory was lost.
+            ValueError: a launch of another shape.
+        """
+        start = self._start(launch)
+        _, readings = first_pass(self.weights(), self.maps, start)
+        return sweeps.unpack(readings, len(start))
+
+    def one_turn_weights(self) -> tuple[Array, Array, Array]:
+        """W0, W1, W2 of one whole turn as a chain: the layers, then the way to the ring's end."""
+        closing = self.maps.closing.coefficients
+        layers = self.weights()
+        W0, W1, W2 = (np.concatenate([w, c[None]]) for w, c in zip(layers, closing, strict=True))
+        return W0, W1, W2
+
+    def layer_map(self, layer: int) -> TaylorMap:
+        """One layer as a Taylor map."""
+        return TaylorMap([w[layer] for w in self.weights()])
+
+    def _forward(self, size: sweeps.Size, states: Array) -> None:
+        W0, W1, W2 = self.weights()
+        sweeps.run(sweeps.forward, len(states), size, W0, W1, W2, curved(W2), states)
+
+    def _track(self, size: sweeps.Size, history: Array) -> None:
+        W0, W1, W2 = self.one_turn_weights()
+        sweeps.run(sweeps.track, len(history), size, W0, W1, W2, curved(W2), history)
+
+    def jacobians(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
+        the layers and of the closing way there [layer + 1, n, n]."""
+        W0, W1, W2 = self.one_turn_weights()
+        size = sweeps.size_of(self.dimension, 1)
+        states = np.empty((1, len(W0) + 1, self.dimension, 1))
+        states[0, 0, :, 0] = x
+        sweeps.run(sweeps.forward, 1, size, W0, W1, W2, curved(W2), states)
+        path = states[0, :, :, 0]
+        slopes = np.einsum("kaij,kj->kai", second_derivatives(W2), path[:-1])
+        return path, W1 + slopes

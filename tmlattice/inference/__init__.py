@@ -1,0 +1,1 @@
+"""From rows to an explanation: it knows rows, not rings."""
