@@ -244,3 +244,15 @@ class Chain(LayerChain):
         path = states[0, :, :, 0]
         slopes = np.einsum("kaij,kj->kai", second_derivatives(W2), path[:-1])
         return path, W1 + slopes
+
+
+def tangents(network: LayerChain, x: Array) -> tuple[Array, Array, Array]:
+    """States [layer + 1, n] at the launch x [n] and all exits, Jacobians M [layer + 1, n, n] of
+    them by the launch, and the inverses of these."""
+    path, steps = network.jacobians(x)
+    layers = len(network.layers)
+    M = np.empty((layers + 1, *steps.shape[1:]))
+    M[0] = np.eye(network.dimension)
+    for k in range(layers):
+        M[k + 1] = steps[k] @ M[k]
+    return path[: layers + 1], M, np.linalg.inv(M)
