@@ -330,7 +330,7 @@ def test_energy_loss_of_a_turn_is_the_formula(petra3, bends, wigglers):
 
 def test_loss_in_a_wiggler_shrinks_the_angles(tmp_path):
     plain = engine_of(tmp_path, WIGGLER)
-    lossy = AtEngine(plain.ring, radiation_wigglers=100.0)  # far more than there is, to be seen
+    lossy = AtEngine(plain.ring, radiation_wigglers=100.0, voltage=20e6)  # far too much, to be seen
     u = lossy.expected_loss / 6e9
     launch = np.array([0, 1e-3, 0, 0, 0, 0])
     before_loss, after = exit_state(plain, launch), exit_state(lossy, launch)

@@ -25,6 +25,7 @@ from scipy.constants import c as SPEED_OF_LIGHT
 from scipy.constants import physical_constants
 from scipy.linalg import sqrtm
 
+from tmlattice.beam.rf import rf_of
 from tmlattice.effects.cause import Cause
 from tmlattice.errors import LatticeError, UnstableRingError, unknown_name
 from tmlattice.lattice.ring import Element, Ring
@@ -39,7 +40,6 @@ RADIUS = physical_constants["classical electron radius"][0]  # m
 C_GAMMA = 4 * np.pi / 3 * RADIUS / ELECTRON**3
 """Energy loss of a circle of radius rho: C_GAMMA E^4 / rho, 1/eV^3 m."""
 
-PETRA_HARMONIC, PETRA_LENGTH = 3840, 2303.952
 TURNS_AT_ONCE = 2**22
 """AT's result is cut into blocks of so many states, so that many turns fit into memory."""
 
@@ -98,9 +98,9 @@ class AtEngine:
         steps: fourth-order integration steps per magnet. With 30 the first turn of a
             PETRA-III-style ring is converged to 0.002 micrometres rms at 1 mm (0.01 with 20).
         aperture: half width in m of quadrupoles and monitors, in both planes.
-        harmonic: of the RF; else that of the ring's first cavity, else 3840 for every 2303.952 m.
+        harmonic: of the RF; else that of the ring's first cavity, else the one nearest to 500 MHz.
         voltage: of the RF in V, all cavities together; else that of the ring's cavities, else
-            20 MV.
+            four times what the design loses when it radiates as expected.
 
     Attributes:
         ring: the design.
@@ -151,27 +151,15 @@ class AtEngine:
         self._set_rf(harmonic, voltage)
 
     def _set_rf(self, harmonic: int | None, voltage: float | None) -> None:
-        ring, elements = self.ring, self.ring.elements
-        own = [i for i, e in enumerate(elements) if e.kind == "cavity"]
-        free = ("marker", "drift")
-        named = [i for i, e in enumerate(elements) if e.name.casefold() == "rf" and e.kind in free]
-        self._cavities = [self._places[i].start for i in own or named[:1]]
-        self._cavities = self._cavities or [len(self._line) - 1]
-        self._has_rf = bool(own)
-        if harmonic is None:
-            frequency = float(elements[own[0]].source.freq) if own else 0.0
-            harmonic = round(
-                frequency * ring.length / SPEED_OF_LIGHT
-                if frequency
-                else PETRA_HARMONIC * ring.length / PETRA_LENGTH
-            )
-        self._harmonic = max(harmonic, 1)
-        if voltage is None:
-            voltage = sum(float(elements[i].source.v) for i in own) * 1e9 or 20e6
-        self._voltage = voltage
-        if self.expected_loss >= voltage:
+        rf = rf_of(self.ring, harmonic, voltage)
+        behind = len(self._line) - 1  # the marker at the end
+        self._cavities = [
+            self._places[i].start if i < len(self._places) else behind for i in rf.places
+        ]
+        self._has_rf, self._harmonic, self._voltage = rf.own, rf.harmonic, rf.voltage
+        if self.expected_loss and self.expected_loss >= rf.voltage:
             raise LatticeError(
-                f"an RF of {voltage / 1e6:.3g} MV cannot make good a loss of "
+                f"an RF of {rf.voltage / 1e6:.3g} MV cannot make good a loss of "
                 f"{self.expected_loss / 1e6:.3g} MeV a turn; give voltage="
             )
 
@@ -214,7 +202,8 @@ class AtEngine:
             for i, setting in changed.items():
                 errors = self._errors.get(i, {})
                 line[self._places[i]] = self._builder.pieces(self.ring.elements[i], errors, setting)
-            if turns > 1 and (self.expected_loss > 0 or self._has_rf or frequency):
+            on = self.expected_loss > 0 or self._has_rf or frequency
+            if turns > 1 and on and self._voltage:
                 for place in self._cavities:
                     line[place] = self._cavity(line[place], frequency)
             readings[shots] = self._track_line(line, state[shots], turns)
@@ -537,7 +526,7 @@ class _Builder:
         return [at.Drift(element.name, element.length)]
 
     def _cavity(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        if type(element.source).__name__ != "Cavity":
+        if type(element.source).__name__ not in ("Cavity", "Drift", "Marker"):
             raise LatticeError(
                 f"AT cannot build '{element.name}', a {type(element.source).__name__}; only "
                 "standing-wave cavities (Cavity)"
