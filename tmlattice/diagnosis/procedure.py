@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.diagnosis.background import SmallErrors, small_errors
@@ -21,6 +20,7 @@ from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measureme
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, Member, ring_tunes
 from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
 from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, Problem, fit
 from tmlattice.inference.scan import FreeScan, look_elsewhere
 from tmlattice.inference.search import FALSE_ALARM, Detection, Explanation, Rival, explain
@@ -173,13 +173,13 @@ def diagnose(
     findings = _findings(ring, model, explanation, dead)
     kept = fitted.without(explanation.dropped)
     freedom = _freedom(kept, result)
-    p_value = float(stats.chi2.sf(result.chi2, freedom))
+    p_value = float(chi2.sf(result.chi2, freedom))
     verdict, standing = _verdict(explanation, findings, p_value, estimated, warnings)
     left = explanation.left
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         causes, result, left = (), before, explanation.first_kicks
         kept = fitted
-        p_value = float(stats.chi2.sf(before.chi2, _freedom(fitted, before)))
+        p_value = float(chi2.sf(before.chi2, _freedom(fitted, before)))
     fits = [before, result] if causes or result.kicks else [before]
     estimates: list[list[Cause]] = [[] for _ in fits]
     if small is not None:
@@ -327,7 +327,7 @@ def _misled(explanation: Explanation) -> bool:
     if not explanation.fit.causes:
         return False
     freedom = _freedom(explanation.problem.data, explanation.fit)
-    return explanation.count > 1 or bool(stats.chi2.sf(explanation.fit.chi2, freedom) < 0.01)
+    return explanation.count > 1 or bool(chi2.sf(explanation.fit.chi2, freedom) < 0.01)
 
 
 # --- after the search ----

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import sqrtm
 
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
@@ -62,11 +61,31 @@ def _identity(n: int) -> Quadratic:
     return Quadratic(np.zeros(n), np.eye(n), None)
 
 
-def _parts(source: Any, energy: float, split: bool) -> list[tuple[Array, Array, Array]]:
-    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element.
+Part = tuple[Array, Array, Array]
+
+ASKED = 5_000
+"""Elements' parts that are remembered, some 20 MB: a scan asks for each in many hypotheses."""
+
+_asked: dict[Hashable, list[Part]] = {}
+
+
+def _parts(source: Any, energy: float, split: bool) -> list[Part]:
+    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element: do not change them.
 
     With `split` the body comes as two halves, in the middle of the list.
     """
+    physics = _physics(source)
+    if isinstance(physics, int):
+        return _parts_of_ocelot(source, energy, split)
+    known = _asked.get((physics, energy, split))
+    if known is None:
+        if len(_asked) > ASKED:
+            _asked.clear()
+        known = _asked[physics, energy, split] = _parts_of_ocelot(source, energy, split)
+    return known
+
+
+def _parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
     from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
 
     atom = source.element
@@ -78,12 +97,25 @@ def _parts(source: Any, energy: float, split: bool) -> list[tuple[Array, Array, 
     if supported is None or SecondTM in supported:
         try:
             second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
-            return [(p.B.ravel(), p.get_rotated_R(), p.get_rotated_T()) for p in second]
+            return [(p.B.ravel(), *_tilted(p.R, p.T, p.tilt)) for p in second]
         except (AttributeError, NotImplementedError):
             pass  # it has no second order: a linear element
     zero = np.zeros((6, 6, 6))
     linear = zip(source.B(energy), source.R(energy), strict=True)
     return [(B.ravel(), R, zero) for B, R in linear]
+
+
+def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
+    """R and T in axes that are turned by the tilt: what OCELOT's `get_rotated_R` and `_T` say.
+
+    The latter is compiled when first called, which takes longer than all maps of a ring.
+    """
+    if tilt == 0:
+        return R, T
+    from tmlattice.lattice.ocelot import rot_mtx
+
+    there, back = rot_mtx(tilt), rot_mtx(-tilt)
+    return back @ R @ there, np.tensordot(back, there.T @ T @ there, 1)
 
 
 def _physics(source: Any) -> Hashable:
@@ -95,7 +127,7 @@ def _physics(source: Any) -> Hashable:
     return id(source)  # it holds more than numbers: a matrix, a field map
 
 
-def _of_ocelot(part: tuple[Array, Array, Array], n: int) -> Quadratic:
+def _of_ocelot(part: Part, n: int) -> Quadratic:
     B, R, T = part
     bent = T[:n, :n, :n]
     bent = 0.5 * (bent + bent.swapaxes(1, 2))
@@ -147,6 +179,8 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
     if len(parts) > 1:
         middle = len(parts) // 2
         return _chain(parts[:middle]), _chain(parts[middle:])
+    from scipy.linalg import sqrtm
+
     root = np.array(np.real(sqrtm(parts[0].R)), dtype=np.float64)  # a bare matrix
     back: Array = np.linalg.inv(root).astype(np.float64)
     first = Quadratic(np.zeros(n), root, None)
@@ -450,10 +484,14 @@ def ring_matrix(ring: Ring) -> Array:
     element has `errors`, its linear map about the design axis stands in.
     """
     total = np.eye(4)
+    known: dict[Hashable, list[Array]] = {}
     for element in ring.elements:
         if element.errors != NO_ERRORS:
             total = _quadratic(element, ring.energy, 6).R[:4, :4] @ total
             continue
-        for matrix in element.source.R(ring.energy):
-            total = matrix[:4, :4] @ total
+        physics = _physics(element.source)
+        if physics not in known:
+            known[physics] = [matrix[:4, :4] for matrix in element.source.R(ring.energy)]
+        for matrix in known[physics]:
+            total = matrix @ total
     return total
