@@ -4,8 +4,9 @@
 and half of scipy. Everything in this package that needs OCELOT imports it from here, when it is
 needed, and then only its elements are loaded:
 
-- `ocelot` itself is run when a name of it is first used (`from ocelot import *`, `ocelot.twiss`):
-  then it is whole, with the same classes. Where it was imported before, it is taken as it is.
+- `ocelot` itself is run when a name of it other than an element is first used (`ocelot.twiss`,
+  `from ocelot import *`): then it is whole, with the same classes. Where it was imported before,
+  it is taken as it is.
 - What OCELOT would compile while it is imported is compiled when it is first called.
 - `LATER` are loaded when OCELOT first uses them.
 
@@ -14,6 +15,7 @@ Where a version of OCELOT does not bear this, it is imported whole.
 
 import contextlib
 import importlib.util
+import inspect
 import io
 import logging
 import sys
@@ -39,6 +41,9 @@ class _Package(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") and name not in ("__all__", "__version__"):
             raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
+        elements = sys.modules.get("ocelot.cpbd.elements")
+        if name in getattr(elements, "__all__", ()):  # all that most lattice files ask for
+            return getattr(elements, name)
         self.__class__ = ModuleType  # type: ignore[assignment]
         spec = self.__spec__
         assert spec is not None
@@ -60,6 +65,15 @@ class _Later(ModuleType):
             return getattr(import_module(self.__name__), name)(*args, **options)
 
         return call
+
+
+def _depth(context: int = 1) -> list[Any]:
+    """A list as long as the stack: OCELOT counts it, and `inspect.stack` reads all its source."""
+    frames = []
+    frame = inspect.currentframe()
+    while frame := frame and frame.f_back:
+        frames.append(frame)
+    return frames
 
 
 @contextlib.contextmanager
@@ -84,10 +98,11 @@ def _light() -> Iterator[None]:
     package.__path__ = list(spec.submodule_search_locations)
     package.__loader__, package.__package__ = spec.loader, "ocelot"
     stand_ins = {name: _Later(name) for name in LATER if name not in sys.modules}
-    jit, njit = numba.jit, numba.njit
+    jit, njit, stack = numba.jit, numba.njit, inspect.stack
     sys.modules["ocelot"] = package
     sys.modules.update(stand_ins)
     numba.jit, numba.njit = uncompiled(jit), uncompiled(njit)
+    inspect.stack = _depth  # type: ignore[assignment]
     try:
         yield
     except BaseException:
@@ -95,7 +110,7 @@ def _light() -> Iterator[None]:
             del sys.modules[name]
         raise
     finally:
-        numba.jit, numba.njit = jit, njit
+        numba.jit, numba.njit, inspect.stack = jit, njit, stack
         for name in stand_ins:
             del sys.modules[name]
 

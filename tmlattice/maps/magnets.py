@@ -363,6 +363,7 @@ class LayerMaps:
         self._known: dict[Hashable, Quadratic] = {}
         self._kept: list[Any] = []
         self._ways: dict[int, Quadratic] = {}
+        self._equal: dict[Hashable, Quadratic] = {}
 
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
@@ -387,11 +388,15 @@ class LayerMaps:
         return int(self._first[k])
 
     def way(self, k: int) -> Quadratic:
-        """From the exit of layer k - 1 to the entrance of its magnet."""
+        """From the exit of layer k - 1 to the entrance of its magnet; one object for equal ways."""
         if k not in self._ways:
             between = self.ring.elements[self._first[k] : self._first[k + 1] - 1]
-            parts = [self.map(e) for e in between if _moves(e)]
-            self._ways[k] = _chain([_identity(self.dimension), *parts])
+            moving = [e for e in between if _moves(e)]
+            physics = tuple(self.physics(e) for e in moving)
+            if physics not in self._equal:
+                parts = [self.map(e) for e in moving]
+                self._equal[physics] = _chain([_identity(self.dimension), *parts])
+            self._ways[k] = self._equal[physics]
         return self._ways[k]
 
     def layer(
