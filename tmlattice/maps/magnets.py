@@ -40,13 +40,13 @@ class Quadratic:
     def after(self, first: "Quadratic") -> "Quadratic":
         """This after `first`, to second order in x."""
         if self.T is None:
-            bent = None if first.T is None else np.tensordot(self.R, first.T, 1)
+            bent = None if first.T is None else _on_rows(self.R, first.T)
             return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
         fed = self.T @ first.B  # [out, n]: what the constant part feeds down, half of it
         slope = self.R + 2.0 * fed
         bent = first.R.T @ self.T @ first.R
         if first.T is not None:
-            bent = bent + np.tensordot(slope, first.T, 1)
+            bent = bent + _on_rows(slope, first.T)
         return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
 
     def reduced(self) -> tuple[Array, Array, Array]:
@@ -55,6 +55,12 @@ class Quadratic:
         if self.T is None:
             return self.B, self.R, np.zeros((len(self.B), len(i)))
         return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
+
+
+def _on_rows(matrix: Array, T: Array) -> Array:
+    """`np.tensordot(matrix, T, 1)`, whose checks cost more than the product."""
+    rows, n = len(T), T.shape[-1]
+    return (matrix @ T.reshape(rows, n * n)).reshape(-1, n, n)
 
 
 def _identity(n: int) -> Quadratic:
@@ -364,11 +370,18 @@ class LayerMaps:
         self._kept: list[Any] = []
         self._ways: dict[int, Quadratic] = {}
         self._equal: dict[Hashable, Quadratic] = {}
+        self._layers: dict[Hashable, tuple[Weights, list[Weights]]] = {}
 
-    @staticmethod
-    def physics(element: Element) -> tuple[Hashable, Hashable]:
+    @cached_property
+    def _own(self) -> dict[int, Hashable]:
+        """The physics of the ring's own sources, by id: they live as long as the ring."""
+        sources = {id(element.source): element.source for element in self.ring.elements}
+        return {key: _physics(source) for key, source in sources.items()}
+
+    def physics(self, element: Element) -> tuple[Hashable, Hashable]:
         """Equal for elements with equal maps."""
-        return (_physics(element.source), element.errors)
+        source = element.source
+        return (self._own.get(id(source)) or _physics(source), element.errors)
 
     def map(self, element: Element) -> Quadratic:
         """The map of one element, of this ring or not."""
@@ -402,18 +415,26 @@ class LayerMaps:
     def layer(
         self, k: int, replaced: Mapping[int, Element] | None = None
     ) -> tuple[Weights, list[Weights]]:
-        """The weights of layer k, and the read-outs of the monitors before its magnet.
+        """The weights of layer k, and the read-outs of the monitors before its magnet: do not
+        change them, equal layers share them.
 
         Args:
             k: up to the number of layers, which names the way from the last magnet to the end.
             replaced: other elements at places of the ring.
         """
+        first, last = self._first[k : k + 2]
+        own = self.ring.elements[first:last]
+        if replaced:
+            return self._composed([replaced.get(first + i, e) for i, e in enumerate(own)])
+        physics = tuple((self.physics(e), e.kind == "monitor") for e in own)
+        if physics not in self._layers:
+            self._layers[physics] = self._composed(own)
+        return self._layers[physics]
+
+    def _composed(self, elements: Iterable[Element]) -> tuple[Weights, list[Weights]]:
         way = _identity(self.dimension)
         readouts = []
-        for place in range(self._first[k], self._first[k + 1]):
-            element = self.ring.elements[place]
-            if replaced:
-                element = replaced.get(place, element)
+        for element in elements:
             if element.kind == "monitor":  # read in its middle; nearly all have no length
                 half = element.length / 2
                 here = _drift(half, self.dimension).after(way) if half else way
