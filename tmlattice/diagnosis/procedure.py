@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.background import SmallErrors, small_errors
@@ -23,6 +22,7 @@ from tmlattice.diagnosis.prepare import Prepared, prepare, same_monitors
 from tmlattice.diagnosis.result import Diagnosis, Finding, ring_tunes
 from tmlattice.effects import Cause, apply, background_rms, find, names
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Fit, Outcome
@@ -204,7 +204,7 @@ def _misled(explanation: Explanation) -> bool:
     if not explanation.fit.causes:
         return False
     freedom = _freedom(turns_of(explanation).data, explanation.fit)
-    return explanation.count > 1 or bool(stats.chi2.sf(explanation.fit.chi2, freedom) < 0.01)
+    return explanation.count > 1 or bool(chi2.sf(explanation.fit.chi2, freedom) < 0.01)
 
 
 def _freedom(data: Data, result: Fit) -> int:
@@ -251,12 +251,12 @@ def _told(
 ) -> _Told:
     result, problem, left = explanation.fit, turns_of(explanation), explanation.left
     findings = findings_of(ring, explanation, ready.dead, judgement)
-    p_value = float(stats.chi2.sf(result.chi2, _freedom(problem.data, result)))
+    p_value = float(chi2.sf(result.chi2, _freedom(problem.data, result)))
     verdict, standing, said = verdict_of(explanation, findings, p_value, ready.estimated, judgement)
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         result, left = explanation.before, explanation.first_kicks
         problem = ready.problem if small is None else small.problem
-        p_value = float(stats.chi2.sf(result.chi2, _freedom(problem.data, result)))
+        p_value = float(chi2.sf(result.chi2, _freedom(problem.data, result)))
     elif result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     fits = [explanation.before, result] if result.causes or result.kicks else [explanation.before]

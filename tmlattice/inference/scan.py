@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.special import logsumexp
 
 from tmlattice.effects import find
+from tmlattice.inference import chi2
 from tmlattice.inference.metric import Hypothesis, Metric
 
 Array = NDArray[np.float64]
@@ -58,12 +58,12 @@ class Scan:
 
 def look_elsewhere(statistic: float, freedom: int, effective: float) -> float:
     """Chance that the largest of `effective` chi-squares of so many degrees reaches this."""
-    return float(-np.expm1(effective * np.log1p(-stats.chi2.sf(statistic, freedom))))
+    return float(-np.expm1(effective * np.log1p(-chi2.sf(statistic, freedom))))
 
 
 def free_threshold(rate: float, freedom: int, effective: float) -> float:
     """The chi-square of so many degrees that the largest of `effective` reaches at this rate."""
-    return float(stats.chi2.isf(-np.expm1(np.log1p(-rate) / effective), freedom))
+    return float(chi2.isf(-np.expm1(np.log1p(-rate) / effective), freedom))
 
 
 def effective_number(largest: Array, freedom: int) -> float:
@@ -71,7 +71,7 @@ def effective_number(largest: Array, freedom: int) -> float:
 
     The exponent N of F(t)^N has the estimate -draws / sum log F(t).
     """
-    tail = stats.chi2.sf(largest, freedom)
+    tail = chi2.sf(largest, freedom)
     return float(max(len(largest) / -np.log1p(-tail).sum(), 1.0))
 
 
