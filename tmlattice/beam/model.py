@@ -30,6 +30,7 @@ from tmlattice.effects import (
     directions,
     find,
     monitors_with,
+    names,
     set_elements,
 )
 from tmlattice.effects.settings import groups
@@ -347,8 +348,9 @@ class Model:
         tangents = np.empty((self.shots, len(order) + 1, n, n))
         states[:, 0] = self._states(launches)
         for cause in causes:
-            if cause.effect == "energy_offset":
-                states[self.active, 0, 5] += cause.amount
+            effect = find(cause.effect)
+            if isinstance(effect, LaunchEffect) and effect.shifts is not None:
+                states[self.active, 0, effect.shifts] += cause.amount
         tangents[:, 0] = np.eye(n)
         slopes = np.empty((self.shots, self.turns * len(self.at), 2, n))
         where = self._where()
@@ -387,11 +389,10 @@ class Model:
         Effects that are there or not (swapped, dead) are included; the energy's only in six
         coordinates.
         """
-        chosen = list(CATALOGUE) if effects is None else list(effects)
+        chosen = names() if effects is None else list(effects)
         found: list[Hypothesis] = []
         for name in chosen:
-            energy = isinstance(CATALOGUE[name], LaunchEffect) or name.startswith("radiation")
-            if not (energy and self.dimension == 4):
+            if not (CATALOGUE[name].energy and self.dimension == 4):
                 found += [(name, place) for place in CATALOGUE[name].places(self.ring)]
         return found
 

@@ -16,10 +16,11 @@ from scipy import stats
 
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.diagnosis.background import SmallErrors, small_errors
+from tmlattice.diagnosis.choice import chosen_effects
 from tmlattice.diagnosis.gap import held_out_gap, misfit
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, Member, ring_tunes
-from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
+from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, expected_radiation, find
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.inference.newton import Fit, Problem, fit
 from tmlattice.inference.scan import FreeScan, look_elsewhere
@@ -81,6 +82,7 @@ def diagnose(
     Raises:
         MeasurementError: data that cannot be used, or that are of another lattice.
         UnknownNameError: a monitor or an effect that does not exist.
+        EffectError: none of the effects can be looked for.
     """
     begun = time.perf_counter()
     options = {
@@ -92,20 +94,19 @@ def diagnose(
         "radiation": radiation,
         "false_alarm": false_alarm,
     }
-    chosen = [name for name in names(effects) if name != "monitor_dead"]
     warnings: list[str] = []
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
             warnings.append("one shot: none is held out, so nobody judges the gap")
-    known = [Cause(f"radiation_loss_{k}", None, 1.0) for k in ("bends", "wigglers") if radiation]
-    known = [cause for cause in known if find(cause.effect).places(ring)]
+    known = expected_radiation(ring) if radiation else []
 
     data = of_measurement(ring, measurement)
     if reference is not None:
         before_fault = of_measurement(ring, reference, reference=True)
         data = joined(before_fault, data)
         background = {"all": None} if background is None else background
+    chosen = chosen_effects(ring, effects, data.launch_sigma)
     progress("model")
     model = Model(ring, data.settings, data.turns, known, active=data.active)
     listed = {name.casefold() for name in measurement.monitors}
@@ -131,12 +132,9 @@ def diagnose(
             return Problem(model, kept, Whitening(kept, spread), places)
 
         progress("scan")
-        hypotheses = model.hypotheses(chosen)
-        if (data.launch_sigma[:, 4] > 0).any():  # the energy of every shot is free
-            hypotheses = [h for h in hypotheses if h[0] != "energy_offset"]
         return explain(
             problem_without(nobody),
-            hypotheses,
+            model.hypotheses(chosen),
             before,
             problem_without,
             most=most,

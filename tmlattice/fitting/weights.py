@@ -101,7 +101,7 @@ def layer_effects(
     """
     chosen = [name for name in names(effects) if isinstance(CATALOGUE[name], RingEffect)]
     if dimension == 4:
-        chosen = [name for name in chosen if not name.startswith("radiation")]
+        chosen = [name for name in chosen if not CATALOGUE[name].energy]
     asked = [(name, place) for name in chosen for place in CATALOGUE[name].places(ring)]
     d = directions(LayerMaps(ring, dimension), asked)
     rows = np.bincount(d.owner, minlength=len(asked))
