@@ -525,7 +525,6 @@ def test_effects_on_readings_and_beam_are_the_callers(small_ring):
         (Cause("radiation_loss_bends", "bend::1", 0.1), EffectError, "leave 'bend::1' out"),
         (Cause("radiation_loss_bends", None, -0.1), LatticeError, "cannot be negative"),
         (Cause("radiation_loss_bends", None, 1e4), LatticeError, "give voltage="),
-        (Cause("radiation_loss_wigglers", None, 1.0), EffectError, "no place in 'small_ring"),
     ],
 )
 def test_a_cause_that_cannot_be_is_named(small_ring, cause, error, message):

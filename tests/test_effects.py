@@ -1,5 +1,7 @@
 """Every effect of the catalogue: its derivative against the finite change of the tracked turn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from places import PLACES, THIN, kicked
@@ -264,6 +266,12 @@ def test_energy_spread_is_a_gaussian_average():
 def test_impossible_causes_are_refused_with_the_mend(petra3, cause, error, says):
     with pytest.raises(error, match=says):
         check(petra3, [cause])
+
+
+def test_an_effect_without_a_place_is_refused(small_ring):
+    bare = [e for e in small_ring.elements if e.kind != "wiggler"]
+    with pytest.raises(EffectError, match=r"no place in .*wigglers"):
+        check(replace(small_ring, elements=bare), [Cause("radiation_loss_wigglers", None, 1.0)])
 
 
 def test_wrong_settings_are_refused(petra3):

@@ -72,7 +72,7 @@ def diagnose(
             every usual one.
         holdout: share of the shots that the fit does not see, for the gap.
         heldout: those shots themselves, instead of a share.
-        effects: names of those that may be the cause; else the whole catalogue.
+        effects: names of those that may be the cause; else all usual ones of the catalogue.
         max_effects: findings at most.
         radiation: the model radiates as expected.
         false_alarm: share of faultless data sets in which something may be found.

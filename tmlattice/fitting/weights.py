@@ -94,7 +94,7 @@ def layer_effects(
     Args:
         ring: the design.
         dimension: of the network, 4 or 6.
-        effects: names; else the whole catalogue.
+        effects: names; else all usual ones.
 
     Raises:
         UnknownNameError: an effect that does not exist.

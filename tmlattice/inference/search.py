@@ -330,7 +330,7 @@ class _Search:
         """What could be done next."""
         problem = self.problem
         options = []
-        statistic = float(found.statistic.max())
+        statistic = float(found.statistic.max(initial=0.0))  # none may have a name
         rate = self.rate * SHARES["named"]
         detection = Detection(statistic, found.threshold(rate), found.p_value(statistic))
         if detection.p_value < rate:
