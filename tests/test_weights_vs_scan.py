@@ -15,12 +15,8 @@ from tmlattice import TaylorMap, TaylorNetwork, fine_tune
 from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.errors import LatticeError, MeasurementError
-from tmlattice.fitting.weights import (
-    layer_effects,
-    read_gradient,
-    read_network,
-    symplectic_directions,
-)
+from tmlattice.fitting.weight_parts import layer_effects, symplectic_directions
+from tmlattice.fitting.weights import read_gradient, read_network
 from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import scan
 from tmlattice.machine import simulate

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.assembly import Assembly
 from tmlattice.beam.chain import LayerChain, chain
-from tmlattice.effects import Cause, changed_elements
+from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
-from tmlattice.maps import LayerMaps, RingMaps
 from tmlattice.maps.taylor import symplectic_form
 
 Array = NDArray[np.float64]
@@ -151,11 +151,12 @@ class RingTunes:
     """Tunes of a ring with causes in it, about the axis: quick for many causes, one after another.
 
     Args:
-        layers, maps: of the ring without.
+        assembly: of the ring without.
     """
 
-    def __init__(self, layers: LayerMaps, maps: RingMaps) -> None:
-        self.layers = layers
+    def __init__(self, assembly: Assembly) -> None:
+        self.assembly = assembly
+        maps = assembly.maps
         steps = np.concatenate([maps.W1, maps.closing.coefficients[1][None]])[:, :4, :4]
         self._upto = np.empty((len(steps) + 1, 4, 4))
         self._upto[0] = np.eye(4)
@@ -168,10 +169,9 @@ class RingTunes:
         Raises:
             UnstableRingError: there are none.
         """
-        replaced = changed_elements(self.layers.ring, causes)
         turn, last = np.eye(4), 0
-        for k in sorted({int(self.layers.layer_of[place]) for place in replaced}):
-            matrix = self.layers.layer(k, replaced)[0][1]
+        changed = self.assembly.layers_with(self.assembly.changed({}, causes))
+        for k, ((_, matrix, _), _) in sorted(changed.items()):
             turn = matrix[:4, :4] @ self._between(last, k) @ turn
             last = k + 1
         return matrix_tunes(self._between(last, len(self._upto) - 1) @ turn)

@@ -98,7 +98,7 @@ def fit_sparse(
         ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
     )
     best = _settled(found)
-    turn = RingTunes(turns_of(found).model.layers, turns_of(found).model.maps)
+    turn = RingTunes(turns_of(found).model.assembly)
     tunes = turn.of(best.causes)
     errors = np.sqrt(np.diag(best.covariance))
     chi2 = [found.before.chi2, best.chi2][: 1 + bool(best.causes)]
