@@ -9,10 +9,11 @@ from torch import Tensor
 
 from tmlattice.beam import flows, sweeps
 from tmlattice.beam.aperture import check_alive
-from tmlattice.beam.chain import chain
+from tmlattice.beam.chain import Chain, chain
 from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
 from tmlattice.maps.taylor import second_derivatives, symplectic_form
+from tmlattice.network.base import NetworkChain
 from tmlattice.network.generators import (
     cubic_generator,
     field,
@@ -21,7 +22,6 @@ from tmlattice.network.generators import (
     nearest_symplectic,
     pull_field,
 )
-from tmlattice.network.network import NetworkChain, TaylorNetwork
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -127,7 +127,7 @@ class SymplecticNetwork(NetworkChain):
         self.register_buffer("design", torch.from_numpy(generator.copy()))
 
     @classmethod
-    def from_network(cls, network: TaylorNetwork) -> "SymplecticNetwork":
+    def from_network(cls, network: Chain) -> "SymplecticNetwork":
         """Layers that agree with a network's to second order.
 
         Args:
