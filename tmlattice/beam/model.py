@@ -276,7 +276,8 @@ class Model:
 
     def _turned(self, monitors: Array, slopes: Array) -> Array:
         by_turn = slopes.reshape(self.shots, self.turns, -1, 2, self.dimension)
-        return np.einsum("smij,stmjk->stmik", monitors, by_turn).reshape(slopes.shape)
+        turned = np.einsum("smij,stmjk->stmik", monitors, by_turn)
+        return np.asarray(turned.reshape(slopes.shape))
 
     # --- hypotheses -----------------------------------------------------------------------------
     def hypotheses(self, effects: Sequence[str] | None = None) -> list[Hypothesis]:

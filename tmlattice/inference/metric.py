@@ -126,10 +126,7 @@ class Metric:
 
     def _changed_readings(self, name: str) -> Array:
         """d readings / d amount of an effect at every monitor, [shot, reading, 2]."""
-        effect = find(name)
-        assert isinstance(effect, ReadingEffect)
-        h = 1.0 if effect.discrete else 1e-6
-        return np.asarray(np.nan_to_num(effect.change(self.paths.beam, h) / h))
+        return np.asarray(np.nan_to_num(self.model.reading_signatures(self.paths, name)))
 
     # --- what has no name -----------------------------------------------------------------------
     def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:

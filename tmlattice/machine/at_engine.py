@@ -71,7 +71,7 @@ OF_THE_BEAM = ("energy_offset", "energy_spread")
 
 SET_ON: Mapping[str, frozenset[str]] = {
     "kick": _CORRECTOR,
-    "k1_relative": frozenset({"quadrupole"}),
+    "k1_relative": frozenset({"quadrupole", "bend"}),
     "k2_relative": frozenset({"sextupole"}),
 }
 _SWAPPED = [0, 1, 2, 3, 5, 4]
@@ -98,7 +98,7 @@ class AtEngine:
         steps: fourth-order integration steps per magnet. With 30 the first turn of a
             PETRA-III-style ring is converged to 0.002 micrometres rms at 1 mm (0.01 with 20).
         aperture: half width in m of quadrupoles and monitors, in both planes.
-        harmonic: of the RF; else that of the ring's first cavity, else the one nearest to 500 MHz.
+        harmonic: of the RF; else that of the ring's first cavity, else the one of `rf_of`.
         voltage: of the RF in V, all cavities together; else that of the ring's cavities, else
             four times what the design loses when it radiates as expected.
 
@@ -177,8 +177,8 @@ class AtEngine:
             launches: (x, px, y, py, tau, p) at the start of the sequence, [shot, 6].
             turns: at least 1.
             settings: one mapping a shot, of element name to what is set: `kick` of a corrector
-                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole,
-                `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
+                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole
+                or a bend, `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
 
         Returns:
             (x, y) in m, [shot, turn, monitor, 2]; NaN from where a particle is lost.
@@ -625,6 +625,7 @@ class _Builder:
             raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
         roll = errors["dipole_roll"]
         horizontal = angle * errors["dipole_field"] - roll**2 * angle / 2  # what px loses
+        k1 = element.k1 * (1 + setting["k1_relative"])
         # The body is exact in a step; only its errors, losses and gradients are spread.
         steps = self.steps if element.k1 or element.k2 else 4
         more: dict[str, Any] = {}
@@ -636,7 +637,7 @@ class _Builder:
                 element.name,
                 share * length,
                 share * angle,
-                PolynomB=[horizontal / length, element.k1, element.k2 / 2, 0.0],
+                PolynomB=[horizontal / length, k1, element.k2 / 2, 0.0],
                 PolynomA=[-roll * angle / length, 0.0, 0.0, 0.0],
                 NumIntSteps=steps,
                 PassMethod=self.bend_pass,
