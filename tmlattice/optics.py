@@ -10,13 +10,16 @@ along the closed orbit, the betas and phases come from carrying its eigenvectors
 >>> off_momentum(TaylorNetwork.from_ring(ring, 6)).chromaticity
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.chain import LayerChain
+from tmlattice.effects import Cause, changed_elements
 from tmlattice.errors import UnstableRingError
+from tmlattice.maps import LayerMaps, RingMaps
 from tmlattice.maps.taylor import symplectic_form
 
 Array = NDArray[np.float64]
@@ -137,6 +140,45 @@ def matrix_tunes(matrix: Array) -> Array:
     """
     values, _ = normal_modes(matrix)
     return _fractions(values)
+
+
+def short_way(difference: Array) -> Array:
+    """Differences of tunes the short way round their circle."""
+    return np.asarray((difference + 0.5) % 1.0 - 0.5)
+
+
+class RingTunes:
+    """Tunes of a ring with causes in it, about the axis: quick for many causes, one after another.
+
+    Args:
+        layers, maps: of the ring without.
+    """
+
+    def __init__(self, layers: LayerMaps, maps: RingMaps) -> None:
+        self.layers = layers
+        steps = np.concatenate([maps.W1, maps.closing.coefficients[1][None]])[:, :4, :4]
+        self._upto = np.empty((len(steps) + 1, 4, 4))
+        self._upto[0] = np.eye(4)
+        for k, step in enumerate(steps):
+            self._upto[k + 1] = step @ self._upto[k]
+
+    def of(self, causes: Sequence[Cause]) -> Array:
+        """Fractional tunes (x, y), [2].
+
+        Raises:
+            UnstableRingError: there are none.
+        """
+        replaced = changed_elements(self.layers.ring, causes)
+        turn, last = np.eye(4), 0
+        for k in sorted({int(self.layers.layer_of[place]) for place in replaced}):
+            matrix = self.layers.layer(k, replaced)[0][1]
+            turn = matrix[:4, :4] @ self._between(last, k) @ turn
+            last = k + 1
+        return matrix_tunes(self._between(last, len(self._upto) - 1) @ turn)
+
+    def _between(self, first: int, last: int) -> Array:
+        """The matrix from one exit to a later one, [4, 4]."""
+        return np.asarray(self._upto[last] @ np.linalg.inv(self._upto[first]))
 
 
 def _fractions(values: ComplexArray) -> Array:

@@ -19,7 +19,6 @@ from tmlattice.beam.sweeps import curved
 from tmlattice.errors import BeamLostError, UnstableRingError
 from tmlattice.lattice.ring import Ring
 from tmlattice.maps import RingMaps, TaylorMap, ring_maps
-from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
 
@@ -86,7 +85,7 @@ def first_pass(
 class LayerChain:
     """What every chain of layers has: names, launches, tracking, the map of a turn.
 
-    A chain says how its layers send states (`_forward`, `_track`) and what their Jacobians are.
+    A chain says how its layers send states (`_forward`, `_track`, `tangents`).
 
     Attributes:
         maps: what it was made from; names and places of layers and monitors.
@@ -104,9 +103,9 @@ class LayerChain:
         """Fill history [block, 1:, n, lane] from history[:, 0]: the start of every turn."""
         raise NotImplementedError
 
-    def jacobians(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
-        the layers and of the closing way there [layer + 1, n, n]."""
+    def tangents(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
+        from the start to there, d state / d launch, [layer + 2, n, n]."""
         raise NotImplementedError
 
     @property
@@ -205,12 +204,6 @@ class LayerChain:
         path, total = self.tangents(x)
         return path[-1], total[-1]
 
-    def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
-        from the start to there, d state / d launch, [layer + 2, n, n]."""
-        path, matrices = self.jacobians(x)
-        return path, products(matrices)
-
     def closed_orbit(
         self,
         start: ArrayLike | None = None,
@@ -302,18 +295,6 @@ class Chain(LayerChain):
         turn = self.turn()
         sweeps.run(sweeps.track, len(history), size, *turn.W, turn.curved, history)
 
-    def jacobians(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
-        the layers and of the closing way there [layer + 1, n, n]."""
-        turn = self.turn()
-        size = sweeps.size_of(self.dimension, 1)
-        states = np.empty((1, turn.steps + 1, self.dimension, 1))
-        states[0, 0, :, 0] = x
-        sweeps.run(sweeps.forward, 1, size, *turn.W, turn.curved, states)
-        path = states[0, :, :, 0]
-        slopes = np.einsum("kaij,kj->kai", second_derivatives(turn.W[2]), path[:-1])
-        return path, turn.W[1] + slopes
-
     def tangents(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
         from the start to there, d state / d launch, [layer + 2, n, n]."""
@@ -337,3 +318,11 @@ class Chain(LayerChain):
         rf = cavities.exits, cavities.values
         kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
         return states[0], tangents[0]
+
+
+def tangents(network: LayerChain, x: Array) -> tuple[Array, Array, Array]:
+    """States [layer + 1, n] at the launch x [n] and all exits, Jacobians M [layer + 1, n, n] of
+    them by the launch, and the inverses of these."""
+    path, total = network.tangents(x)
+    M = total[:-1]
+    return path[:-1], M, np.asarray(np.linalg.inv(M), dtype=float)

@@ -83,7 +83,7 @@ class Model:
         active: shots in which causes are there; the others are of the ring without, [shot].
 
     Attributes:
-        ring, maps: with what is known.
+        ring, layers, maps: with what is known.
         groups: shots with equal settings.
         steps: of a turn.
         where: the state that each reading is made from, [reading].
@@ -108,7 +108,7 @@ class Model:
         self.dimension = dimension
         self.assembly = assembly(ring, known, dimension)
         self.ring, self.maps = self.assembly.ring, self.assembly.maps
-        self.at = self.maps.at
+        self.layers, self.at = self.assembly.layers, self.maps.at
         self._known_monitors = monitors_with(ring, known)
         self._monitor = {name: m for m, name in enumerate(self.maps.monitors)}
         self._made: dict[tuple[int, tuple[Cause, ...], int], LayerParts] = {}

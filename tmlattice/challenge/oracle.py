@@ -18,8 +18,8 @@ from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.diagnosis.background import background_signatures
 from tmlattice.effects import Cause, RingEffect, find, names
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import effective_number, free_threshold
-from tmlattice.inference.search import FALSE_ALARM
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import draw_background
 from tmlattice.observe.data import Data, joined, of_measurement
@@ -139,7 +139,7 @@ class Oracle:
         draws = np.random.default_rng([seed, 7]).standard_normal((DRAWS, self.whitening.rows))
         inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
         largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
-        return free_threshold(FALSE_ALARM, 1, effective_number(largest, 1))
+        return free_threshold(DEFAULT.false_alarm, 1, effective_number(largest, 1))
 
 
 def _best(

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,12 +34,13 @@ from tmlattice.challenge.record import (
     oracle_answer,
     stated,
 )
-from tmlattice.diagnosis.gap import held_out_gap
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference.judge import held_out_gap
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns, judged
 
 FORMAT = "tmlattice-challenge"
 
@@ -244,7 +246,9 @@ def clean_gap(
         if cause.effect == "monitor_dead":
             dropped[:, monitors.index(str(cause.element))] = True
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
-    gap = held_out_gap([Model(ring, data.settings)] * 2, data, [(), causes])
+    design = FirstTurns(model=Model(ring, data.settings), data=data, places={})
+    found = replace(design, fixed=tuple(causes))
+    gap = held_out_gap([judged(problem, data.launches) for problem in (design, found)])
     return {"clean_before": gap.misfits[0].rms, "clean_after": gap.misfits[-1].rms}
 
 

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from tmlattice.diagnosis.result import ring_tunes
 from tmlattice.effects import Cause, apply
+from tmlattice.inference import chi2
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.calibration import CALIBRATES

@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from tmlattice.beam.model import Model
-from tmlattice.diagnosis.gap import Gap, Misfit
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.search import Detection, Explanation
+from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.rivals import Detection
+from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.maps.magnets import ring_matrix
 from tmlattice.observe.data import Data
@@ -114,6 +115,7 @@ class Diagnosis:
         next: the shot that would tell the likeliest rivals apart, or None.
         sensitivity: by effect, the amount that would be seen at half of its places.
         warnings: what a reader should know.
+        left_out: single readings that the search left out: shot, turn, monitor, plane.
         noise: rms of a reading, m, (x, y).
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options, seed, seconds.
@@ -133,6 +135,7 @@ class Diagnosis:
     next: NextMeasurement | None
     sensitivity: dict[str, float]
     warnings: tuple[str, ...]
+    left_out: tuple[dict[str, Any], ...]
     noise: tuple[float, float]
     noise_estimated: bool
     provenance: dict[str, Any]
@@ -184,6 +187,7 @@ class Diagnosis:
             "next_measurement": None if self.next is None else self.next.as_json(),
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
+            "left_out": [dict(row) for row in self.left_out],
             "provenance": self.provenance,
         }
 

@@ -84,6 +84,7 @@ def directions(
     """
     ring, n = layers.ring, layers.dimension
     known: dict[Hashable, Quadratic | None] = {}
+    moved: dict[Hashable, Weights] = {}
     rows = _Rows(n, n)
     reads = _Rows(2, n)
     first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
@@ -101,7 +102,10 @@ def directions(
                     known[key] = _derivative(layers, effect, element, h)
                 own = known[key]
                 if own is not None:
-                    rows.add(owner, k, own.after(layers.way(k)).reduced())
+                    way = layers.way(k)
+                    if (key, id(way)) not in moved:
+                        moved[key, id(way)] = own.after(way).reduced()
+                    rows.add(owner, k, moved[key, id(way)])
                 continue
             (up, up_read), (down, down_read) = (
                 layers.layer(k, {member: effect.changed(element, a, ring.energy)}) for a in (h, -h)
@@ -109,9 +113,9 @@ def directions(
             rows.add(owner, k, _slope(up, down, h))
             start = first_monitor[layers.first_element(k)]
             for i, (a, b) in enumerate(zip(up_read, down_read, strict=True)):
-                moved = _slope(a, b, h)
-                if any(m.any() for m in moved):
-                    reads.add(owner, int(start + i), moved)
+                slope = _slope(a, b, h)
+                if any(m.any() for m in slope):
+                    reads.add(owner, int(start + i), slope)
     return Directions(tuple(hypotheses), *rows.stacked(), *reads.stacked())
 
 

@@ -1,7 +1,7 @@
 """Fine-tuning by the paper's recipe: every weight free, Adam, and a symplectic penalty."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -142,7 +142,7 @@ def fit_adam(
     )
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the tensors are small: more threads only wait for each other
-    optimiser = torch.optim.Adam(moving, lr=learning_rate, fused=True)
+    step = _adam(moving, learning_rate)
     losses: list[float] = []
     penalties: list[float] = []
     best, best_epoch, best_weights = np.inf, 0, start
@@ -153,7 +153,8 @@ def fit_adam(
     bar = tqdm(range(epochs), "fine-tuning", unit="epoch", disable=None if progress else True)
     try:
         for epoch in bar:
-            optimiser.zero_grad()
+            for parameter in moving:
+                parameter.grad = None
             try:
                 readings = model(launch)
             except BeamLostError as error:
@@ -177,7 +178,7 @@ def fit_adam(
                 stopped = True
                 break
             torch.nn.utils.clip_grad_norm_(moving, clip)
-            optimiser.step()
+            step()
     finally:
         bar.close()
         torch.set_num_threads(threads)
@@ -203,6 +204,36 @@ def fit_adam(
             "patience": patience,
         },
     )
+
+
+def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
+    """One step of Adam with torch's defaults: its class would import torch's compiler, seconds."""
+    from torch.optim.adam import adam
+
+    mean, square = ([torch.zeros_like(p) for p in moving] for _ in range(2))
+    counts = [torch.zeros((), dtype=torch.float32) for _ in moving]
+
+    @torch.no_grad()
+    def step() -> None:
+        gradients = [p.grad for p in moving if p.grad is not None]
+        adam(
+            list(moving),
+            gradients,
+            mean,
+            square,
+            [],
+            counts,
+            fused=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
+
+    return step
 
 
 def _penalty(

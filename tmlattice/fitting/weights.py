@@ -36,8 +36,7 @@ from tmlattice.beam import tangents as kernels
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.effects import CATALOGUE, RingEffect, directions, names
 from tmlattice.errors import LatticeError, MeasurementError
-from tmlattice.inference.metric import behind
-from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import BLIND
 from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
@@ -46,6 +45,8 @@ from tmlattice.maps.taylor import kronecker_exponents, symplectic_form
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.observe.metric import behind
 from tmlattice.observe.noise import estimate
 
 Array = NDArray[np.float64]
@@ -377,8 +378,8 @@ class _Trajectories:
         self.model = model = Model(ring, data.settings, dimension=n)
         if not np.isfinite(data.sigma[data.valid]).all():
             rough = data.with_sigma(np.array([1e-4, 1e-4]))
-            first = fit(Problem(model, rough, Whitening(rough), {}), (), data.launches)
-            noise = estimate(data, first.paths)
+            first = fit(FirstTurns(model=model, data=rough, places={}), (), data.launches)
+            noise = estimate(data, first.point.view)
             if not (noise > 0).all():
                 raise MeasurementError(
                     "the noise of the readings is not given and cannot be estimated from so few; "
@@ -386,10 +387,11 @@ class _Trajectories:
                 )
             data = data.with_sigma(noise)
         whitening = Whitening(data)
-        found = fit(Problem(model, data, whitening, {}), (), data.launches)
-        self.launches, self.chi2 = found.launches, found.chi2
+        problem = FirstTurns(model=model, data=data, places={}, white=whitening)
+        found = fit(problem, (), data.launches)
+        self.launches, self.chi2 = found.nuisances, found.chi2
         self.readings = int(data.valid.sum())
-        paths = found.paths
+        paths = found.point.view
         self.states = np.ascontiguousarray(paths.states)
 
         shots, count = data.shots, len(model.at)

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.special import logsumexp
 
-from tmlattice.beam.model import Hypothesis
 from tmlattice.effects import find
-from tmlattice.inference.metric import Metric
+from tmlattice.inference import chi2
+from tmlattice.inference.metric import Hypothesis, Metric
 
 Array = NDArray[np.float64]
 
@@ -59,12 +58,12 @@ class Scan:
 
 def look_elsewhere(statistic: float, freedom: int, effective: float) -> float:
     """Chance that the largest of `effective` chi-squares of so many degrees reaches this."""
-    return float(-np.expm1(effective * np.log1p(-stats.chi2.sf(statistic, freedom))))
+    return float(-np.expm1(effective * np.log1p(-chi2.sf(statistic, freedom))))
 
 
 def free_threshold(rate: float, freedom: int, effective: float) -> float:
     """The chi-square of so many degrees that the largest of `effective` reaches at this rate."""
-    return float(stats.chi2.isf(-np.expm1(np.log1p(-rate) / effective), freedom))
+    return float(chi2.isf(-np.expm1(np.log1p(-rate) / effective), freedom))
 
 
 def effective_number(largest: Array, freedom: int) -> float:
@@ -72,13 +71,12 @@ def effective_number(largest: Array, freedom: int) -> float:
 
     The exponent N of F(t)^N has the estimate -draws / sum log F(t).
     """
-    tail = stats.chi2.sf(largest, freedom)
+    tail = chi2.sf(largest, freedom)
     return float(max(len(largest) / -np.log1p(-tail).sum(), 1.0))
 
 
 def scan(
     metric: Metric,
-    launches: Array,
     hypotheses: Sequence[Hypothesis],
     residual: Array,
     *,
@@ -89,18 +87,20 @@ def scan(
 
     Args:
         metric: of the data about the model's trajectories.
-        launches: those of the trajectories.
         hypotheses: see `Model.hypotheses`.
         residual: whitened rows, launches fitted.
         effective: number of independent hypotheses where it is known already; else simulated.
         seed: of the simulation.
     """
+    if not len(hypotheses):
+        nothing = np.zeros(0)
+        return Scan((), nothing, nothing, nothing, 1.0)
     draws = np.zeros((0, len(residual)))
     if effective is None:
         random = np.random.default_rng([seed, 1])
         draws = metric.projection.out(random.standard_normal((DRAWS, len(residual))))
     data = np.concatenate([metric.projection.out(residual)[None], draws])
-    sums = metric.products(hypotheses, launches, data)
+    sums = metric.products(hypotheses, data)
     norm = sums.whole - sums.inside
     reach = np.array([FAR * find(name).largest ** find(name).power for name, _ in hypotheses])
     seen = (norm > BLIND * sums.whole) & (norm * reach**2 > 1.0)
@@ -134,6 +134,11 @@ class FreeScan:
     statistic: Array
     freedom: NDArray[np.int64]
     amounts: Array
+
+
+_NOTHING = np.zeros(0)
+NO_SCAN = FreeScan(np.zeros(0, np.int64), _NOTHING, _NOTHING, np.zeros(0, np.int64), _NOTHING)
+"""Of no places at all."""
 
 
 _RATIOS = np.logspace(-1, 8, 46)

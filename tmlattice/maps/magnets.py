@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import sqrtm
 
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
@@ -41,13 +40,13 @@ class Quadratic:
     def after(self, first: "Quadratic") -> "Quadratic":
         """This after `first`, to second order in x."""
         if self.T is None:
-            bent = None if first.T is None else np.tensordot(self.R, first.T, 1)
+            bent = None if first.T is None else _on_rows(self.R, first.T)
             return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
         fed = self.T @ first.B  # [out, n]: what the constant part feeds down, half of it
         slope = self.R + 2.0 * fed
         bent = first.R.T @ self.T @ first.R
         if first.T is not None:
-            bent = bent + np.tensordot(slope, first.T, 1)
+            bent = bent + _on_rows(slope, first.T)
         return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
 
     def reduced(self) -> tuple[Array, Array, Array]:
@@ -63,15 +62,41 @@ FAINT = 3e-4
 (k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large)."""
 
 
+def _on_rows(matrix: Array, T: Array) -> Array:
+    """`np.tensordot(matrix, T, 1)`, whose checks cost more than the product."""
+    rows, n = len(T), T.shape[-1]
+    return (matrix @ T.reshape(rows, n * n)).reshape(-1, n, n)
+
+
 def _identity(n: int) -> Quadratic:
     return Quadratic(np.zeros(n), np.eye(n), None)
 
 
-def _parts(source: Any, energy: float, split: bool) -> list[tuple[Array, Array, Array]]:
-    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element.
+Part = tuple[Array, Array, Array]
+
+ASKED = 5_000
+"""Elements' parts that are remembered, some 20 MB: a scan asks for each in many hypotheses."""
+
+_asked: dict[Hashable, list[Part]] = {}
+
+
+def _parts(source: Any, energy: float, split: bool) -> list[Part]:
+    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element: do not change them.
 
     With `split` the body comes as two halves, in the middle of the list.
     """
+    physics = _physics(source)
+    if isinstance(physics, int):
+        return _parts_of_ocelot(source, energy, split)
+    known = _asked.get((physics, energy, split))
+    if known is None:
+        if len(_asked) > ASKED:
+            _asked.clear()
+        known = _asked[physics, energy, split] = _parts_of_ocelot(source, energy, split)
+    return known
+
+
+def _parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
     from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
 
     atom = source.element
@@ -83,12 +108,25 @@ def _parts(source: Any, energy: float, split: bool) -> list[tuple[Array, Array, 
     if supported is None or SecondTM in supported:
         try:
             second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
-            return [(p.B.ravel(), p.get_rotated_R(), p.get_rotated_T()) for p in second]
+            return [(p.B.ravel(), *_tilted(p.R, p.T, p.tilt)) for p in second]
         except (AttributeError, NotImplementedError):
             pass  # it has no second order: a linear element
     zero = np.zeros((6, 6, 6))
     linear = zip(source.B(energy), source.R(energy), strict=True)
     return [(B.ravel(), R, zero) for B, R in linear]
+
+
+def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
+    """R and T in axes that are turned by the tilt: what OCELOT's `get_rotated_R` and `_T` say.
+
+    The latter is compiled when first called, which takes longer than all maps of a ring.
+    """
+    if tilt == 0:
+        return R, T
+    from tmlattice.lattice.ocelot import rot_mtx
+
+    there, back = rot_mtx(tilt), rot_mtx(-tilt)
+    return back @ R @ there, np.tensordot(back, there.T @ T @ there, 1)
 
 
 def _physics(source: Any) -> Hashable:
@@ -100,7 +138,7 @@ def _physics(source: Any) -> Hashable:
     return id(source)  # it holds more than numbers: a matrix, a field map
 
 
-def _of_ocelot(part: tuple[Array, Array, Array], n: int) -> Quadratic:
+def _of_ocelot(part: Part, n: int) -> Quadratic:
     B, R, T = part
     bent = T[:n, :n, :n]
     bent = 0.5 * (bent + bent.swapaxes(1, 2))
@@ -167,6 +205,8 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
     if len(parts) > 1:
         middle = len(parts) // 2
         return _chain(parts[:middle]), _chain(parts[middle:])
+    from scipy.linalg import sqrtm
+
     root = np.array(np.real(sqrtm(parts[0].R)), dtype=np.float64)  # a bare matrix
     back: Array = np.linalg.inv(root).astype(np.float64)
     first = Quadratic(np.zeros(n), root, None)
@@ -349,11 +389,19 @@ class LayerMaps:
         self._known: dict[Hashable, Quadratic] = {}
         self._kept: list[Any] = []
         self._ways: dict[int, Quadratic] = {}
+        self._equal: dict[Hashable, Quadratic] = {}
+        self._layers: dict[Hashable, tuple[Weights, list[Weights]]] = {}
 
-    @staticmethod
-    def physics(element: Element) -> tuple[Hashable, Hashable]:
+    @cached_property
+    def _own(self) -> dict[int, Hashable]:
+        """The physics of the ring's own sources, by id: they live as long as the ring."""
+        sources = {id(element.source): element.source for element in self.ring.elements}
+        return {key: _physics(source) for key, source in sources.items()}
+
+    def physics(self, element: Element) -> tuple[Hashable, Hashable]:
         """Equal for elements with equal maps."""
-        return (_physics(element.source), element.errors)
+        source = element.source
+        return (self._own.get(id(source)) or _physics(source), element.errors)
 
     def map(self, element: Element) -> Quadratic:
         """The map of one element, of this ring or not."""
@@ -373,28 +421,40 @@ class LayerMaps:
         return int(self._first[k])
 
     def way(self, k: int) -> Quadratic:
-        """From the exit of layer k - 1 to the entrance of its magnet."""
+        """From the exit of layer k - 1 to the entrance of its magnet; one object for equal ways."""
         if k not in self._ways:
             between = self.ring.elements[self._first[k] : self._first[k + 1] - 1]
-            parts = [self.map(e) for e in between if _moves(e)]
-            self._ways[k] = _chain([_identity(self.dimension), *parts])
+            moving = [e for e in between if _moves(e)]
+            physics = tuple(self.physics(e) for e in moving)
+            if physics not in self._equal:
+                parts = [self.map(e) for e in moving]
+                self._equal[physics] = _chain([_identity(self.dimension), *parts])
+            self._ways[k] = self._equal[physics]
         return self._ways[k]
 
     def layer(
         self, k: int, replaced: Mapping[int, Element] | None = None
     ) -> tuple[Weights, list[Weights]]:
-        """The weights of layer k, and the read-outs of the monitors before its magnet.
+        """The weights of layer k, and the read-outs of the monitors before its magnet: do not
+        change them, equal layers share them.
 
         Args:
             k: up to the number of layers, which names the way from the last magnet to the end.
             replaced: other elements at places of the ring.
         """
+        first, last = self._first[k : k + 2]
+        own = self.ring.elements[first:last]
+        if replaced:
+            return self._composed([replaced.get(first + i, e) for i, e in enumerate(own)])
+        physics = tuple((self.physics(e), e.kind == "monitor") for e in own)
+        if physics not in self._layers:
+            self._layers[physics] = self._composed(own)
+        return self._layers[physics]
+
+    def _composed(self, elements: Iterable[Element]) -> tuple[Weights, list[Weights]]:
         way = _identity(self.dimension)
         readouts = []
-        for place in range(self._first[k], self._first[k + 1]):
-            element = self.ring.elements[place]
-            if replaced:
-                element = replaced.get(place, element)
+        for element in elements:
             if element.kind == "monitor":  # read in its middle; nearly all have no length
                 half = element.length / 2
                 here = _drift(half, self.dimension).after(way) if half else way
@@ -470,10 +530,14 @@ def ring_matrix(ring: Ring) -> Array:
     element has `errors`, its linear map about the design axis stands in.
     """
     total = np.eye(4)
+    known: dict[Hashable, list[Array]] = {}
     for element in ring.elements:
         if element.errors != NO_ERRORS or element.kind == "cavity":
             total = _quadratic(element, ring.energy, 6).R[:4, :4] @ total
             continue
-        for matrix in element.source.R(ring.energy):
-            total = matrix[:4, :4] @ total
+        physics = _physics(element.source)
+        if physics not in known:
+            known[physics] = [matrix[:4, :4] for matrix in element.source.R(ring.energy)]
+        for matrix in known[physics]:
+            total = matrix @ total
     return total

@@ -16,8 +16,6 @@ from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm, logm
 
 from tmlattice.errors import TmlatticeError
 from tmlattice.maps.taylor import TaylorMap, _Table, _table, kronecker_exponents
@@ -217,6 +215,8 @@ def _series(
 def _integrated(
     equation: _Equation, rows: Array, span: tuple[float, float], table: _Table, tolerance: float
 ) -> Array:
+    from scipy.integrate import solve_ivp
+
     def slope(t: float, flat: Array) -> Array:
         return equation.of_map(t, flat.reshape(rows.shape), table).ravel()
 
@@ -278,6 +278,8 @@ def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Arr
 
 def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
     """The equation's coefficients [n, monomial], exact where W0 = 0, else a close guess."""
+    from scipy.linalg import expm, logm
+
     n, order = taylor_map.n, taylor_map.order
     W = taylor_map.coefficients
     eigenvalues = np.linalg.eigvals(W[1])
@@ -315,6 +317,8 @@ def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
 
 def _phi(matrix: Array, time: float) -> Array:
     """The integral of exp(matrix s) over s from 0 to `time`."""
+    from scipy.linalg import expm
+
     n = len(matrix)
     block = np.zeros((2 * n, 2 * n))
     block[:n, :n] = matrix

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
-from tmlattice.inference.search import SHARES
 from tmlattice.plots.strip import lattice_strip
 from tmlattice.report.text import words
 
@@ -100,9 +100,9 @@ def plot_readings(
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
     data, found = diagnosis.data, diagnosis.explanation
     explained = diagnosis.verdict != "distributed"
-    models = [found.before.paths.readings]
+    models = [found.before.point.view.readings]
     if explained:
-        models.append(found.fit.paths.readings)
+        models.append(found.fit.point.view.readings)
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
     if shot is None:
@@ -252,8 +252,8 @@ def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
     free = explanation.first_kicks
     freedom = max(int(np.median(free.freedom)), 1)
     return (
-        explanation.first.threshold(rate * SHARES["named"]),
-        free_threshold(rate * SHARES["kick"], freedom, len(free.places)),
+        explanation.first.threshold(rate * DEFAULT.shares["named"]),
+        free_threshold(rate * DEFAULT.shares["kick"], freedom, len(free.places)),
     )
 
 
