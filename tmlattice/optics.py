@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.chain import LayerChain
+from tmlattice.beam.chain import LayerChain, products
 from tmlattice.effects import Cause, changed_elements
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps import LayerMaps, RingMaps
@@ -157,10 +157,7 @@ class RingTunes:
     def __init__(self, layers: LayerMaps, maps: RingMaps) -> None:
         self.layers = layers
         steps = np.concatenate([maps.W1, maps.closing.coefficients[1][None]])[:, :4, :4]
-        self._upto = np.empty((len(steps) + 1, 4, 4))
-        self._upto[0] = np.eye(4)
-        for k, step in enumerate(steps):
-            self._upto[k + 1] = step @ self._upto[k]
+        self._upto = products(steps)
 
     def of(self, causes: Sequence[Cause]) -> Array:
         """Fractional tunes (x, y), [2].

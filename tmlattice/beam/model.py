@@ -28,6 +28,7 @@ from tmlattice.effects import (
     beams,
     find,
     monitors_with,
+    names,
 )
 from tmlattice.effects.settings import groups
 from tmlattice.lattice import Ring
@@ -235,8 +236,9 @@ class Model:
         tangents = np.empty((self.shots, self.turns * self.steps + 1, n, n))
         states[:, 0] = self._states(launches)
         for cause in causes:
-            if cause.effect == "energy_offset":
-                states[self.active, 0, 5] += cause.amount
+            effect = find(cause.effect)
+            if isinstance(effect, LaunchEffect) and effect.shifts is not None:
+                states[self.active, 0, effect.shifts] += cause.amount
         tangents[:, 0] = np.eye(n)
         slopes = np.empty((self.shots, self.turns * len(self.at), 2, n))
         for group, shots, rf in self._runs(causes, kicks):
@@ -286,11 +288,10 @@ class Model:
         Effects that are there or not (swapped, dead) are included; the energy's only in six
         coordinates.
         """
-        chosen = list(CATALOGUE) if effects is None else list(effects)
+        chosen = names() if effects is None else list(effects)
         found: list[Hypothesis] = []
         for name in chosen:
-            energy = isinstance(CATALOGUE[name], LaunchEffect) or name.startswith("radiation")
-            if not (energy and self.dimension == 4):
+            if not (CATALOGUE[name].energy and self.dimension == 4):
                 found += [(name, place) for place in CATALOGUE[name].places(self.ring)]
         return found
 

@@ -34,7 +34,7 @@ from tmlattice.challenge.record import (
     oracle_answer,
     stated,
 )
-from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judge import held_out_gap
 from tmlattice.lattice import Ring
@@ -165,7 +165,7 @@ def row_of(
     if len(causes) == 1:
         row["column"] = column(result, causes[0])
     if len(causes) > 1:
-        visible = [cause for cause in causes if cause.effect != "monitor_dead"]
+        visible = [cause for cause in causes if find(cause.effect).modelled]
         row["exact"] = {
             name: exact(answer, visible if name.endswith("oracle") else causes)
             for name, answer in answers.items()
@@ -236,14 +236,14 @@ def clean_gap(
     causes = [
         Cause(f["effect"], f["element"], f["amount"])
         for f in findings
-        if f["effect"] != "monitor_dead"
+        if find(f["effect"]).modelled
     ]
     data = of_measurement(ring, heldout)
     clean = np.nan_to_num(truth.clean["heldout"])
     dropped = np.zeros(data.valid.shape, dtype=bool)
     monitors = [monitor.name for monitor in ring.monitors]
     for cause in truth.causes:
-        if cause.effect == "monitor_dead":
+        if not find(cause.effect).modelled:
             dropped[:, monitors.index(str(cause.element))] = True
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
     design = FirstTurns(model=Model(ring, data.settings), data=data, places={})

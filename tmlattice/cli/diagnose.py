@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 @click.option(
     "--effects",
     type=NameList(),
-    help="Look for these alone; else for the whole catalogue (`tmlattice effects`).",
+    help="Look for these alone; else for all usual ones (`tmlattice effects`).",
 )
 @click.option(
     "--network",

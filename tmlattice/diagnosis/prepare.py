@@ -4,17 +4,19 @@ Nothing here decides what the fault is: monitors without a signal are set aside,
 estimated where nobody states it, and data of another ring are declined.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
-from tmlattice.effects import Cause, find
+from tmlattice.diagnosis.choice import chosen_effects
+from tmlattice.effects import Cause, expected_radiation, find
 from tmlattice.errors import BeamLostError, MeasurementError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import Data, joined, of_measurement
@@ -34,6 +36,7 @@ class Prepared:
     Attributes:
         problem: launches and readings, no small errors.
         before: launches alone.
+        hypotheses: what may be the cause.
         known: causes that the model holds anyway.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
         noise: rms of a reading, m, (x, y); NaN for a plane without readings.
@@ -43,6 +46,7 @@ class Prepared:
 
     problem: FirstTurns
     before: Fit
+    hypotheses: tuple[Hypothesis, ...]
     known: tuple[Cause, ...]
     dead: tuple[tuple[int, float], ...]
     noise: tuple[float, float]
@@ -55,7 +59,7 @@ def prepare(
     measurement: Measurement,
     reference: Measurement | None,
     radiation: bool,
-    places: Mapping[str, float],
+    effects: Sequence[str] | None,
     judgement: Judgement,
 ) -> Prepared:
     """Data, model and launches.
@@ -63,12 +67,15 @@ def prepare(
     Raises:
         MeasurementError: data that cannot be used, or that are of another lattice.
         BeamLostError: the launches are lost in the design.
-        UnknownNameError: a monitor that the ring does not have.
+        EffectError: none of the effects can be looked for.
+        UnknownNameError: a monitor that the ring does not have, or an effect that does not exist.
     """
-    known = known_causes(ring, radiation)
+    known = tuple(expected_radiation(ring)) if radiation else ()
     data = of_measurement(ring, measurement)
     if reference is not None:
         data = joined(of_measurement(ring, reference, reference=True), data)
+    chosen = chosen_effects(ring, effects, data.launch_sigma)
+    places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
     model = Model(ring, data.settings, data.turns, known, active=data.active)
     listed = {name.casefold() for name in measurement.monitors}
     dead, data, said = _dead_monitors(model, data, listed, judgement)
@@ -82,13 +89,8 @@ def prepare(
     _check_lattice(ring, data, start, judgement)
     problem = replace(problem, data=data, white=None)
     before = _on_its_way(fit(problem, (), start.nuisances), ring)
-    return Prepared(problem, before, known, dead, noise, estimated, said)
-
-
-def known_causes(ring: Ring, radiation: bool) -> tuple[Cause, ...]:
-    """What the model holds anyway: the radiation of what the ring has, where it is asked for."""
-    losses = [Cause(f"radiation_loss_{kind}", None, 1.0) for kind in ("bends", "wigglers")]
-    return tuple(c for c in losses if radiation and find(c.effect).places(ring))
+    hypotheses = tuple(model.hypotheses(chosen))
+    return Prepared(problem, before, hypotheses, known, dead, noise, estimated, said)
 
 
 def _on_its_way(start: Fit, ring: Ring) -> Fit:

@@ -20,13 +20,12 @@ from tmlattice.diagnosis.findings import credible, findings_of, sensitivity, une
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, prepare, same_monitors
 from tmlattice.diagnosis.result import Diagnosis, Finding, ring_tunes
-from tmlattice.effects import Cause, apply, background_rms, find, names
+from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Fit, Outcome
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import FreeScan
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.lattice import Ring
@@ -64,7 +63,7 @@ def diagnose(
             every usual one.
         holdout: share of the shots that the fit does not see, for the gap.
         heldout: those shots themselves, instead of a share.
-        effects: names of those that may be the cause; else the whole catalogue.
+        effects: names of those that may be the cause; else all usual ones of the catalogue.
         max_effects: findings at most.
         radiation: the model radiates as expected.
         false_alarm: share of faultless data sets in which something may be found.
@@ -74,6 +73,7 @@ def diagnose(
     Raises:
         MeasurementError: data that cannot be used, or that are of another lattice.
         BeamLostError: launches that are lost in the design.
+        EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor or an effect that does not exist.
     """
     begun = time.perf_counter()
@@ -87,7 +87,6 @@ def diagnose(
         "false_alarm": false_alarm,
     }
     judgement = Judgement(false_alarm=false_alarm)
-    chosen = [name for name in names(effects) if name != "monitor_dead"]
     said: list[str] = []
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
@@ -96,11 +95,8 @@ def diagnose(
     if reference is not None and background is None:
         background = {"all": None}
     progress("model")
-    places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
-    ready = prepare(ring, measurement, reference, radiation, places, judgement)
-    search = Search(
-        ready.problem, _hypotheses(ready.problem, chosen), max_effects, seed=seed, progress=progress
-    )
+    ready = prepare(ring, measurement, reference, radiation, effects, judgement)
+    search = Search(ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress)
     rms = background_rms(background or {})
     if rms:
         small, explanation = _among_small_errors(ring, ready, search, rms)
@@ -164,14 +160,6 @@ def _version() -> str:
 
 
 # --- the search ----
-def _hypotheses(problem: FirstTurns, chosen: Sequence[str]) -> list[Hypothesis]:
-    """What may be the cause; not an energy offset where the energy of every shot is free."""
-    found = problem.model.hypotheses(chosen)
-    if (problem.data.launch_sigma[:, 4] > 0).any():
-        found = [h for h in found if h[0] != "energy_offset"]
-    return found
-
-
 def _among_small_errors(
     ring: Ring, ready: Prepared, search: Search, rms: Mapping[str, float]
 ) -> tuple[SmallErrors, Explanation]:

@@ -52,7 +52,7 @@ class Directions:
     E2: Array
 
     def replaced(self, which: Sequence[int], fresh: "Directions") -> "Directions":
-        """With the rows of `fresh`, whose hypotheses are `which` of these, for theirs."""
+        """With the rows of `fresh`, whose hypotheses are `which` of these, instead of theirs."""
         owner = np.array(which, dtype=np.int64)
         keep = ~np.isin(self.owner, owner)
         keep_read = ~np.isin(self.read_owner, owner)

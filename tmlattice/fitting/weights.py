@@ -95,14 +95,14 @@ def layer_effects(
     Args:
         ring: the design.
         dimension: of the network, 4 or 6.
-        effects: names; else the whole catalogue.
+        effects: names; else all usual ones.
 
     Raises:
         UnknownNameError: an effect that does not exist.
     """
     chosen = [name for name in names(effects) if isinstance(CATALOGUE[name], RingEffect)]
     if dimension == 4:
-        chosen = [name for name in chosen if not name.startswith("radiation")]
+        chosen = [name for name in chosen if not CATALOGUE[name].energy]
     asked = [(name, place) for name in chosen for place in CATALOGUE[name].places(ring)]
     d = directions(LayerMaps(ring, dimension), asked)
     rows = np.bincount(d.owner, minlength=len(asked))

@@ -58,7 +58,13 @@ class Scan:
 
 def look_elsewhere(statistic: float, freedom: int, effective: float) -> float:
     """Chance that the largest of `effective` chi-squares of so many degrees reaches this."""
-    return float(-np.expm1(effective * np.log1p(-chi2.sf(statistic, freedom))))
+    return float(-np.expm1(effective * _log_below(statistic, freedom)))
+
+
+def _log_below(statistic: float | Array, freedom: int) -> Array:
+    """Log of the chance that one chi-square stays below; a finite number where it cannot."""
+    tail = np.minimum(chi2.sf(statistic, freedom), 1 - np.finfo(float).epsneg)
+    return np.asarray(np.log1p(-tail))
 
 
 def free_threshold(rate: float, freedom: int, effective: float) -> float:
@@ -71,8 +77,7 @@ def effective_number(largest: Array, freedom: int) -> float:
 
     The exponent N of F(t)^N has the estimate -draws / sum log F(t).
     """
-    tail = chi2.sf(largest, freedom)
-    return float(max(len(largest) / -np.log1p(-tail).sum(), 1.0))
+    return float(max(len(largest) / -_log_below(largest, freedom).sum(), 1.0))
 
 
 def scan(
@@ -107,7 +112,7 @@ def scan(
     safe = np.where(seen, norm, 1.0)
     squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
     if effective is None:
-        effective = effective_number(squares[:, 1:].max(axis=0), 1)
+        effective = effective_number(squares[:, 1:].max(axis=0, initial=0.0), 1)
     return Scan(
         tuple(hypotheses),
         statistic=squares[:, 0],

@@ -8,7 +8,7 @@ way from the exit of magnet k - 1 to the exit of magnet k, and the chain of laye
 
 import functools
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
+from tmlattice.lattice.ring import NO_ERRORS, Element, Ring, Slopes
 from tmlattice.maps.taylor import TaylorMap
 
 Array = NDArray[np.float64]
@@ -153,18 +153,18 @@ def _quadratic(element: Element, energy: float, n: int) -> Quadratic:
             f"is wrong below {FAINT:g} rad; make it a sextupole and a corrector"
         )
     if element.kind == "cavity":  # what it gives depends on the turn: that is the beam's
-        total = _empty(element, energy, n)
-    elif errors == NO_ERRORS:
+        element = _empty(element)
+    if errors == NO_ERRORS:
         total = _chain(_of_ocelot(part, n) for part in _parts(element.source, energy, False))
     else:
         first, second = _halves(element, energy, n)
         total = _chain(
             [
-                _thin(n, k1l=errors.entrance_k1l),
+                _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
                 _shift(n, -errors.dx, -errors.dy),
                 _turn(n, errors.roll),
                 first,
-                _thin(n, errors.kick_x, errors.kick_y, errors.k1l, errors.k1sl),
+                _thin(n, errors.kick_x, errors.kick_y, errors.k1l, errors.k1sl, errors.middle),
                 _loss(n, errors.loss, element),
                 second,
                 _turn(n, -errors.roll),
@@ -179,12 +179,11 @@ def _quadratic(element: Element, energy: float, n: int) -> Quadratic:
     return total
 
 
-def _empty(element: Element, energy: float, n: int) -> Quadratic:
-    """A drift of the element's length."""
+def _empty(element: Element) -> Element:
+    """The same element as a drift."""
     from tmlattice.lattice.ocelot import elements
 
-    (part,) = _parts(elements.Drift(l=element.length), energy, False)
-    return _of_ocelot(part, n)
+    return replace(element, source=elements.Drift(l=element.length))
 
 
 def _chain(parts: Iterable[Quadratic | None]) -> Quadratic:
@@ -202,27 +201,35 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
         parts = [_of_ocelot(part, n) for part in _parts(element.source, energy, False)]
         return _identity(n), _chain(parts)
     parts = [_of_ocelot(part, n) for part in _parts(element.source, energy, True)]
-    if len(parts) > 1:
-        middle = len(parts) // 2
+    middle = len(parts) // 2
+    if len(parts) % 2 == 0:
         return _chain(parts[:middle]), _chain(parts[middle:])
     from scipy.linalg import sqrtm
 
-    root = np.array(np.real(sqrtm(parts[0].R)), dtype=np.float64)  # a bare matrix
+    body = parts[middle]  # of a bare matrix, or of a cavity: it comes in one piece
+    root = np.array(np.real(sqrtm(body.R)), dtype=np.float64)
     back: Array = np.linalg.inv(root).astype(np.float64)
     first = Quadratic(np.zeros(n), root, None)
-    return first, parts[0].after(Quadratic(np.zeros(n), back, None))
+    second = body.after(Quadratic(np.zeros(n), back, None))
+    return _chain([*parts[:middle], first]), _chain([second, *parts[middle + 1 :]])
 
 
 def _thin(
-    n: int, kick_x: float = 0.0, kick_y: float = 0.0, k1l: float = 0.0, k1sl: float = 0.0
+    n: int,
+    kick_x: float = 0.0,
+    kick_y: float = 0.0,
+    k1l: float = 0.0,
+    k1sl: float = 0.0,
+    slopes: Slopes = NO_ERRORS.middle,
 ) -> Quadratic | None:
-    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x."""
-    if kick_x == kick_y == k1l == k1sl == 0:
+    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and what the slopes say."""
+    if kick_x == kick_y == k1l == k1sl == 0 and not any(slopes):
         return None
     B, R = np.zeros(n), np.eye(n)
     B[1], B[3] = kick_x, kick_y
     R[1, 0], R[3, 2] = -k1l, k1l
     R[1, 2] = R[3, 0] = k1sl
+    R[np.ix_([1, 3], [0, 2])] += np.reshape(slopes, (2, 2))
     return Quadratic(B, R, None)
 
 

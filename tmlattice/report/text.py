@@ -11,63 +11,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
-from tmlattice.effects import find
+from tmlattice.effects import CATALOGUE, find
 
 WIDTH = 100
-
-WORDS = {
-    "quadrupole_gradient": "wrong strength of a quadrupole",
-    "gradient_absolute": "focusing error (quadrupole field) in the middle of an element",
-    "skew_gradient": "skew quadrupole field in the middle of an element",
-    "quadrupole_roll": "quadrupole rolled about the beam axis",
-    "quadrupole_offset_x": "quadrupole displaced horizontally",
-    "quadrupole_offset_y": "quadrupole displaced vertically",
-    "family_gradient": "wrong strength of a whole family of quadrupoles",
-    "dipole_field": "wrong field of a bending magnet",
-    "dipole_roll": "bending magnet rolled about the beam axis",
-    "corrector_kick_x": "corrector that kicks horizontally beyond its setting",
-    "corrector_kick_y": "corrector that kicks vertically beyond its setting",
-    "corrector_calibration": "wrong calibration of a corrector",
-    "corrector_roll": "corrector rolled about the beam axis",
-    "sextupole_strength": "wrong strength of a sextupole",
-    "sextupole_offset_x": "sextupole displaced horizontally",
-    "sextupole_offset_y": "sextupole displaced vertically",
-    "insertion_device_focusing": "unmodelled focusing of an insertion device",
-    "monitor_offset_x": "horizontal offset of a monitor",
-    "monitor_offset_y": "vertical offset of a monitor",
-    "monitor_gain_x": "wrong horizontal gain of a monitor",
-    "monitor_gain_y": "wrong vertical gain of a monitor",
-    "monitor_roll": "monitor rolled about the beam axis",
-    "monitor_coupling": "monitor that mixes its planes",
-    "monitor_swap": "monitor with its planes exchanged",
-    "monitor_dead": "dead monitor",
-    "energy_offset": "energy deviation of the beam",
-    "energy_spread": "energy spread of the beam",
-    "radiation_loss_bends": "energy loss by radiation in the bends",
-    "radiation_loss_wigglers": "energy loss by radiation in the wigglers",
-}
-"""Every effect of the catalogue in plain words."""
-
-DEAD = {1.0: "no signal", 2.0: "frozen readings"}
-
-MAIN = (
-    "quadrupole_gradient",
-    "quadrupole_roll",
-    "quadrupole_offset_x",
-    "quadrupole_offset_y",
-    "dipole_field",
-    "dipole_roll",
-    "corrector_kick_x",
-    "corrector_kick_y",
-    "sextupole_strength",
-    "insertion_device_focusing",
-    "monitor_offset_x",
-    "monitor_offset_y",
-    "monitor_gain_x",
-    "monitor_gain_y",
-    "energy_offset",
-)
-"""Effects whose sensitivity a short report states."""
 
 _SCALES = {
     "relative": ((0.0, 100.0, "%"),),
@@ -82,7 +28,7 @@ _SCALES = {
 # --- words for parts ------------------------------------------------------------------------------
 def words(effect: str) -> str:
     """An effect of the catalogue in plain words."""
-    return WORDS.get(effect, effect.replace("_", " "))
+    return CATALOGUE[effect].words if effect in CATALOGUE else effect.replace("_", " ")
 
 
 def _scale(effect: str, amount: float) -> tuple[float, str]:
@@ -100,7 +46,7 @@ def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
         amount, sigma: in the effect's unit.
     """
     if find(effect).discrete:
-        return DEAD.get(amount, "") if effect == "monitor_dead" else ""
+        return find(effect).forms.get(amount, "")
     factor, unit = _scale(effect, amount)
     value = factor * amount
     if sigma is None or not 0 < sigma < np.inf:
@@ -404,7 +350,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
     lines += _wrapped(closed_text(diagnosis) + ".", "", width)
     lines += _wrapped(left_text(diagnosis), "", width)
     if diagnosis.verdict == "nothing":
-        rows = sensitivity_rows(diagnosis, MAIN)
+        rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
         if rows:
             lines += ["", "Would have been seen, at half of the places where it can sit, from:"]
             lines += _columns(rows, "   ")
