@@ -37,9 +37,12 @@ def products(matrices: Array) -> Array:
     return total
 
 
-def chain(matrices: Array) -> Array:
-    """The product of matrices [step, n, n] in beam order: the last one stands on the left."""
-    return np.asarray(products(matrices)[-1])
+def merged(matrices: Array, ends: NDArray[np.intp]) -> Array:
+    """Products of runs of the matrices [step, n, n] in beam order, each up to and with one of the
+    rising `ends`, [end, n, n]."""
+    whole = np.empty((len(ends), *matrices.shape[1:]))
+    kernels.merge(np.ascontiguousarray(matrices), ends, whole)
+    return whole
 
 
 def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tmlattice.beam import flows, sweeps
 from tmlattice.beam.aperture import check_alive
-from tmlattice.beam.chain import chain, products
+from tmlattice.beam.chain import merged, products
 from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
 from tmlattice.maps.taylor import second_derivatives, symplectic_form
@@ -199,10 +199,8 @@ class SymplecticNetwork(NetworkChain):
         # Inside a turn nobody looks: matrices that follow each other are multiplied.
         ends = np.flatnonzero(moves | W0.any(axis=1))
         ends = np.unique([*ends, len(W1) - 1])
-        first = np.concatenate([[0], ends[:-1] + 1])
-        merged = np.stack([chain(W1[a : b + 1]) for a, b in zip(first, ends, strict=True)])
         rest = (w[ends] for w in (*fields, moves, flat))
-        sweeps.run(flows.track, len(history), size, W0[ends], merged, *rest, history)
+        sweeps.run(flows.track, len(history), size, W0[ends], merged(W1, ends), *rest, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
