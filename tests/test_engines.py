@@ -52,3 +52,18 @@ def test_radiating_turns_keep_their_beam_in_both_engines(petra3):
         late = beam[0, -50:]
         assert np.isfinite(late).all()
         assert np.sqrt((late**2).mean()) < 1.5e-3  # the sawtooth orbit and the launch's own
+
+
+def test_a_set_gradient_of_a_bend_is_the_same_in_both_engines(small_ring):
+    """k1_relative of a combined-function bend, alone and in the model."""
+    ring = small_ring.with_changed("bend::3", k1=-0.05)
+    setting = {"bend::3": {"k1_relative": 0.1}}
+    shots = draw_shots(ring, 2, 1e-3, seed=3)
+    changes = {}
+    for engine in ("at", "ocelot"):
+        machine = Machine(ring, engine=engine)
+        there = machine.beam(shots.launches, 1, [setting] * 2)
+        changes[engine] = there - machine.beam(shots.launches)
+    size = np.sqrt((changes["at"] ** 2).mean())
+    assert size > 1e-5
+    assert np.sqrt(((changes["at"] - changes["ocelot"]) ** 2).mean()) < 0.02 * size

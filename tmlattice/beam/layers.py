@@ -36,15 +36,13 @@ class Layers:
     start: NDArray[np.int64]
 
     @classmethod
-    def of(cls, maps: RingMaps) -> "Layers":
-        """Arrays of their own, that may be written to."""
+    def of(cls, maps: RingMaps, weights: Weights | None = None) -> "Layers":
+        """Arrays of their own, that may be written to; other weights of the layers on request."""
+        weights = (maps.W0, maps.W1, maps.W2) if weights is None else weights
         closing = maps.closing.coefficients
-        W0, W1, W2 = (
-            np.concatenate([w, c[None]])
-            for w, c in zip((maps.W0, maps.W1, maps.W2), closing, strict=True)
-        )
-        return cls((W0, W1, W2), (maps.R0.copy(), maps.R1.copy(), maps.R2.copy()), maps.at,
-                   maps.start)  # fmt: skip
+        W0, W1, W2 = (np.concatenate([w, c[None]]) for w, c in zip(weights, closing, strict=True))
+        R = maps.R0.copy(), maps.R1.copy(), maps.R2.copy()
+        return cls((W0, W1, W2), R, maps.at, maps.start)
 
     @property
     def steps(self) -> int:
@@ -56,16 +54,11 @@ class Layers:
         """Which steps have a second order, [step]."""
         return curved(self.W[2])
 
-    def exits(self, turns: int) -> NDArray[np.int64]:
-        """The state that each reading of so many turns is made from, [reading]."""
-        return np.concatenate([self.at + turn * self.steps for turn in range(turns)])
-
     def put(self, parts: Mapping[int, LayerParts]) -> dict[int, LayerParts]:
         """Write layers, in place; returns what was there."""
         steps = np.fromiter(parts, dtype=np.intp)
         reads = [(int(self.start[k]), len(found)) for k, (_, found) in parts.items()]
-        rows = np.concatenate([np.arange(s, s + m) for s, m in reads] or [np.empty(0)])
-        rows = rows.astype(np.intp)
+        rows = np.array([row for s, m in reads for row in range(s, s + m)], dtype=np.intp)
         old_W, old_R = [w[steps] for w in self.W], [r[rows] for r in self.R]
         own = zip(*(w for w, _ in parts.values()), strict=True)
         for stack, new in zip(self.W, own, strict=False):

@@ -84,7 +84,7 @@ class Model:
         active: shots in which causes are there; the others are of the ring without, [shot].
 
     Attributes:
-        ring, maps: with what is known.
+        ring, layers, maps: with what is known.
         groups: shots with equal settings.
         steps: of a turn.
         where: the state that each reading is made from, [reading].
@@ -109,7 +109,7 @@ class Model:
         self.dimension = dimension
         self.assembly = assembly(ring, known, dimension)
         self.ring, self.maps = self.assembly.ring, self.assembly.maps
-        self.at = self.maps.at
+        self.layers, self.at = self.assembly.layers, self.maps.at
         self._known_monitors = monitors_with(ring, known)
         self._monitor = {name: m for m, name in enumerate(self.maps.monitors)}
         self._made: dict[tuple[int, tuple[Cause, ...], int], LayerParts] = {}
@@ -278,7 +278,8 @@ class Model:
 
     def _turned(self, monitors: Array, slopes: Array) -> Array:
         by_turn = slopes.reshape(self.shots, self.turns, -1, 2, self.dimension)
-        return np.einsum("smij,stmjk->stmik", monitors, by_turn).reshape(slopes.shape)
+        turned = np.einsum("smij,stmjk->stmik", monitors, by_turn)
+        return np.asarray(turned.reshape(slopes.shape))
 
     # --- hypotheses -----------------------------------------------------------------------------
     def hypotheses(self, effects: Sequence[str] | None = None) -> list[Hypothesis]:

@@ -5,9 +5,10 @@ late particle (tau > 0) has too much energy, it must be given less. The phase ma
 design orbit loses. A frequency other than the ring's own slips against the turns by
 L df / (f + df) each: on the first one it meets the beam at the design's phase.
 
-What a lattice does not say comes from a rule. The harmonic number is the one nearest to 500 MHz,
-the frequency of most light sources; the voltage is four times what the ring loses when its bends
-and wigglers radiate, the over-voltage at which storage rings have a lifetime.
+What a lattice does not say comes from a rule. The harmonic number is the one nearest to 499.65 MHz,
+the frequency of most light sources (a circumference that fits 500 MHz fits it too, unless it is
+long); the voltage is four times what the ring loses when its bends and wigglers radiate, an
+over-voltage with which storage rings run.
 
 Source: M. Sands, SLAC-121 (1970), 3.
 """
@@ -23,7 +24,7 @@ from tmlattice.effects import Settings, expected_loss
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import Ring
 
-FREQUENCY = 500e6
+FREQUENCY = 499.65e6
 """Hz; where neither a cavity nor the caller says otherwise."""
 OVERVOLTAGE = 4.0
 """Voltage of the RF over the loss of a turn, where no cavity says otherwise."""
@@ -51,7 +52,7 @@ class Rf:
 
     def frequency(self, ring: Ring) -> float:
         """Hz, of a beam at the speed of light on the design orbit."""
-        return self.harmonic * SPEED_OF_LIGHT / ring.length
+        return float(self.harmonic * SPEED_OF_LIGHT / ring.length)
 
 
 def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None) -> Rf:
@@ -59,7 +60,7 @@ def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None)
 
     Args:
         ring: the design.
-        harmonic: else that of the ring's first cavity, else the one nearest to 500 MHz.
+        harmonic: else that of the ring's first cavity, else the one nearest to 499.65 MHz.
         voltage: of all cavities, V; else that of the ring's, else four times the expected loss.
     """
     elements = ring.elements

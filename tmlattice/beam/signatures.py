@@ -100,7 +100,7 @@ def _of_ring(
         part = np.zeros((len(hypotheses), len(shots), *out.shape[2:]))
         slopes = np.ascontiguousarray(paths.beam_launch[shots])
         share(kernels.carry, len(shots), d.owner, start, pulled, slopes, part)
-        _given_back(model, group, hypotheses, inverse[shots], slopes, part)
+        _given_back(model, group, hypotheses, inverse, states, slopes, part)
         for row, (owner, monitor) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
             for turn in range(model.turns):
                 x = states[:, turns[turn] + model.at[monitor]]
@@ -114,7 +114,8 @@ def _given_back(
     model: "Model",
     group: Group,
     hypotheses: list[Hypothesis],
-    inverse: Array,
+    inverse: NDArray[np.floating],
+    states: Array,
     slopes: Array,
     part: Array,
 ) -> None:
@@ -124,14 +125,18 @@ def _given_back(
     there = model.assembly
     for h, (name, place) in enumerate(hypotheses):
         lost = there.turn_loss(Cause(name, place, 1.0))
-        exits = there.cavities(group.settings, [Cause(name, place, 1e-9)]).exits if lost else []
-        if not len(exits):
+        if not lost:
             continue
-        gain = np.zeros(model.dimension)
-        gain[5] = lost / len(exits)
-        behind = (np.asarray(exits)[:, None] + np.arange(model.turns) * model.steps).ravel()
-        pulled = inverse[:, behind] @ gain  # [shot, cavity and turn, n]
-        pulled = np.ascontiguousarray(pulled[:, None])
+        rf = there.cavities(group.settings, [Cause(name, place, 1e-9)])
+        if not len(rf.exits):
+            continue
+        _, phase, wave, slip = rf.values
+        behind = (rf.exits[:, None] + np.arange(model.turns) * model.steps).ravel()
+        slipped = np.repeat(np.where(rf.exits == model.steps, slip, 0.0), model.turns)
+        late = states[:, behind, 4] - slipped  # at the ring's end the RF slips behind the cavity
+        gain = lost / len(rf.exits) * np.cos(phase - wave * late) / np.cos(phase)
+        pulled = inverse[group.shots[:, None], behind][..., 5] * gain[..., None]
+        pulled = np.ascontiguousarray(pulled[:, None])  # [shot, 1, cavity and turn, n]
         start = np.searchsorted(model.where, behind)[:, None]
         owner = np.full(len(behind), h)
         share(kernels.carry, len(part[h]), owner, start, pulled, slopes, part)

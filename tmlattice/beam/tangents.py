@@ -7,6 +7,7 @@ Axes: states [shot, step + 1, n], tangents C [shot, step + 1, n, n] = d state / 
 import math
 
 import numba
+import numpy as np
 
 _jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 
@@ -66,6 +67,24 @@ def _cavities(exit_, exits, rf, x, tangent):  # type: ignore[no-untyped-def]
             slope = -rf[0] * rf[2] * math.cos(angle)
             for j in range(len(x)):
                 tangent[5, j] += slope * tangent[4, j]
+
+
+@_jit
+def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
+    """whole [end, n, n]: the product of the steps behind the last end, up to and with this one."""
+    n, k = steps.shape[1], 0
+    row = np.empty(n)
+    for e in range(len(ends)):
+        whole[e] = steps[k]
+        for s in range(k + 1, ends[e] + 1):
+            for j in range(n):
+                for a in range(n):
+                    row[a] = 0.0
+                    for i in range(n):
+                        row[a] += steps[s, a, i] * whole[e, i, j]
+                for a in range(n):
+                    whole[e, a, j] = row[a]
+        k = ends[e] + 1
 
 
 @_jit

@@ -253,6 +253,7 @@ class Builder:
         roll = wrong.roll
         horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2  # what px loses
         # The body is exact in a step; only its errors, losses and gradients are spread.
+        k1 = element.k1 * (1 + setting["k1_relative"])
         steps = self.steps if element.k1 or element.k2 else 4
         more: dict[str, Any] = {}
         if element.tilt:
@@ -263,7 +264,7 @@ class Builder:
                 element.name,
                 share * length,
                 share * angle,
-                PolynomB=[horizontal / length, element.k1, element.k2 / 2, 0.0],
+                PolynomB=[horizontal / length, k1, element.k2 / 2, 0.0],
                 PolynomA=[-roll * angle / length, 0.0, 0.0, 0.0],
                 NumIntSteps=steps,
                 PassMethod=self.bend_pass,

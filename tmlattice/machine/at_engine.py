@@ -43,7 +43,7 @@ TURNS_AT_ONCE = 2**22
 _CORRECTOR = frozenset({"hcorrector", "vcorrector"})
 SET_ON: Mapping[str, frozenset[str]] = {
     "kick": _CORRECTOR,
-    "k1_relative": frozenset({"quadrupole"}),
+    "k1_relative": frozenset({"quadrupole", "bend"}),
     "k2_relative": frozenset({"sextupole"}),
 }
 
@@ -150,8 +150,8 @@ class AtEngine:
             launches: (x, px, y, py, tau, p) at the start of the sequence, [shot, 6].
             turns: at least 1.
             settings: one mapping a shot, of element name to what is set: `kick` of a corrector
-                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole,
-                `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
+                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole
+                or a bend, `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
 
         Returns:
             (x, y) in m, [shot, turn, monitor, 2]; NaN from where a particle is lost.

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tmlattice.beam.chain import chain, tangents
+from tmlattice.beam.chain import tangents
 from tmlattice.beam.strengths import LARGEST, ring_strengths
 from tmlattice.lattice import Ring
 from tmlattice.maps.taylor import symplectic_form
 from tmlattice.network.generators import exponents, field_matrix
 from tmlattice.network.network import TaylorNetwork
 from tmlattice.network.symplectic_network import SymplecticNetwork
-from tmlattice.optics import normal_modes, one_turn_optics
+from tmlattice.optics import normal_modes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -147,13 +147,8 @@ def tune_slopes(space: Space, amounts: Array) -> Array:
     """
     space.put(amounts)
     network = space.network
-    _, steps = network.jacobians(one_turn_optics(network).closed_orbit)
-    steps = steps[:, :4, :4]
-    _, vector = normal_modes(chain(steps))
-    modes = np.empty((len(network.layers), 4, 2), dtype=complex)
-    for k in range(len(modes)):
-        vector = steps[k] @ vector
-        modes[k] = vector
-    v = modes[space.layer]
+    _, total = network.closed_orbit()
+    total = total[:, :4, :4]
+    v = (total[1:-1] @ normal_modes(total[-1])[1])[space.layer]
     turned = np.einsum("jav,jab,jbv->vj", v.conj(), space.hessians(amounts), v, optimize=True)
     return np.asarray(np.real(turned) / (4 * np.pi))

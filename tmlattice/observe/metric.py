@@ -87,7 +87,7 @@ class TurnMetric(Metric):
 
     def _changed_readings(self, name: str) -> Array:
         """d readings / d amount of an effect at every monitor, [shot, reading, 2]."""
-        return np.nan_to_num(self.model.reading_signatures(self.paths, name))
+        return np.asarray(np.nan_to_num(self.model.reading_signatures(self.paths, name)))
 
     # --- what has no name -----------------------------------------------------------------------
     def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
