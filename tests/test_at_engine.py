@@ -165,6 +165,14 @@ def test_thin_kicks_are_those_of_the_table(tmp_path, name):
     np.testing.assert_allclose(exit_state(engine), expected, atol=1e-14)
 
 
+def test_a_wake_in_a_cavity_kicks_in_its_middle(tmp_path):
+    engine = engine_of(tmp_path, "Cavity(l=0.6, freq=5e8, eid='it')", ("wake_kick_y", 0.05))
+    kick = np.eye(4)
+    kick[3, 2] = 0.05
+    expected = quadrupole(0, 0.3) @ kick @ quadrupole(0, 0.3) @ LAUNCH[:4]
+    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-14)
+
+
 BEND = "SBend(l=2.0, angle=0.028, eid='it')"
 
 

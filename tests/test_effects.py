@@ -23,6 +23,7 @@ from tmlattice.effects import (
     names,
 )
 from tmlattice.errors import EffectError, LatticeError, UnknownNameError
+from tmlattice.lattice import save_ring
 from tmlattice.maps import element_map
 from tmlattice.maps.magnets import ring_maps, ring_matrix
 
@@ -264,6 +265,13 @@ def test_a_kick_in_a_cavity_sits_in_its_middle(tmp_path):
     kick = 0.05 * (y + 0.3 * py)
     expected = [x + 0.6 * px, px, y + 0.6 * py + 0.3 * kick, py + kick]
     assert element_map(ring["it"], 6.0)([x, px, y, py]) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_kick_survives_the_lattice_file(small_ring, tmp_path):
+    ring = apply(small_ring, [Cause("wake_kick_y", "wig_1", 0.02)])
+    save_ring(ring, tmp_path / "ring.json")
+    again = load_ring(tmp_path / "ring.json")["wig_1"]
+    assert again.errors == ring["wig_1"].errors != small_ring["wig_1"].errors
 
 
 def test_a_wake_is_looked_for_where_somebody_asks():
