@@ -18,7 +18,14 @@ from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.diagnosis.background import SmallErrors, small_errors
 from tmlattice.diagnosis.gap import held_out_gap, misfit
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, Member, ring_tunes
+from tmlattice.diagnosis.result import (
+    VERDICTS,
+    Diagnosis,
+    Finding,
+    Member,
+    TrajectoryView,
+    ring_tunes,
+)
 from tmlattice.effects import CATALOGUE, Cause, apply, background_rms, find, names
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.inference.newton import Fit, Problem, fit
@@ -229,9 +236,8 @@ def diagnose(
         ring=ring,
         repaired=repaired,
         causes=causes,
-        explanation=explanation,
-        data=data,
-        model=model,
+        errors=tuple(np.sqrt(np.maximum(np.diag(result.covariance)[: len(causes)], 0)).tolist()),
+        view=TrajectoryView(explanation, data, model),
     )
 
 
