@@ -54,8 +54,10 @@ def key_of(path: Path, sequence: str | None, energy: float | None) -> str | None
     if cache.folder() is None or path.suffix.lower() not in (".py", ".json", ".mat"):
         return None
     content = path.read_bytes()
-    if path.suffix.lower() == ".py" and not depends_on_nothing(content):
-        return None
+    if path.suffix.lower() == ".py":
+        neighbours = {neighbour.stem for neighbour in path.absolute().parent.iterdir()}
+        if neighbours & _MODULES or not depends_on_nothing(content):
+            return None
     return cache.key("ring", path.suffix.lower(), content, sequence, energy)
 
 
