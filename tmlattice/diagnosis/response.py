@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.effects import apply, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, Misfit
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.calibration import CALIBRATES
@@ -79,8 +80,15 @@ def diagnose_response(
     trials = _trials(effects)
     data = response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
-    fit = fit_steps(data, split, trials, max_effects, progress)
-    found, degenerate = told(fit.state)
+    judgement = Judgement(false_alarm=false_alarm)
+    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    if few is None:
+        fit = fit_steps(data, split, trials, max_effects, progress)
+        found, degenerate = told(fit.state)
+        verdict = _verdict(fit, false_alarm)
+    else:
+        fit, found, degenerate = few.fit, few.told, ()
+        verdict = few.verdict
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     design, model = (state.at.read for state in (fit.design, fit.state))
     on_ring = [c for c, _ in found if c.effect not in (*CALIBRATES, "energy_spread")]
@@ -93,8 +101,8 @@ def diagnose_response(
     }  # fmt: skip
     noise = np.sqrt(np.mean(data.noise[good] ** 2, axis=0))
     return Diagnosis(
-        verdict=_verdict(fit, false_alarm),
-        findings=(),
+        verdict=verdict,
+        findings=() if few is None else few.findings,
         fit_before=_misfit(fit, design),
         fit_after=_misfit(fit, model),
         heldout=_gap(fit, float(np.sqrt(np.mean(data.noise[good] ** 2)))),
@@ -103,7 +111,7 @@ def diagnose_response(
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=None,
         sensitivity={},
-        warnings=_warnings(fit),
+        warnings=(*(() if few is None else few.said), *_warnings(fit)),
         noise=(float(noise[0]), float(noise[1])),
         noise_estimated=False,
         provenance={

@@ -52,6 +52,8 @@ class Effect(ABC):
         calibrates: a file of calibrations may hold it.
         headline: a short report states how little of it would be seen.
         usual: looked for, and drawn by the challenge, where nobody says which effects to take.
+        responds: a closed orbit's response to a corrector sees it alone, to first order.
+        multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
     """
 
     name: ClassVar[str]
@@ -73,6 +75,8 @@ class Effect(ABC):
     calibrates: ClassVar[bool] = False
     headline: ClassVar[bool] = False
     usual: ClassVar[bool] = True
+    responds: ClassVar[bool] = False
+    multiplies: ClassVar[bool] = False
 
     @property
     def label(self) -> str:
@@ -177,6 +181,7 @@ class ThinKickEffect(RingEffect):
         where: "entrance" or "middle" of the element.
     """
 
+    responds = True
     slopes: ClassVar[Slopes]
     where: ClassVar[Where] = "middle"
 
@@ -196,6 +201,7 @@ class StrengthEffect(RingEffect):
         strength: k1, k2, or the angle that a corrector is set to.
     """
 
+    multiplies = True
     strength: ClassVar[str]
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:

@@ -48,6 +48,7 @@ class MonitorOffsetY(_Offset):
 
 
 class _Gain(ReadingEffect):
+    multiplies = True
     headline = True
     calibrates = True
     unit = "relative"
@@ -72,6 +73,7 @@ class MonitorGainX(_Gain):
     """A monitor that reads x too large or too small."""
 
     name = "monitor_gain_x"
+    responds = True
     words = "wrong horizontal gain of a monitor"
     plane = 0
 
@@ -81,6 +83,7 @@ class MonitorGainY(_Gain):
     """A monitor that reads y too large or too small."""
 
     name = "monitor_gain_y"
+    responds = True
     words = "wrong vertical gain of a monitor"
     plane = 1
 
@@ -90,6 +93,7 @@ class MonitorRoll(ReadingEffect):
     """A monitor turned about the beam axis."""
 
     name = "monitor_roll"
+    responds = True
     words = "monitor rolled about the beam axis"
     calibrates = True
     unit = "rad"
@@ -112,6 +116,7 @@ class MonitorCoupling(ReadingEffect):
     """A monitor whose electronics mix the planes."""
 
     name = "monitor_coupling"
+    responds = True
     words = "monitor that mixes its planes"
     calibrates = True
     unit = "relative"
@@ -133,6 +138,7 @@ class MonitorSwap(ReadingEffect):
     """A monitor whose two planes are exchanged."""
 
     name = "monitor_swap"
+    responds = True
     words = "monitor with its planes exchanged"
     calibrates = True
     unit = "discrete"
