@@ -1,12 +1,15 @@
 """Rings that many tests share, loaded once."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+_kept = tempfile.TemporaryDirectory(prefix="tmlattice-tests-")
+os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 

@@ -171,7 +171,9 @@ def test_effects_as_json(folder):
         assert rows[name] == {
             "effect": name, "sits_on": effect.sits_on_text, "unit": effect.unit,
             "sign": effect.sign, "background_rms": effect.background,
-            "largest_fault": effect.largest,
+            "largest_fault": effect.largest, "words": effect.words, "group": effect.group,
+            "modelled": effect.modelled, "energy": effect.energy, "usual": effect.usual,
+            "acts_on_settings": effect.acts_on_settings,
         }  # fmt: skip
     code, text = run("effects", "--json", "nowhere/effects.json")
     assert (code, "cannot write" in text) == (2, True)

@@ -18,11 +18,11 @@ from tmlattice.effects import Cause
 from tmlattice.files import write_json
 from tmlattice.machine import simulate
 from tmlattice.measurement import OrbitResponse, write_measurement
+from tmlattice.report.plain import report_text
 from tmlattice.report.text import (
     amount_text,
     least_text,
     probability_text,
-    report_text,
 )
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")

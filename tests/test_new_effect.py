@@ -12,7 +12,7 @@ from tmlattice.cli.command import tmlattice as command
 from tmlattice.diagnosis import diagnose
 from tmlattice.effects import CATALOGUE, Cause, names
 from tmlattice.machine import Machine, draw_shots, simulate
-from tmlattice.report.text import report_text
+from tmlattice.report.plain import report_text
 
 PAGE = Path(__file__).parent.parent / "docs" / "new_effect.md"
 

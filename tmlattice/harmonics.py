@@ -10,8 +10,12 @@ that grows or shrinks (a network that is not symplectic) keeps its phase: the tr
 taken out before the line is sought.
 """
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,11 +135,19 @@ def levelled(signal: ComplexArray) -> ComplexArray:
 def frequency(signal: ComplexArray, method: Method = Method.NAFF) -> tuple[float, float]:
     """Frequency in [0, 1) and amplitude of the strongest line of a complex signal [turns]."""
     if method is Method.NAFF:
-        import nafflib  # pulls in pandas
-
-        lines, values = nafflib.naff(signal.copy(), num_harmonics=1)
+        lines, values = _naff()(signal.copy(), num_harmonics=1)
         return float(np.real(values[0])) % 1.0, float(abs(lines[0]))
     return _interpolated_fft(signal)
+
+
+@cache
+def _naff() -> Callable[..., Any]:
+    """nafflib's NAFF, whose compiled loop is kept from one process to the next, as our own are."""
+    import nafflib
+
+    with suppress(AttributeError, RuntimeError):  # another version, or no place to keep it
+        nafflib.optimize.expArray.enable_caching()
+    return cast(Callable[..., Any], nafflib.naff)
 
 
 def _interpolated_fft(signal: ComplexArray) -> tuple[float, float]:

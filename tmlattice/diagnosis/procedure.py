@@ -19,7 +19,7 @@ from tmlattice.diagnosis.background import SmallErrors, small_errors
 from tmlattice.diagnosis.findings import credible, findings_of, sensitivity, unexplained, verdict_of
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, prepare, same_monitors
-from tmlattice.diagnosis.result import Diagnosis, Finding, ring_tunes
+from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
 from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
@@ -147,9 +147,8 @@ def diagnose(
         ring=ring,
         repaired=repaired,
         causes=told.causes,
-        explanation=explanation,
-        data=ready.problem.data,
-        model=told.problem.model,
+        errors=_errors(explanation)[: len(told.causes)],
+        view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
     )
 
 
@@ -205,6 +204,11 @@ def _freedom(data: Data, result: Fit) -> int:
 
 
 # --- what is told ----
+def _errors(explanation: Explanation) -> tuple[float, ...]:
+    """Standard error of the amount of each cause."""
+    return tuple(np.sqrt(np.maximum(np.diag(explanation.fit.covariance), 0.0)).tolist())
+
+
 @dataclass(frozen=True)
 class _Told:
     """What stands of an explanation.

@@ -320,6 +320,8 @@ def find(name: str) -> Effect:
     Raises:
         UnknownNameError: with the nearest names.
     """
+    if name in CATALOGUE:
+        return CATALOGUE[name]
     try:
         return CATALOGUE[name.strip().casefold()]
     except KeyError:

@@ -28,7 +28,7 @@ CLASSES = (
 )  # fmt: skip
 """OCELOT's element classes that a file may name."""
 
-_NOT_PHYSICS = ("id", "has_edge", "color", "width", "height", "params", "n")
+NOT_PHYSICS = ("id", "has_edge", "color", "width", "height", "params", "n")
 
 
 def save_ring(ring: Ring, path: str | Path) -> None:
@@ -56,7 +56,7 @@ def save_ring(ring: Ring, path: str | Path) -> None:
     keys: dict[str, str] = {}  # what an element is, as text -> its key
     sequence = []
     for element in ring.elements:
-        content = _described(element)
+        content = described(element)
         text = json.dumps([element.family, content], sort_keys=True)
         if text not in keys:
             key, k = element.family, 1
@@ -170,10 +170,15 @@ def _blank(cls: str) -> dict[str, Any]:
     from tmlattice.lattice.ocelot import elements
 
     values = vars(getattr(elements, cls)(eid="blank").element)
-    return {k: v for k, v in values.items() if k not in _NOT_PHYSICS}
+    return {k: v for k, v in values.items() if k not in NOT_PHYSICS}
 
 
-def _described(element: Element) -> dict[str, Any]:
+def described(element: Element) -> dict[str, Any]:
+    """An element as a definition of the file.
+
+    Raises:
+        LatticeError: numbers do not describe it.
+    """
     source = element.source
     cls = type(source).__name__
     if cls not in CLASSES:
@@ -205,6 +210,11 @@ def _entries(array: Any) -> dict[str, float]:
         "".join(str(i + 1) for i in index): float(squeezed[tuple(index)])
         for index in np.argwhere(squeezed)
     }
+
+
+def source_of(cls: str, parameters: dict[str, Any]) -> Any:
+    """The OCELOT element of a class and of those of its numbers that are not its defaults."""
+    return _source(Path("cache"), "", {"class": cls, "parameters": parameters})
 
 
 def _source(path: Path, key: str, definition: dict[str, Any]) -> Any:

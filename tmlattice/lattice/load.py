@@ -1,9 +1,11 @@
 """One door to all lattice files: the suffix says which reader it is."""
 
+import warnings
 from importlib.resources import files
 from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.lattice import stored
 from tmlattice.lattice.ring import Ring
 
 AT_SUFFIXES = (".mat", ".m", ".repr")
@@ -41,6 +43,21 @@ def load_ring(
     """
     path = _find(str(name_or_path))
     name = str(name_or_path)
+    key = stored.key_of(path, sequence, energy)
+    kept = stored.load(key, name) if key else None
+    if kept is not None:
+        return kept
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        ring = _read(path, name, sequence, energy)
+    for w in told:
+        warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
+    if key and not told:  # what is told is told every time
+        stored.save(key, ring)
+    return ring
+
+
+def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> Ring:
     suffix = path.suffix.lower()
     if suffix == ".py":
         from tmlattice.lattice.ocelot_file import read_ocelot

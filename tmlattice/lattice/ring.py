@@ -1,6 +1,7 @@
 """A ring: named elements in beam order, each with the OCELOT object that it stands for."""
 
 import copy
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -80,6 +81,24 @@ NO_ERRORS = Errors()
 
 
 @dataclass(frozen=True)
+class Source:
+    """What an OCELOT element is, as data; the element itself is made when it is asked for.
+
+    Attributes:
+        text: JSON of its class and of those numbers that are not the class's defaults.
+    """
+
+    text: str
+
+    @cached_property
+    def element(self) -> Any:
+        """The OCELOT element; one object, as long as this lives."""
+        from tmlattice.lattice.json_file import source_of
+
+        return source_of(*json.loads(self.text))
+
+
+@dataclass(frozen=True)
 class Element:
     """One place in the ring.
 
@@ -110,6 +129,12 @@ class Element:
     errors: Errors = NO_ERRORS
 
     @property
+    def data(self) -> Source | None:
+        """The source as data, where it was read as such: equal for elements with equal maps."""
+        source = self.__dict__["source"]
+        return source if isinstance(source, Source) else None
+
+    @property
     def is_magnet(self) -> bool:
         """True for everything that is not a drift, a monitor, a marker or a cavity."""
         return self.kind not in PASSIVE
@@ -138,7 +163,23 @@ class Element:
 
     def with_errors(self, **amounts: float | Slopes) -> "Element":
         """A copy with these amounts added to its `errors`."""
-        return replace(self, errors=self.errors.plus(**amounts))
+        return replace(self, source=self.data or self.source, errors=self.errors.plus(**amounts))
+
+
+class _Made:
+    """The field `source`: an element that was read as data asks OCELOT when it is first used."""
+
+    def __get__(self, element: Element | None, owner: type) -> Any:
+        if element is None:
+            return self
+        source = element.__dict__["source"]
+        return source.element if isinstance(source, Source) else source
+
+    def __set__(self, element: Element, source: Any) -> None:
+        element.__dict__["source"] = source
+
+
+Element.source = _Made()
 
 
 @dataclass(frozen=True)
@@ -245,5 +286,8 @@ def number_names(names: Iterable[str]) -> list[str]:
         seen[key] += 1
     return numbered
 
+
+KEPT = ("kept",)
+"""Where a ring's `memory` has the key under which it is kept in the cache, if it is."""
 
 KINDS: tuple[str, ...] = get_args(Kind)

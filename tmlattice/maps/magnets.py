@@ -7,6 +7,7 @@ way from the exit of magnet k - 1 to the exit of magnet k, and the chain of laye
 """
 
 import functools
+import io
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice import cache
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import NO_ERRORS, Element, Ring, Slopes
+from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Ring, Slopes
 from tmlattice.maps.taylor import TaylorMap
 
 Array = NDArray[np.float64]
@@ -80,19 +82,19 @@ ASKED = 5_000
 _asked: dict[Hashable, list[Part]] = {}
 
 
-def _parts(source: Any, energy: float, split: bool) -> list[Part]:
+def _parts(element: Element, energy: float, split: bool) -> list[Part]:
     """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element: do not change them.
 
     With `split` the body comes as two halves, in the middle of the list.
     """
-    physics = _physics(source)
+    physics = _physics(element)
     if isinstance(physics, int):
-        return _parts_of_ocelot(source, energy, split)
+        return _parts_of_ocelot(element.source, energy, split)
     known = _asked.get((physics, energy, split))
     if known is None:
         if len(_asked) > ASKED:
             _asked.clear()
-        known = _asked[physics, energy, split] = _parts_of_ocelot(source, energy, split)
+        known = _asked[physics, energy, split] = _parts_of_ocelot(element.source, energy, split)
     return known
 
 
@@ -129,13 +131,20 @@ def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
     return back @ R @ there, np.tensordot(back, there.T @ T @ there, 1)
 
 
-def _physics(source: Any) -> Hashable:
-    """Equal for sources with equal maps: the class and every attribute but those for people."""
+def _physics(element: Element) -> Hashable:
+    """Equal for elements with equal maps, but for their errors: the class and every attribute of
+    the source but those for people."""
+    if element.data is not None:
+        return element.data
+    source = element.source
     values = vars(source.element)
     physics = tuple(values[k] for k in values if k not in ("id", "color", "params"))
-    if not values.get("params") and all(isinstance(v, int | float | None) for v in physics):
+    if not values.get("params") and all(isinstance(v, _NUMBERS) for v in physics):
         return (type(source), physics)
     return id(source)  # it holds more than numbers: a matrix, a field map
+
+
+_NUMBERS = (int, float, type(None))
 
 
 def _of_ocelot(part: Part, n: int) -> Quadratic:
@@ -155,7 +164,7 @@ def _quadratic(element: Element, energy: float, n: int) -> Quadratic:
     if element.kind == "cavity":  # what it gives depends on the turn: that is the beam's
         element = _empty(element)
     if errors == NO_ERRORS:
-        total = _chain(_of_ocelot(part, n) for part in _parts(element.source, energy, False))
+        total = _chain(_of_ocelot(part, n) for part in _parts(element, energy, False))
     else:
         first, second = _halves(element, energy, n)
         total = _chain(
@@ -198,9 +207,9 @@ def _chain(parts: Iterable[Quadratic | None]) -> Quadratic:
 def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
     """The maps to and from the middle of an element's body."""
     if element.length == 0:  # as thin as what is put into it
-        parts = [_of_ocelot(part, n) for part in _parts(element.source, energy, False)]
+        parts = [_of_ocelot(part, n) for part in _parts(element, energy, False)]
         return _identity(n), _chain(parts)
-    parts = [_of_ocelot(part, n) for part in _parts(element.source, energy, True)]
+    parts = [_of_ocelot(part, n) for part in _parts(element, energy, True)]
     middle = len(parts) // 2
     if len(parts) % 2 == 0:
         return _chain(parts[:middle]), _chain(parts[middle:])
@@ -286,7 +295,7 @@ def part_maps(element: Element, energy: float, dimension: int = 4) -> list[Taylo
     Args:
         element, energy, dimension: see `element_map`.
     """
-    parts = _parts(element.source, energy, False)
+    parts = _parts(element, energy, False)
     return [TaylorMap(_of_ocelot(part, dimension).reduced()) for part in parts]
 
 
@@ -399,16 +408,10 @@ class LayerMaps:
         self._equal: dict[Hashable, Quadratic] = {}
         self._layers: dict[Hashable, tuple[Weights, list[Weights]]] = {}
 
-    @cached_property
-    def _own(self) -> dict[int, Hashable]:
-        """The physics of the ring's own sources, by id: they live as long as the ring."""
-        sources = {id(element.source): element.source for element in self.ring.elements}
-        return {key: _physics(source) for key, source in sources.items()}
-
-    def physics(self, element: Element) -> tuple[Hashable, Hashable]:
+    @staticmethod
+    def physics(element: Element) -> tuple[Hashable, Hashable]:
         """Equal for elements with equal maps."""
-        source = element.source
-        return (self._own.get(id(source)) or _physics(source), element.errors)
+        return (_physics(element), element.errors)
 
     def map(self, element: Element) -> Quadratic:
         """The map of one element, of this ring or not."""
@@ -490,7 +493,36 @@ def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -
         LatticeError: a ring without magnets, or a map that is not finite.
         ValueError: another dimension.
     """
-    layers = LayerMaps(ring, dimension) if layers is None else layers
+    key = cache.key("maps", ring.memory[KEPT], dimension) if KEPT in ring.memory else None
+    content = cache.load(key) if key else None
+    if content is not None:
+        return _read(ring, content)
+    maps = _made(ring, dimension, LayerMaps(ring, dimension) if layers is None else layers)
+    if key:
+        cache.save(key, _written(maps))
+    return maps
+
+
+_KEPT = ("s", "W0", "W1", "W2", "s_monitors", "at", "R0", "R1", "R2")
+
+
+def _written(maps: RingMaps) -> bytes:
+    content = io.BytesIO()
+    np.savez(content, *maps.closing.coefficients, **{name: getattr(maps, name) for name in _KEPT})
+    return content.getvalue()
+
+
+def _read(ring: Ring, content: bytes) -> RingMaps:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return RingMaps(
+            layers=tuple(e.name for e in ring.magnets),
+            monitors=tuple(e.name for e in ring.monitors),
+            closing=TaylorMap([arrays[f"arr_{degree}"] for degree in range(3)]),
+            **{name: arrays[name] for name in _KEPT},
+        )
+
+
+def _made(ring: Ring, dimension: int, layers: LayerMaps) -> RingMaps:
     magnets = ring.magnets
     weights: list[Weights] = []
     readouts: list[Weights] = []
@@ -542,7 +574,7 @@ def ring_matrix(ring: Ring) -> Array:
         if element.errors != NO_ERRORS or element.kind == "cavity":
             total = _quadratic(element, ring.energy, 6).R[:4, :4] @ total
             continue
-        physics = _physics(element.source)
+        physics = _physics(element)
         if physics not in known:
             known[physics] = [matrix[:4, :4] for matrix in element.source.R(ring.energy)]
         for matrix in known[physics]:

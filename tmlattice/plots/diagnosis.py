@@ -12,6 +12,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
+from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import lattice_strip
 
 Array = NDArray[np.float64]
@@ -35,6 +36,21 @@ WIDE = 300.0
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
+    own = _trajectory_figures if diagnosis.kind == "trajectory" else response_figures
+    yield from own(diagnosis)
+    for number, finding in enumerate(diagnosis.findings, 1):
+        if len(finding.credible_set) > 1:
+            height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
+            _, ax = plt.subplots(figsize=(9, height), layout="constrained")
+            plot_credible_set(finding, ax)
+            yield (
+                f"credible-set-{number}",
+                f"Explanations of finding {number} that the data do not exclude.",
+                _figure(ax),
+            )
+
+
+def _trajectory_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     yield (
         "readings",
         "Readings of one shot of the fit, and what each model leaves of them, its launch fitted.",
@@ -63,16 +79,6 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
             "Readings of shots that the fit never saw less the model, as findings are added.",
             _figure(ax),
         )
-    for number, finding in enumerate(diagnosis.findings, 1):
-        if len(finding.credible_set) > 1:
-            height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
-            _, ax = plt.subplots(figsize=(9, height), layout="constrained")
-            plot_credible_set(finding, ax)
-            yield (
-                f"credible-set-{number}",
-                f"Explanations of finding {number} that the data do not exclude.",
-                _figure(ax),
-            )
 
 
 def _figure(ax: Axes) -> Figure:
@@ -93,7 +99,7 @@ def plot_readings(
         shot: its place among those of the fit; else the one with the largest residual.
     """
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
-    data, found = diagnosis.data, diagnosis.explanation
+    data, found = diagnosis.trajectories.data, diagnosis.explanation
     explained = diagnosis.verdict != "distributed"
     models = [found.before.point.view.readings]
     if explained:

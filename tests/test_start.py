@@ -1,0 +1,320 @@
+"""What a command loads, and what is kept between two calls."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tmlattice import cache, load_ring
+from tmlattice.inference import chi2
+from tmlattice.lattice import stored
+from tmlattice.lattice.ring import KEPT
+from tmlattice.maps import element_map, ring_maps
+
+SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
+
+
+def python(code, folder, *arguments, **environment):
+    """What a fresh interpreter prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, "TMLATTICE_CACHE": str(folder / "cache"), **environment},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """An empty cache folder, and a lattice file of one's own."""
+    monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path / "cache"))
+    path = tmp_path / "small.py"
+    shutil.copy(SMALL, path)
+    return path
+
+
+LOADED = (
+    "import sys\n"
+    "from tmlattice.cli.command import tmlattice\n"
+    "tmlattice(sys.argv[1:], standalone_mode=False)\n"
+    "heavy = {'ocelot', 'torch', 'scipy.stats', 'pandas', 'matplotlib', 'at'}\n"
+    "print('loaded:', *sorted(heavy & set(sys.modules)))\n"
+)
+
+
+def test_a_second_info_loads_neither_ocelot_nor_torch_and_says_the_same(tmp_path):
+    def info(name):
+        out = python(LOADED, tmp_path, "info", "petra3", "--json", name)
+        return json.loads((tmp_path / name).read_text()), out.partition("loaded:")
+
+    cold, (said_cold, _, _) = info("cold.json")
+    warm, (said_warm, _, loaded) = info("warm.json")
+    assert cold == warm
+    assert said_cold == said_warm
+    assert loaded.split() == []
+
+
+def test_ocelot_is_whole_for_a_user_who_imports_it_after_the_package(tmp_path):
+    python(
+        "import sys, numba\n"
+        "jit = numba.jit\n"
+        "from tmlattice.lattice.ocelot import elements\n"
+        "assert numba.jit is jit\n"
+        "left = [n for n in ('pandas', 'scipy.signal', 'scipy.optimize') if n in sys.modules]\n"
+        "assert not left, left\n"
+        "import ocelot, ocelot.cpbd.match\n"
+        "missing = [n for n in ocelot.__all__ if not hasattr(ocelot, n)]\n"
+        "assert not missing, missing\n"
+        "assert all(getattr(ocelot, n) is getattr(elements, n) for n in elements.__all__\n"
+        "           if n in ocelot.__all__)\n"
+        "import numpy as np\n"
+        "from ocelot.common import math_op\n"
+        "assert hasattr(math_op.corr_f_nb, 'py_func')  # compiled, not plain Python\n"
+        "a, b = (np.random.default_rng(1).normal(size=(4, 4)) for _ in range(2))\n"
+        "c = a.copy()\n"
+        "math_op.corr_f_nb(a, b, 1, 2); math_op.corr_f_py(c, b, 1, 2)\n"
+        "assert np.allclose(a, c, equal_nan=True)\n"
+        "from ocelot.cpbd.beam import core\n"
+        "assert abs(core.savgol_filter(np.arange(9.0), 5, 2) - np.arange(9.0)).max() < 1e-12\n"
+        "assert len(ocelot.Twiss().to_series()) > 10  # pandas\n"
+        "cell = ocelot.MagneticLattice([ocelot.Drift(l=1.0), ocelot.Quadrupole(l=0.2, k1=1.0)])\n"
+        "assert cell.totalLen == 1.2\n",
+        tmp_path,
+    )
+
+
+def test_ocelot_stays_as_it_is_for_a_user_who_imported_it_before(tmp_path):
+    python(
+        "import ocelot, sys\n"
+        "before = dict(vars(ocelot))\n"
+        "import tmlattice\n"
+        "ring = tmlattice.load_ring('petra3')\n"
+        "tmlattice.element_map(ring.magnets[0], ring.energy)\n"
+        "assert sys.modules['ocelot'] is ocelot and type(ocelot) is type(sys)\n"
+        "assert all(vars(ocelot)[name] is value for name, value in before.items())\n"
+        "source = ring.magnets[0].source\n"
+        "assert type(source) is getattr(ocelot, type(source).__name__)\n",
+        tmp_path,
+    )
+
+
+def test_a_version_of_ocelot_that_cannot_be_parted_is_imported_whole(tmp_path):
+    python(
+        "import sys\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        light = type(sys.modules.get('ocelot')) is not type(sys)\n"
+        "        if name == 'ocelot.cpbd.elements' and light:\n"
+        "            raise RuntimeError('parted')\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        "from tmlattice.lattice.ocelot import elements\n"
+        "import ocelot\n"
+        "assert type(ocelot) is type(sys) and ocelot.Drift is elements.Drift\n",
+        tmp_path,
+    )
+
+
+def test_a_kept_ring_is_the_ring_that_was_read(kept):
+    read = load_ring(kept)
+    again = load_ring(kept)
+    assert all(e.data is not None for e in again.elements)
+    assert again == read
+    for ours, theirs in zip(again.elements, read.elements, strict=True):
+        assert type(ours.source) is type(theirs.source)
+        a, b = vars(ours.source.element), vars(theirs.source.element)
+        for name in a.keys() - {"id"}:
+            assert np.array_equal(a[name], b[name]), (ours.name, name)
+    for dimension in (4, 6):
+        made, found = (ring_maps(ring, dimension) for ring in (read, again))
+        again.memory.clear()
+        anew = ring_maps(again, dimension)  # without the key: made from the kept elements
+        again = load_ring(kept)
+        for name in ("s", "W0", "W1", "W2", "s_monitors", "at", "R0", "R1", "R2"):
+            assert np.array_equal(getattr(made, name), getattr(found, name)), name
+            assert np.array_equal(getattr(made, name), getattr(anew, name)), name
+        assert made.layers == found.layers
+        assert made.monitors == found.monitors
+        for a, b in zip(made.closing.coefficients, found.closing.coefficients, strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_a_change_of_a_kept_ring_gets_its_own_maps(kept):
+    load_ring(kept)
+    ring = load_ring(kept)
+    ring_maps(ring)
+    weak = ring.with_changed("qf::3", k1=0.7)
+    assert ring["qf::3"].source.k1 == 0.9
+    assert ring["qf::4"].source.k1 == 0.9
+    moved = np.flatnonzero((ring_maps(weak).W1 != ring_maps(ring).W1).any(axis=(1, 2)))
+    assert [ring.magnets[k].name for k in moved] == ["QF::3"]
+    pushed = ring["qf::3"].with_errors(dx=1e-3)
+    assert element_map(pushed, ring.energy)([0.0] * 4)[1] != 0.0
+
+
+def test_a_changed_file_is_read_again(kept):
+    load_ring(kept)
+    kept.write_text(kept.read_text().replace("k = 0.9", "k = 0.8"))
+    assert load_ring(kept)["qf::0"].k1 == 0.8
+    assert load_ring(kept, energy=2.0).energy == 2.0
+
+
+def test_a_damaged_entry_is_made_anew(kept):
+    ring = load_ring(kept)
+    expected = ring_maps(ring).W1
+    entries = sorted((kept.parent / "cache").iterdir())
+    assert len(entries) == 2  # elements, maps
+    whole = [entry.read_bytes() for entry in entries]
+    for spoil in (lambda b: b[:-1], lambda b: b"", lambda b: b[:90] + b"?" + b[91:]):
+        for entry, content in zip(entries, whole, strict=True):
+            entry.write_bytes(spoil(content))
+        again = load_ring(kept)
+        assert again == ring
+        assert np.array_equal(ring_maps(again).W1, expected)
+        assert [entry.read_bytes()[:32] for entry in entries] == [w[:32] for w in whole]
+
+
+@pytest.mark.parametrize("place", ["off", "a file/in the way"])
+def test_without_a_place_to_keep_it_a_ring_is_read_every_time(kept, monkeypatch, place):
+    (kept.parent / "a file").write_text("")
+    monkeypatch.chdir(kept.parent)
+    monkeypatch.setenv("TMLATTICE_CACHE", place)
+    first, second = load_ring(kept), load_ring(kept)
+    assert first == second
+    assert second["qf::0"].data is None
+    assert np.array_equal(ring_maps(first).W1, ring_maps(second).W1)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from parts import q",
+        "import os",
+        "k = float(open('k.txt').read())",
+        "k = np.loadtxt('k.txt')",
+        "k = np.random.rand()",
+        "k = __import__('parts').k",
+        "from .parts import q",
+        "this is no Python",
+    ],
+)
+def test_code_that_may_depend_on_more_than_itself_is_run_every_time(tmp_path, line):
+    path = tmp_path / "ring.py"
+    path.write_text(f"from ocelot import *\nimport numpy as np\n{line}\n")
+    assert stored.key_of(path, None, None) is None
+    path.write_text("from ocelot import *\nimport numpy as np\nk = np.sqrt(2.0)\n")
+    assert stored.key_of(path, None, None) is not None
+    (tmp_path / "numpy.py").write_text("sqrt = max")
+    assert stored.key_of(path, None, None) is None
+
+
+def test_a_neighbour_that_changes_is_seen(kept):
+    (kept.parent / "parts_of_it.py").write_text("k1 = 1.0\n")
+    kept.write_text(
+        "from ocelot import *\nfrom parts_of_it import k1\nenergy = 1.0\n"
+        "ring = [Quadrupole(l=0.1, k1=k1, eid='q'), Drift(l=1.0)]\n"
+    )
+    assert load_ring(kept)["q"].k1 == 1.0
+    (kept.parent / "parts_of_it.py").write_text("k1 = 2.0  # another size\n")
+    sys.modules.pop("parts_of_it")
+    assert load_ring(kept)["q"].k1 == 2.0
+
+
+def test_a_warning_is_told_every_time(kept):
+    kept.write_text("from ocelot import *\nring = [Quadrupole(l=0.1, k1=1.0, eid='q')]\n")
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="states no beam energy"):
+            load_ring(kept)
+
+
+def test_what_data_cannot_say_is_not_kept(kept):
+    kept.write_text(
+        "from ocelot import *\nenergy = 1.0\nq = Quadrupole(l=0.1, k1=1.0, eid='q')\n"
+        "q.element.mag_field = max\nring = [q]\n"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert KEPT not in load_ring(kept).memory
+    assert load_ring(kept)["q"].data is None
+
+
+def test_many_writers_never_leave_a_torn_entry(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path))
+    contents = [bytes([k]) * (40_000 + 977 * k) for k in range(4)]
+    cache.save("entry", contents[0])
+    wrong = []
+
+    def work(k):
+        for _ in range(40):
+            cache.save("entry", contents[k])
+            if cache.load("entry") not in contents:
+                wrong.append(k)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert [path.name for path in tmp_path.iterdir()] == ["entry"]
+
+
+def test_the_cache_stays_within_its_bound_and_the_oldest_go(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path))
+    monkeypatch.setattr(cache, "LIMIT", 5000)
+    for k in range(6):
+        cache.save(f"entry{k}", b"x" * 1500)
+        os.utime(tmp_path / f"entry{k}", (k, k))
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 5000
+    assert cache.load("entry5") == b"x" * 1500
+    assert cache.load("entry0") is None
+
+
+@pytest.mark.parametrize("tilt", [0.3, np.pi / 2])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda e, t: e.Quadrupole(l=0.4, k1=0.9, tilt=t),
+        lambda e, t: e.Sextupole(l=0.2, k2=12.0, tilt=t),
+        lambda e, t: e.SBend(l=1.2, angle=0.2, e1=0.1, e2=0.1, k1=0.1, tilt=t),
+    ],
+)
+def test_tilted_maps_vs_ocelots_own_rotation(make, tilt):
+    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
+    from tmlattice.maps.magnets import _parts_of_ocelot
+
+    source = make(elements, tilt)
+    ours = _parts_of_ocelot(source, 3.0, split=False)
+    edges = source.element.has_edge
+    types = [TMTypes.ENTRANCE, TMTypes.MAIN, TMTypes.EXIT] if edges else [TMTypes.MAIN]
+    for (_, R, T), which in zip(ours, types, strict=True):
+        theirs = SecondTM.from_element(source.element, which).get_params(3.0)
+        assert np.allclose(R, theirs.get_rotated_R(), rtol=1e-14, atol=1e-15)
+        # three products of sums of six terms: a few roundings of the largest term
+        largest = abs(T).max()
+        symmetric = 0.5 * (T + T.swapaxes(1, 2))
+        assert abs(symmetric - theirs.get_rotated_T()).max() < 1e-14 * largest
+        assert largest > 0.1
+
+
+def test_tails_of_chi_square_vs_scipy_stats():
+    statistic = np.array([-1.0, 0.0, 1e-3, 5.0, 4000.0, 1e5, np.inf, np.nan])
+    for freedom in (0, 1, 6, 4000):
+        assert np.array_equal(
+            chi2.sf(statistic, freedom), stats.chi2.sf(statistic, freedom), equal_nan=True
+        )
+        rate = np.array([1e-300, 1e-12, 0.01, 0.5, 1.0])
+        assert np.array_equal(
+            chi2.isf(rate, freedom), stats.chi2.isf(rate, freedom), equal_nan=True
+        )
