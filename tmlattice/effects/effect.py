@@ -231,8 +231,8 @@ class ReadingEffect(Effect):
         """What a monitor with this amount alone reads of the beam [..., 2] (x, y), m, less beam."""
 
     @abstractmethod
-    def set(self, monitors: "Monitors", at: int, amount: float) -> None:
-        """Put this much more of it into monitor `at` of `monitors`, in place."""
+    def set(self, monitors: "Monitors", at: int | slice, amount: float) -> None:
+        """Put this much more of it into monitor `at` of `monitors`, or into some, in place."""
 
 
 class LaunchEffect(Effect):

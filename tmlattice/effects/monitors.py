@@ -24,7 +24,7 @@ class _Offset(ReadingEffect):
         change[..., self.plane] = amount
         return change
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the offset."""
         monitors.offset[at, self.plane] += amount
 
@@ -63,7 +63,7 @@ class _Gain(ReadingEffect):
         change[..., self.plane] = amount * beam[..., self.plane]
         return change
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Multiply the gain."""
         monitors.gain[at, self.plane] = (1 + monitors.gain[at, self.plane]) * (1 + amount) - 1
 
@@ -106,7 +106,7 @@ class MonitorRoll(ReadingEffect):
         cos, sin = np.cos(amount), np.sin(amount)
         return np.asarray(beam @ np.array([[cos - 1, -sin], [sin, cos - 1]]))
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the angle."""
         monitors.roll[at] += amount
 
@@ -128,7 +128,7 @@ class MonitorCoupling(ReadingEffect):
         """The other plane's share."""
         return np.asarray(amount * beam[..., ::-1])
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the coupling."""
         monitors.coupling[at] += amount
 
@@ -150,7 +150,7 @@ class MonitorSwap(ReadingEffect):
         """The other plane instead of the own."""
         return np.asarray(amount * (beam[..., ::-1] - beam))
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Exchange the planes (0 does not)."""
         monitors.swapped[at] ^= amount != 0
 
@@ -176,6 +176,6 @@ class MonitorDead(ReadingEffect):
         first = beam[(0,) * (beam.ndim - 1)] if amount == 2 else beam
         return np.asarray(first - beam)
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Silence it, or freeze it."""
         (monitors.frozen if amount == 2 else monitors.silent)[at] = amount != 0
