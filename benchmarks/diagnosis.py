@@ -12,11 +12,10 @@ import numpy as np
 
 import tmlattice
 from tmlattice.beam.model import Model
-from tmlattice.inference.metric import metric
-from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import scan
-from tmlattice.inference.whitening import Whitening
 from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 
 
 def median_time(call, repeats=5):
@@ -33,13 +32,12 @@ def scanner(ring, measurement):
     """A call that scans every hypothesis anew, the directions of the ring at hand."""
     data = of_measurement(ring, measurement)
     model = Model(ring, data.settings, data.turns)
-    problem = Problem(model, data, Whitening(data), {})
+    problem = FirstTurns(model=model, data=data, places={})
     base = fit(problem, (), data.launches)
     hypotheses = [h for h in model.hypotheses() if h[0] != "monitor_dead"]
 
     def call():
-        about = metric(model, base.paths, problem.whitening, base.projection, data.active)
-        return scan(about, base.launches, hypotheses, base.residual)
+        return scan(problem.metric(base.point), hypotheses, base.residual)
 
     return call, len(hypotheses)
 

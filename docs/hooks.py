@@ -29,7 +29,8 @@ def effects() -> str:
 
     rows = [
         [
-            f"`{effect.name}`",
+            f"`{effect.name}`" + ("" if effect.usual else " (\\*)"),
+            effect.words,
             effect.unit,
             effect.sits_on_text,
             effect.sign.replace("*", "\\*"),
@@ -38,7 +39,15 @@ def effects() -> str:
         ]
         for effect in CATALOGUE.values()
     ]
-    head = ["effect", "unit", "sits on", "what a positive amount does", "usual rms", "largest"]
+    head = [
+        "effect",
+        "in words",
+        "unit",
+        "sits on",
+        "what a positive amount does",
+        "usual rms",
+        "largest",
+    ]
     return table(head, rows)
 
 

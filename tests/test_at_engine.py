@@ -4,14 +4,20 @@ One element is followed by a monitor, a metre of drift and a second monitor: the
 state (x, px, y, py), since a drift of AT is x += L px on energy.
 """
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from ocelot.cpbd.elements import Solenoid, Undulator
+from places import THIN, kicked
 
 from tmlattice import TaylorNetwork, load_ring, off_momentum
-from tmlattice.effects import Cause
-from tmlattice.errors import LatticeError, UnknownNameError
-from tmlattice.machine.at_engine import SITS_ON, AtEngine, to_at
+from tmlattice.effects import CATALOGUE, Cause, LaunchEffect, ReadingEffect, RingEffect
+from tmlattice.effects.build import Build
+from tmlattice.errors import EffectError, LatticeError, UnknownNameError
+from tmlattice.machine.at_elements import Builder
+from tmlattice.machine.at_engine import AtEngine, to_at
 
 LAUNCH = np.array([1.1e-3, 2e-4, -0.7e-3, 1e-4, 0.0, 0.0])
 TOUCHED = set()
@@ -149,6 +155,24 @@ def test_insertion_device_focuses_at_its_entrance(tmp_path):
     np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
 
 
+@pytest.mark.parametrize("name", THIN)
+def test_thin_kicks_are_those_of_the_table(tmp_path, name):
+    """What `sign` says: of a marker, or of a wiggler's entrance."""
+    marker = "marker" in CATALOGUE[name].sits_on_text
+    engine = engine_of(tmp_path, "Marker(eid='it')" if marker else WIGGLER, (name, 0.01))
+    body = np.eye(4) if marker else block(quadrupole(0, 4.0), quadrupole(0.0027, 4.0))
+    expected = body @ kicked(name, 0.01, LAUNCH)
+    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-14)
+
+
+def test_a_wake_in_a_cavity_kicks_in_its_middle(tmp_path):
+    engine = engine_of(tmp_path, "Cavity(l=0.6, freq=5e8, eid='it')", ("wake_kick_y", 0.05))
+    kick = np.eye(4)
+    kick[3, 2] = 0.05
+    expected = quadrupole(0, 0.3) @ kick @ quadrupole(0, 0.3) @ LAUNCH[:4]
+    np.testing.assert_allclose(exit_state(engine), expected, atol=1e-14)
+
+
 BEND = "SBend(l=2.0, angle=0.028, eid='it')"
 
 
@@ -234,8 +258,9 @@ def test_sextupole_offset_is_that_of_its_centre(tmp_path):
 
 
 def test_no_effect_is_left_untested():
-    """Runs last of the effects' tests: each has met its formula above."""
-    assert set(SITS_ON) <= TOUCHED
+    """Runs last of the effects' tests: each has met a formula above."""
+    on_one = {n for n, e in CATALOGUE.items() if isinstance(e, RingEffect) and not e.energy}
+    assert on_one - {"family_gradient"} <= TOUCHED
 
 
 def test_octupole_multipole_and_solenoid(tmp_path):
@@ -330,7 +355,7 @@ def test_energy_loss_of_a_turn_is_the_formula(petra3, bends, wigglers):
 
 def test_loss_in_a_wiggler_shrinks_the_angles(tmp_path):
     plain = engine_of(tmp_path, WIGGLER)
-    lossy = AtEngine(plain.ring, radiation_wigglers=100.0)  # far more than there is, to be seen
+    lossy = AtEngine(plain.ring, radiation_wigglers=100.0, voltage=20e6)  # far too much, to be seen
     u = lossy.expected_loss / 6e9
     launch = np.array([0, 1e-3, 0, 0, 0, 0])
     before_loss, after = exit_state(plain, launch), exit_state(lossy, launch)
@@ -474,12 +499,11 @@ def test_momentum_of_at_and_ocelot():
 def test_thousands_of_causes_are_built_at_once(petra3, rng):
     import time
 
-    powered = [e.name for e in petra3.elements if e.kind == "quadrupole"]
     causes = [
-        Cause(effect, name, float(1e-4 * rng.standard_normal()))
-        for name in powered
-        for effect in SITS_ON
-        if "quadrupole" in SITS_ON[effect]
+        Cause(name, place, float(1e-4 * rng.standard_normal()))
+        for name, effect in CATALOGUE.items()
+        if effect.group == "quadrupoles"
+        for place in effect.places(petra3)
     ]
     assert len(causes) > 2400
     begun = time.perf_counter()
@@ -488,27 +512,31 @@ def test_thousands_of_causes_are_built_at_once(petra3, rng):
 
 
 def test_effects_on_readings_and_beam_are_the_callers(small_ring):
-    names = ["monitor_offset_x", "monitor_swap", "energy_offset", "energy_spread"]
-    engine = AtEngine(small_ring, [Cause(name, "last_a", 1.0) for name in names])
+    causes = [
+        Cause(name, effect.places(small_ring)[0], 1.0)
+        for name, effect in CATALOGUE.items()
+        if isinstance(effect, ReadingEffect | LaunchEffect)
+    ]
+    engine = AtEngine(small_ring, causes)
     np.testing.assert_array_equal(
         engine.track(LAUNCH[None] / 10), AtEngine(small_ring).track(LAUNCH[None] / 10)
     )
 
 
 @pytest.mark.parametrize(
-    ("cause", "message"),
+    ("cause", "error", "message"),
     [
-        (Cause("quadrupole_gradint", "QF::1", 0.1), "quadrupole_gradient"),
-        (Cause("quadrupole_gradient", "sf::1", 0.1), "cannot sit on the sextupole"),
-        (Cause("quadrupole_gradient", "QF::99", 0.1), "QF::9"),
-        (Cause("quadrupole_gradient", None, 0.1), "name it"),
-        (Cause("radiation_loss_bends", "bend::1", 0.1), "should be None"),
-        (Cause("radiation_loss_bends", None, -0.1), "cannot be negative"),
-        (Cause("radiation_loss_bends", None, 1e4), "give voltage="),
+        (Cause("quadrupole_gradint", "QF::1", 0.1), UnknownNameError, "quadrupole_gradient"),
+        (Cause("quadrupole_gradient", "sf::1", 0.1), EffectError, "cannot sit on 'sf::1'"),
+        (Cause("quadrupole_gradient", "QF::99", 0.1), UnknownNameError, "QF::9"),
+        (Cause("quadrupole_gradient", None, 0.1), EffectError, "needs an element"),
+        (Cause("radiation_loss_bends", "bend::1", 0.1), EffectError, "leave 'bend::1' out"),
+        (Cause("radiation_loss_bends", None, -0.1), LatticeError, "cannot be negative"),
+        (Cause("radiation_loss_bends", None, 1e4), LatticeError, "give voltage="),
     ],
 )
-def test_a_cause_that_cannot_be_is_named(small_ring, cause, message):
-    with pytest.raises(LatticeError, match=message):
+def test_a_cause_that_cannot_be_is_named(small_ring, cause, error, message):
+    with pytest.raises(error, match=message):
         AtEngine(small_ring, [cause])
 
 
@@ -533,3 +561,16 @@ def test_a_setting_that_cannot_be_is_named(small_ring):
 def test_what_at_cannot_build_is_named(tmp_path, element):
     with pytest.raises(LatticeError, match="cannot build 'it'"):
         engine_of(tmp_path, element)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"), [("bend", "dx"), ("hcorrector", "dy"), ("octupole", "roll")]
+)
+def test_what_at_cannot_make_wrong_is_not_passed_over(small_ring, kind, wrong):
+    builder = Builder(6e9, 10, 0.05, False, 0.0)
+    bend = next(e for e in small_ring.elements if e.kind == "bend")
+    element = replace(bend, kind=kind, name="it")
+    if kind == "octupole":
+        element = replace(element, source=SimpleNamespace(k3=1.0))
+    with pytest.raises(LatticeError, match=f"'it' with another {wrong}"):
+        builder.pieces(element, Build(**{wrong: 1e-3}), {})

@@ -12,9 +12,10 @@ from conftest import SMALL
 from tmlattice.challenge import make, read_case, read_truth, run, score
 from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import Truth, ring_of
+from tmlattice.challenge.figures import calibration, confusion, pulls, summary
 from tmlattice.challenge.oracle import Oracle, judge
 from tmlattice.challenge.record import Places, baseline_answer, exact
-from tmlattice.challenge.score import calibration, confusion, pulls, row_of, summary
+from tmlattice.challenge.score import row_of
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
 from tmlattice.machine import Machine

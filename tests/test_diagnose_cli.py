@@ -14,16 +14,15 @@ import pytest
 
 from tmlattice.cli.command import main
 from tmlattice.diagnosis import diagnose
-from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.effects import Cause
 from tmlattice.files import write_json
 from tmlattice.machine import simulate
 from tmlattice.measurement import OrbitResponse, write_measurement
+from tmlattice.report.plain import report_text
 from tmlattice.report.text import (
-    WORDS,
     amount_text,
     least_text,
     probability_text,
-    report_text,
 )
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
@@ -301,10 +300,6 @@ def test_amounts_read_in_the_units_of_the_field(effect, amount, sigma, text):
 def test_what_cannot_be_seen_is_not_given_a_number():
     assert least_text("corrector_roll", 1.2e14) == "not even the largest fault, 100 mrad"
     assert probability_text(0.99999) == "> 99.9 %"
-
-
-def test_every_effect_has_words():
-    assert set(WORDS) == set(CATALOGUE)
 
 
 # --- the figures ----------------------------------------------------------------------------------

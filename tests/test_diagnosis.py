@@ -7,9 +7,9 @@ from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.newton import Problem, amount_prior, fit
-from tmlattice.inference.whitening import Whitening
+from tmlattice.inference.newton import fit
 from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 
 
 def measured(ring, causes, shots=6, seed=1, **options):
@@ -143,7 +143,11 @@ def test_a_single_wild_reading_is_left_out_and_is_no_finding(petra3):
     readings[0, 0, 100, 0] += 1e-3
     result = diagnose(petra3, data.__class__(**{**vars(data), "readings": readings}), holdout=0)
     assert result.verdict == "nothing"
-    assert result.explanation.spikes == [(0, 100, 0)]
+    assert result.explanation.spikes == ((0, 100, 0),)
+    (told,) = result.as_json()["left_out"]
+    name = data.monitors[100]
+    assert told == {"shot": data.shots[0], "turn": 0, "monitor": name, "plane": "x"}
+    assert any(name in warning for warning in result.warnings)
 
 
 def test_data_of_another_ring_are_recognised(petra3):
@@ -191,15 +195,16 @@ def test_evidence_vs_integration(small_ring):
     assert data.monitors == tuple(names)
     of = of_measurement(small_ring, data)
     model = Model(small_ring, of.settings)
-    problem = Problem(model, of, Whitening(of), {"quadrupole_gradient": 1})
+    problem = FirstTurns(model=model, data=of, places={"quadrupole_gradient": 1})
     best = fit(problem, [cause], of.launches)
     sigma = np.sqrt(best.covariance[0, 0])
     amounts = best.causes[0].amount + sigma * np.linspace(-6, 6, 49)
     logs = []
     for amount in amounts:
         there = Cause(cause.effect, cause.element, float(amount))
-        held = Problem(model, of, problem.whitening, {}, (there,))
-        logs.append(-0.5 * fit(held, [], best.launches).chi2 + amount_prior(there))
+        held = FirstTurns(model=model, data=of, places={}, fixed=(there,))
+        left = fit(held, [], best.nuisances).chi2
+        logs.append(-0.5 * left + problem.amounts.log_density(there))
     logs = np.array(logs)
     integral = np.log(np.trapezoid(np.exp(logs - logs.max()), amounts)) + logs.max()
     prior = problem.prior((cause.effect, cause.element))

@@ -7,11 +7,11 @@ from scipy import stats
 from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.inference import scan as scanning
-from tmlattice.inference.metric import metric
-from tmlattice.inference.newton import Problem, fit
+from tmlattice.inference.newton import fit
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import simulate
 from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import estimate
 
 SETTINGS = [
@@ -39,28 +39,24 @@ class Base:
         self.hypotheses = [h for h in self.model.hypotheses() if h[0] != "monitor_dead"]
         spread = None
         if background:
-            plain = fit(
-                Problem(self.model, self.data, Whitening(self.data), {}), (), self.data.launches
-            )
+            alone = FirstTurns(model=self.model, data=self.data, places={})
+            plain = fit(alone, (), self.data.launches)
             some = [
                 h for h in self.hypotheses if h[0] in ("quadrupole_gradient", "monitor_offset_x")
             ]
-            spread = 1e-4 * self.model.signatures(plain.paths, some, plain.launches)
-        self.whitening = Whitening(self.data, spread)
-        self.problem = Problem(self.model, self.data, self.whitening, {})
+            spread = 1e-4 * self.model.signatures(plain.point.view, some, plain.nuisances)
+        self.problem = FirstTurns(model=self.model, data=self.data, places={}, spread=spread)
+        self.whitening = self.problem.whitening
         self.fit = fit(self.problem, (), self.data.launches)
-        self.metric = metric(
-            self.model, self.fit.paths, self.whitening, self.fit.projection, self.data.active
-        )
+        self.metric = self.problem.metric(self.fit.point)
 
     def scan(self, hypotheses=None, **options):
         return scanning.scan(
-            self.metric, self.fit.launches, hypotheses or self.hypotheses, self.fit.residual,
-            **options,
-        )  # fmt: skip
+            self.metric, hypotheses or self.hypotheses, self.fit.residual, **options
+        )
 
     def rows(self, hypotheses):
-        signatures = self.model.signatures(self.fit.paths, hypotheses, self.fit.launches)
+        signatures = self.model.signatures(self.fit.point.view, hypotheses, self.fit.nuisances)
         return self.fit.projection.out(self.whitening.signature(np.nan_to_num(signatures)))
 
 
@@ -106,14 +102,14 @@ def test_free_kicks_and_free_monitors_equal_explicit_least_squares(kind, request
     kicks = scanning.scan_kicks(base.metric, [5, 700, 1400], base.fit.residual)
     clean = base.fit.projection.out(base.fit.residual)
     for i, layer in enumerate([5, 700, 1400]):
-        kicked = base.model.kick_signatures(base.fit.paths, np.array([layer]))[0]
+        kicked = base.model.kick_signatures(base.fit.point.view, np.array([layer]))[0]
         alone = np.zeros((3, *kicked.shape))
         for shot in range(3):
             alone[shot, :, shot] = kicked[:, shot]
         rows = base.fit.projection.out(base.whitening.signature(alone)).reshape(6, -1)
         best, *_ = np.linalg.lstsq(rows.T, clean, rcond=1e-6)
         assert kicks.statistic[i] == pytest.approx(best @ rows @ clean, rel=1e-5)
-    shape = base.fit.paths.readings.shape
+    shape = base.fit.point.view.readings.shape
     monitors = scanning.scan_monitors(base.metric, base.fit.residual)
     m = 100
     alone = np.zeros((6, *shape))
@@ -152,12 +148,12 @@ def test_noise_is_estimated_within_five_percent_beside_a_strong_fault(petra3):
     base = Base(petra3, causes, noise=(3e-5, 1.5e-5))
     blind = base.data
     start = fit(base.problem, (), blind.launches)
-    assert estimate(blind, start.paths) == pytest.approx([3e-5, 1.5e-5], rel=0.05)
+    assert estimate(blind, start.point.view) == pytest.approx([3e-5, 1.5e-5], rel=0.05)
 
 
 def test_projection_takes_out_what_a_launch_can_do(base):
     """A change of one shot's launch leaves nothing; the coordinates come back."""
-    data, paths = base.data, base.fit.paths
+    data, paths = base.data, base.fit.point.view
     free = Whitening(data.__class__(**{**vars(data), "launch_sigma": np.full((3, 5), np.inf)}))
     projection = Projection(free.launch(paths.launch))
     step = np.array([1e-5, 2e-6, -3e-5, 1e-6, 1e-5])
@@ -170,5 +166,5 @@ def test_projection_takes_out_what_a_launch_can_do(base):
 
 def test_exactly_known_launches_have_no_directions(petra3):
     base = Base(petra3, [], launch_sigma=(0, 0, 0, 0, 0))
-    assert base.whitening.launch(base.fit.paths.launch).shape[2] == 0
+    assert base.whitening.launch(base.fit.point.view.launch).shape[2] == 0
     assert base.scan(base.hypotheses[:50], effective=1.0).statistic.max() < 40

@@ -1,13 +1,19 @@
 """Every effect of the catalogue: its derivative against the finite change of the tracked turn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from places import PLACES, THIN, kicked
 
+from tmlattice import load_ring
 from tmlattice.beam.model import Model
 from tmlattice.effects import (
     CATALOGUE,
     Cause,
+    LaunchEffect,
     Monitors,
+    RingEffect,
     apply,
     beams,
     check,
@@ -17,6 +23,7 @@ from tmlattice.effects import (
     names,
 )
 from tmlattice.errors import EffectError, LatticeError, UnknownNameError
+from tmlattice.lattice import save_ring
 from tmlattice.maps import element_map
 from tmlattice.maps.magnets import ring_maps, ring_matrix
 
@@ -24,40 +31,6 @@ SETTINGS = {
     "hcor_sw_4": {"kick": 1e-4},
     "vcor_a1_5": {"kick": -1e-4},
     "qd::4": {"k1_relative": 0.01},
-}
-CORRECTORS = ["hcor_sw_4", "vcor_a1_5"]
-
-# Where each effect is tried: an effect without a row here fails the test.
-PLACES = {
-    "quadrupole_gradient": ["qd::12", "qa4::14", "q1_se"],
-    "gradient_absolute": ["qd::12", "s1::48", "wiggler::3", "a3", "qskew_nw_1"],
-    "skew_gradient": ["qd::12", "s1::48", "wiggler::3", "a3", "qskew_nw_1"],
-    "quadrupole_roll": ["qd::12", "qa2::13"],
-    "quadrupole_offset_x": ["qd::12", "qa3::2"],
-    "quadrupole_offset_y": ["qd::12", "qa3::2"],
-    "family_gradient": ["qd", "qe5"],
-    "dipole_field": ["b::28", "b_in::10", "bo_out::5"],
-    "dipole_roll": ["b::28", "b_in::10", "bo_out::5"],
-    "corrector_kick_x": CORRECTORS,
-    "corrector_kick_y": CORRECTORS,
-    "corrector_calibration": CORRECTORS,
-    "corrector_roll": CORRECTORS,
-    "sextupole_strength": ["s1::48", "s4::26"],
-    "sextupole_offset_x": ["s1::48", "s4::26"],
-    "sextupole_offset_y": ["s1::48", "s4::26"],
-    "insertion_device_focusing": ["wiggler::0", "wiggler::12"],
-    "monitor_offset_x": ["bpm_a4_3"],
-    "monitor_offset_y": ["bpm_a4_3"],
-    "monitor_gain_x": ["bpm_a4_3"],
-    "monitor_gain_y": ["bpm_a4_3"],
-    "monitor_roll": ["bpm_a4_3"],
-    "monitor_coupling": ["bpm_a4_3"],
-    "monitor_swap": ["bpm_a4_3"],
-    "monitor_dead": ["bpm_a4_3"],
-    "energy_offset": [None],
-    "energy_spread": [None],
-    "radiation_loss_bends": [None],
-    "radiation_loss_wigglers": [None],
 }
 
 
@@ -82,10 +55,13 @@ def finite_change(model, launches, effect, place):
     """d readings / d amount^power of the tracked turn, by differences around no effect."""
     if effect.discrete:
         return model.readings(launches, [Cause(effect.name, place, 1.0)]) - model.readings(launches)
-    h = (1e-2 if effect.power == 2 else 1e-3) * effect.largest
+    h = 7e-4 * effect.largest
+    if effect.power == 2:  # even in the amount: what two steps leave of its square
+        base = model.readings(launches)
+        one, two = (model.readings(launches, [Cause(effect.name, place, k * 20 * h)]) - base
+                    for k in (1, 2))  # fmt: skip
+        return (16 * one - two) / 12 / (20 * h) ** 2
     up = model.readings(launches, [Cause(effect.name, place, h)])
-    if effect.power == 2:
-        return (up - model.readings(launches)) / h**2
     return (up - model.readings(launches, [Cause(effect.name, place, -h)])) / (2 * h)
 
 
@@ -98,9 +74,62 @@ def test_derivative_vs_finite_change_of_the_tracked_turn(model, launches, paths,
         change = finite_change(model, launches, effect, place)
         size = np.linalg.norm(np.nan_to_num(change, nan=1.0))
         assert size > 0
-        # central differences leave (1e-3)^2 of an effect's own nonlinearity
-        assert np.linalg.norm(np.nan_to_num(change - signature)) < 3e-6 * size, place
+        # central differences leave (1e-3)^2 of an effect's own nonlinearity; one step of a spread
+        # leaves its fourth power
+        most = 1e-5 if effect.power == 2 else 3e-6
+        assert np.linalg.norm(np.nan_to_num(change - signature)) < most * size, place
         assert np.array_equal(np.isnan(change), np.isnan(signature))
+
+
+# A wrong polarity and more, a roll, exchanged planes, an offset: what a diagnosis may know.
+KNOWN = [
+    Cause("monitor_gain_x", "bpm_a4_3", -1.84),
+    Cause("monitor_gain_y", "bpm_a4_3", 0.2),
+    Cause("monitor_roll", "bpm_a4_3", 0.1),
+    Cause("monitor_coupling", "bpm_a4_3", 0.05),
+    Cause("monitor_offset_x", "bpm_a4_3", 1e-3),
+    Cause("monitor_swap", "bpm_a4_3", 1.0),
+]
+
+
+@pytest.fixture(scope="module")
+def known(petra3, launches):
+    """The same monitor errors everywhere that is tried, and a fitted one on top."""
+    model = Model(petra3, [{}, SETTINGS], known=KNOWN)
+    return model, model.paths(launches)
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, effect in CATALOGUE.items() if not isinstance(effect, RingEffect)]
+)
+def test_known_monitor_errors_are_in_the_signatures_of_launch_and_readings(known, launches, name):
+    model, paths = known
+    effect = find(name)
+    place = None if isinstance(effect, LaunchEffect) else "bpm_a4_3"
+    signature = model.signatures(paths, [(name, place)], launches)[0]
+    seen = model.maps.monitors.index("bpm_a4_3")
+    change = finite_change(model, launches, effect, place)
+    mine, there = signature[:, seen], change[:, seen]
+    assert np.array_equal(np.isnan(mine), np.isnan(there))
+    if name != "monitor_dead":
+        assert np.linalg.norm(mine - there) < 3e-6 * np.linalg.norm(there)
+        assert np.linalg.norm(there) > 0
+
+
+def test_reading_effects_join_what_a_fit_has_found(petra3, launches):
+    """A monitor that is exchanged by the fit: its x reads y, so an error of x is one of y."""
+    model = Model(petra3, [{}, SETTINGS])
+    causes = [Cause("monitor_swap", "bpm_a4_3", 1.0), Cause("monitor_gain_x", "bpm_a4_3", 0.5)]
+    paths = model.paths(launches, causes)
+    signature = model.signatures(paths, [("monitor_offset_x", "bpm_a4_3")], launches)[0]
+    h = 1e-6
+    up, down = (
+        model.readings(launches, [*causes, Cause("monitor_offset_x", "bpm_a4_3", a)])
+        for a in (h, -h)
+    )
+    change = (up - down) / (2 * h)
+    assert np.abs(change).max() == pytest.approx(1.0)
+    assert np.abs(change - signature).max() < 1e-6
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -212,6 +241,44 @@ def test_kicks_have_the_signs_of_the_table(petra3):
     )
 
 
+@pytest.mark.parametrize("name", THIN)
+def test_thin_kicks_are_those_of_the_table(petra3, name):
+    """What `sign` says stands in the model's map: of a marker, or of a wiggler's entrance."""
+    state = [1e-3, 1e-4, 2e-3, -2e-4]
+    marker = "a3" in PLACES[name]
+    place = "a3" if marker else PLACES[name][0]
+    changed = element_map(apply(petra3, [Cause(name, place, 0.01)])[place], 6.0)(state)
+    after = kicked(name, 0.01, state)
+    expected = after if marker else element_map(petra3[place], 6.0)(after)
+    assert np.abs(changed - expected).max() < 1e-15  # rounding
+    assert np.abs(after - state).max() > 1e-6
+
+
+def test_a_kick_in_a_cavity_sits_in_its_middle(tmp_path):
+    path = tmp_path / "line.py"
+    path.write_text(
+        "from ocelot import *\nenergy = 6.0\n"
+        "ring = [Cavity(l=0.6, freq=5e8, eid='it'), Quadrupole(l=0.1, k1=0.1, eid='q')]\n"
+    )
+    ring = apply(load_ring(path), [Cause("wake_kick_y", "it", 0.05)])
+    x, px, y, py = 1e-3, 1e-4, 2e-3, -2e-4
+    kick = 0.05 * (y + 0.3 * py)
+    expected = [x + 0.6 * px, px, y + 0.6 * py + 0.3 * kick, py + kick]
+    assert element_map(ring["it"], 6.0)([x, px, y, py]) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_kick_survives_the_lattice_file(small_ring, tmp_path):
+    ring = apply(small_ring, [Cause("wake_kick_y", "wig_1", 0.02)])
+    save_ring(ring, tmp_path / "ring.json")
+    again = load_ring(tmp_path / "ring.json")["wig_1"]
+    assert again.errors == ring["wig_1"].errors != small_ring["wig_1"].errors
+
+
+def test_a_wake_is_looked_for_where_somebody_asks():
+    assert "wake_kick_x" not in names()
+    assert names(["wake_kick_x"]) == ["wake_kick_x"]
+
+
 def test_monitor_model_in_the_order_of_the_design_page():
     monitors = Monitors.perfect(1)
     for name, amount in [
@@ -265,6 +332,12 @@ def test_energy_spread_is_a_gaussian_average():
 def test_impossible_causes_are_refused_with_the_mend(petra3, cause, error, says):
     with pytest.raises(error, match=says):
         check(petra3, [cause])
+
+
+def test_an_effect_without_a_place_is_refused(small_ring):
+    bare = [e for e in small_ring.elements if e.kind != "wiggler"]
+    with pytest.raises(EffectError, match=r"no place in .*wigglers"):
+        check(replace(small_ring, elements=bare), [Cause("radiation_loss_wigglers", None, 1.0)])
 
 
 def test_wrong_settings_are_refused(petra3):

@@ -5,14 +5,15 @@ import pytest
 import torch
 
 from tmlattice import Measurement, TaylorNetwork, fine_tune, one_turn_optics
+from tmlattice.beam.strengths import ring_strengths
 from tmlattice.errors import MeasurementError, TmlatticeError
-from tmlattice.fitting.data import first_turn
 from tmlattice.fitting.experiment import perturbed_ring
-from tmlattice.fitting.prior import _Generators, _Linear, _Strengths, tune_slopes
-from tmlattice.fitting.strengths import ring_strengths
+from tmlattice.fitting.many import TurnReadings
 from tmlattice.fitting.study import run_case
 from tmlattice.maps import ring_matrix
 from tmlattice.network import SymplecticNetwork
+from tmlattice.network.spaces import Generators, Strengths, tune_slopes
+from tmlattice.observe.data import first_turn
 from tmlattice.optics import matrix_tunes
 
 LAUNCH = np.array([[1e-4, 0, 1e-4, 0], [-1e-4, 1e-5, 5e-5, 0]])
@@ -124,8 +125,8 @@ def test_told_states_the_cramer_rao_bound(small_ring, small_network):
 
 
 SPACES = {
-    "generators": lambda ring, network: _Generators(network),
-    "strengths": lambda ring, network: _Strengths(network, ring, KINDS),
+    "generators": lambda ring, network: Generators(network),
+    "strengths": lambda ring, network: Strengths(network, ring, KINDS),
 }
 
 
@@ -134,29 +135,25 @@ def test_products_of_the_dual_system_match_differences(small_ring, small_network
     """J, J P J^T and their products about amounts that are not zero, against moved networks."""
     space = SPACES[kind](small_ring, small_network)
     _, measurement = measured(small_ring, ["QD::5"], -0.02)
-    data = first_turn(small_network, measurement, None, [1e-6, 1e-7, 1e-6, 1e-7])
+    data = first_turn(small_network.monitors, measurement, None, [1e-6, 1e-7, 1e-6, 1e-7])
+    problem = TurnReadings(space, data, LAUNCH)
     number = len(space.layer)
     about = 0.3 * rng.standard_normal(number)
-
-    def moved(amounts):
-        space.put(amounts)
-        return space.network(data.launches).detach().numpy()
-
-    moved(about)
-    products = _Linear(space, data)
+    products = problem.slopes(about)
     J = products.matrix
     for j in rng.choice(number, 6, replace=False):
         one = np.eye(1, number, j)[0]
-        slope = (moved(about + one) - moved(about - one)) / 2  # third order: 1e-4 of 1 %
-        np.testing.assert_allclose(J[:, j], slope.ravel(), atol=1e-5 * np.abs(J).max())
+        # third order: 1e-4 of 1 %
+        slope = (problem.residual(about - one) - problem.residual(about + one)) / 2
+        np.testing.assert_allclose(J[:, j], slope, atol=1e-5 * np.abs(J).max())
     variance = rng.uniform(0.1, 2.0, number)
     full = (J * variance) @ J.T
     np.testing.assert_allclose(products.kernel(variance), full, atol=1e-12 * full.max())
     amounts = rng.standard_normal(number)
     scale = np.abs(J @ amounts).max()
-    np.testing.assert_allclose(products.times(amounts).ravel(), J @ amounts, atol=1e-11 * scale)
-    weights = rng.standard_normal(data.readings.shape)
-    back = J.T @ weights.ravel()
+    np.testing.assert_allclose(products.times(amounts), J @ amounts, atol=1e-11 * scale)
+    weights = rng.standard_normal(len(J))
+    back = J.T @ weights
     np.testing.assert_allclose(products.transposed(weights), back, atol=1e-11 * np.abs(back).max())
 
 
@@ -179,7 +176,7 @@ def test_layers_between_the_nodes_match_ocelots_changed_magnets(petra3, rng):
 def test_tune_slopes_match_differences(small_ring, small_network, kind):
     space = SPACES[kind](small_ring, small_network)
     about = np.zeros(len(space.layer))
-    slopes = tune_slopes(space)
+    slopes = tune_slopes(space, about)
     strong = np.argsort(-np.abs(slopes).max(axis=0))[:40:13]
     for j in strong:
         tunes = []

@@ -348,3 +348,18 @@ def test_processes_do_not_change_a_digit(small_ring):
         shots=2 * CHUNK + 5, amplitude=1e-4, seed=1,
     )  # fmt: skip
     np.testing.assert_array_equal(readings(simulation, jobs=2), readings(simulation))
+
+
+def test_calibration_errors_that_are_known_act_on_what_is_set(small_ring):
+    """The kick of a shot replaces the design's: what is known of the corrector stays."""
+    from tmlattice.beam import Model
+
+    setting = {"v5": {"kick": 1e-4}}
+    calibration = [Cause("corrector_calibration", "v5", 0.5)]
+    launch = np.zeros((1, 5))
+    seen = Model(small_ring, [setting], known=calibration).readings(launch)
+    there = Machine(small_ring, calibration, noise=0).beam(np.zeros((1, 6)), 1, [setting])
+    stronger = Model(small_ring, [{"v5": {"kick": 1.5e-4}}]).readings(launch)
+    assert np.abs(stronger).max() > 1e-4
+    np.testing.assert_allclose(seen, stronger, atol=1e-15)
+    np.testing.assert_allclose(seen[0], there[0, 0], atol=1e-9)  # AT's thick elements

@@ -13,8 +13,9 @@ from click.testing import CliRunner
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
-from tmlattice.diagnosis.response import ResponseRun, diagnose_response
-from tmlattice.diagnosis.response_missing import weigh
+from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.missing import weigh
+from tmlattice.diagnosis.response import diagnose_response
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
@@ -23,8 +24,9 @@ from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
+from tmlattice.observe.orbit_response import response_data, split_columns
 from tmlattice.optics import twiss
-from tmlattice.report.response_text import response_text
+from tmlattice.report.plain import report_text
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
@@ -34,6 +36,11 @@ CAUSES = [
     Cause("quadrupole_gradient", "QF::9", -0.008),
     Cause("corrector_calibration", "v2", 0.1),
 ]
+
+
+def fitted(ring, measured, seed=1):
+    data = response_data(ring, measured)
+    return fit_steps(data, split_columns(data, 0.2, np.random.default_rng(seed))).state
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +124,9 @@ def test_a_withheld_energy_spread_is_named(small_ring):
 
 
 def test_no_hypothesis_is_wanted_where_nothing_is_missing(small_ring, measured):
-    run = ResponseRun(small_ring, measured, seed=1)
-    run.run()
-    none, *rows = weigh(run, ["one_sided_steps", "corrector_energy", "energy_offset"])
+    none, *rows = weigh(
+        fitted(small_ring, measured), ["one_sided_steps", "corrector_energy", "energy_offset"]
+    )
     assert none.effect == "none"
     assert len(rows) == 3
     assert all(row.judgement == "excluded" for row in rows)
@@ -185,9 +192,8 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
         small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
     ).measured
     response = made(small_ring, rng) + rng.normal(0, 1e-9, measured.response.shape)
-    run = ResponseRun(small_ring, replace(measured, response=response), seed=1)
-    run.run()
-    rows = {row.effect: row for row in weigh(run)}
+    state = fitted(small_ring, replace(measured, response=response))
+    rows = {row.effect: row for row in weigh(state)}
     assert rows[effect].judgement == "helps"
     assert rows[effect] == min(rows.values(), key=lambda row: row.heldout_rms_in_plane)
     expected = {"energy offset of the beam": 0.05, "nonlinear monitors (cubic)": 8e-4}
@@ -236,7 +242,7 @@ def test_the_errors_of_a_known_machine_are_those_stated(small_ring):
     found = diagnose_response(small_ring, measured, seed=1)
     drawn = draw_background(small_ring, background, 5)
     true = {(cause.effect, cause.element): cause.amount for cause in drawn}
-    held = {n for n, out in zip(measured.correctors, found.held, strict=False) if out}
+    held = {n for n, out in zip(measured.correctors, found.response.held, strict=False) if out}
     pulls = {}
     for cause, sigma in zip(found.causes, found.errors, strict=True):
         if (cause.effect, cause.element) in true and cause.element not in held:
@@ -259,7 +265,7 @@ def test_report_and_json(result):
     document = result.as_json()
     jsonschema.validate(json.loads(json.dumps(document)), schema)
     assert [s["effect"] for s in document["steps"]] == [s.effect for s in result.steps]
-    text = response_text(result)
+    text = report_text(result)
     assert "DISTRIBUTED" in text
     assert "QD::5" in text
 
@@ -281,7 +287,7 @@ def test_command(tmp_path, measured, result):
     causes = read_calibration(tmp_path / "ring.json.calibration.json", ring)
     _, response = calibrated_response(ring, causes, measured.correctors)
     at = [[m.name for m in ring.monitors].index(name) for name in measured.monitors]
-    kept = ~result.held[:-1]
+    kept = ~result.response.held[:-1]
     read = (measured.kicks[:, None, None] * response[:, at])[kept]
     miss, gap = read - measured.response[kept], measured.response[kept]
     own = (np.arange(kept.sum()), slice(None), [int(p == "y") for p in

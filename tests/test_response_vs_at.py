@@ -118,9 +118,7 @@ CASES = {
 }
 
 
-def test_every_effect_on_the_ring_has_a_case():
-    own = {name for name, effect in CATALOGUE.items() if isinstance(effect, RingEffect)}
-    assert own == {*CASES, "corrector_calibration"}
+ON_THE_RING = [n for n, e in CATALOGUE.items() if isinstance(e, RingEffect)]
 
 
 @pytest.fixture(scope="module")
@@ -130,9 +128,9 @@ def bent(small_ring):
                               Cause("corrector_kick_y", "v7", 3e-5)])  # fmt: skip
 
 
-@pytest.mark.parametrize("effect", CASES)
+@pytest.mark.parametrize("effect", [n for n in ON_THE_RING if n != "corrector_calibration"])
 def test_derivative_vs_finite_difference(bent, effect):
-    kind, h = CASES[effect]
+    kind, h = CASES.get(effect, (None, 1e-4 * CATALOGUE[effect].largest))
     places = CATALOGUE[effect].places(bent)
     if kind in (None, "family"):
         place = places[-1]

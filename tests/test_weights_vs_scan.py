@@ -15,19 +15,14 @@ from tmlattice import TaylorMap, TaylorNetwork, fine_tune
 from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.errors import LatticeError, MeasurementError
-from tmlattice.fitting.weights import (
-    layer_effects,
-    read_gradient,
-    read_network,
-    symplectic_directions,
-)
-from tmlattice.inference.metric import metric
-from tmlattice.inference.newton import Problem, fit
+from tmlattice.fitting.weight_parts import layer_effects, symplectic_directions
+from tmlattice.fitting.weights import read_gradient, read_network
+from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import scan
-from tmlattice.inference.whitening import Whitening
 from tmlattice.machine import simulate
 from tmlattice.network.reference import plain_readings
 from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 FAULT = Cause("quadrupole_gradient", "QD::7", 0.03)
@@ -71,10 +66,10 @@ def test_score_of_the_gradient_is_the_scans_signed_root(small_ring, measurement,
     reading = read_gradient(small_ring, measurement, dimension)
     model = Model(small_ring, measurement.settings or [{}] * 3, dimension=dimension)
     data = of_measurement(small_ring, measurement)
-    problem = Problem(model, data, Whitening(data), {})
+    problem = FirstTurns(model=model, data=data, places={})
     found = fit(problem, (), data.launches)
-    about = metric(model, found.paths, problem.whitening, found.projection, data.active)
-    referee = scan(about, found.launches, reading.hypotheses, found.residual, effective=1.0)
+    about = problem.metric(found.point)
+    referee = scan(about, reading.hypotheses, found.residual, effective=1.0)
     root = np.sign(referee.amount) * np.sqrt(referee.statistic)
     # what launches leave a millionth of has lost as many digits in both
     seen = referee.information > 1e-4 * np.median(referee.information)

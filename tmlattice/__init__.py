@@ -23,7 +23,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis as Diagnosis
-    from tmlattice.diagnosis.procedure import diagnose as diagnose
+    from tmlattice.diagnosis import diagnose as diagnose
     from tmlattice.effects import CATALOGUE as CATALOGUE
     from tmlattice.effects import Cause as Cause
     from tmlattice.errors import TmlatticeError as TmlatticeError

@@ -76,6 +76,21 @@ def output_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def check_writable(path: Path) -> None:
+    """Know before the work whether a file can be written there; nothing is left behind.
+
+    Raises:
+        OutputError: the folder is not there or cannot be written.
+    """
+    path = path.absolute()
+    if path.is_dir():
+        raise OutputError(f"'{path}' is a folder; name a file")
+    try:
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise _refusal(path, error) from error
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a value as JSON; numbers that are not finite become null."""
     text = json.dumps(_finite(value), indent=2, allow_nan=False)

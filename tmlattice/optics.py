@@ -10,12 +10,15 @@ along the closed orbit, the betas and phases come from carrying its eigenvectors
 >>> off_momentum(TaylorNetwork.from_ring(ring, 6)).chromaticity
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.chain import LayerChain, chain
+from tmlattice.beam.assembly import Assembly
+from tmlattice.beam.chain import LayerChain, products
+from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import symplectic_form
 
@@ -139,6 +142,42 @@ def matrix_tunes(matrix: Array) -> Array:
     return _fractions(values)
 
 
+def short_way(difference: Array) -> Array:
+    """Differences of tunes the short way round their circle."""
+    return np.asarray((difference + 0.5) % 1.0 - 0.5)
+
+
+class RingTunes:
+    """Tunes of a ring with causes in it, about the axis: quick for many causes, one after another.
+
+    Args:
+        assembly: of the ring without.
+    """
+
+    def __init__(self, assembly: Assembly) -> None:
+        self.assembly = assembly
+        maps = assembly.maps
+        steps = np.concatenate([maps.W1, maps.closing.coefficients[1][None]])[:, :4, :4]
+        self._upto = products(steps)
+
+    def of(self, causes: Sequence[Cause]) -> Array:
+        """Fractional tunes (x, y), [2].
+
+        Raises:
+            UnstableRingError: there are none.
+        """
+        turn, last = np.eye(4), 0
+        changed = self.assembly.layers_with(self.assembly.changed({}, causes))
+        for k, ((_, matrix, _), _) in sorted(changed.items()):
+            turn = matrix[:4, :4] @ self._between(last, k) @ turn
+            last = k + 1
+        return matrix_tunes(self._between(last, len(self._upto) - 1) @ turn)
+
+    def _between(self, first: int, last: int) -> Array:
+        """The matrix from one exit to a later one, [4, 4]."""
+        return np.asarray(self._upto[last] @ np.linalg.inv(self._upto[first]))
+
+
 def _fractions(values: ComplexArray) -> Array:
     """Fractional tunes in [0, 1) of eigenvalues exp(2 pi i Q)."""
     return np.asarray(np.angle(values) / (2 * np.pi) % 1.0)
@@ -155,25 +194,17 @@ def closed_orbit(network: LayerChain, delta: float = 0.0, tolerance: float = 1e-
     Raises:
         UnstableRingError: there is none within reach.
     """
-    x = np.zeros(network.dimension)
+    return np.asarray(_on_closed_orbit(network, delta, tolerance)[0][0])
+
+
+def _on_closed_orbit(
+    network: LayerChain, delta: float = 0.0, tolerance: float = 1e-14
+) -> tuple[Array, Array]:
+    """`LayerChain.tangents` about the closed orbit of an energy."""
+    start = np.zeros(network.dimension)
     if network.dimension == 6:
-        x[5] = delta
-    for _ in range(30):
-        image, jacobian = network.one_turn_map(x)
-        miss = image[:4] - x[:4]
-        if not np.isfinite(miss).all():
-            break
-        try:
-            step = np.linalg.solve(np.eye(4) - jacobian[:4, :4], miss)
-        except np.linalg.LinAlgError:
-            break
-        x[:4] += step
-        if np.abs(step).max() < max(tolerance, 1e-12 * np.abs(x[:4]).max()):
-            return x
-    raise UnstableRingError(
-        "no closed orbit: Newton's method does not settle; the ring is at an integer resonance or "
-        "its kicks are too large"
-    )
+        start[5] = delta
+    return network.closed_orbit(start, tolerance=tolerance)
 
 
 def one_turn_optics(network: LayerChain) -> Optics:
@@ -182,14 +213,13 @@ def one_turn_optics(network: LayerChain) -> Optics:
     Raises:
         UnstableRingError: no closed orbit, or no tune.
     """
-    orbit = closed_orbit(network)
-    _, jacobian = network.one_turn_map(orbit)
-    values, vectors = normal_modes(jacobian[:4, :4])
+    path, total = _on_closed_orbit(network)
+    values, vectors = normal_modes(total[-1, :4, :4])
     moduli = np.abs(values)
     return Optics(
         tunes=_fractions(values),
         modes=vectors,
-        closed_orbit=orbit,
+        closed_orbit=path[0],
         growth=float(moduli[np.abs(moduli - 1).argmax()]),
     )
 
@@ -211,13 +241,9 @@ def twiss(network: LayerChain) -> Twiss:
     Raises:
         UnstableRingError: no closed orbit, or no tune.
     """
-    orbit = closed_orbit(network)
-    _, jacobians = network.jacobians(orbit)
-    values, vector = normal_modes(chain(jacobians)[:4, :4])
-    path = [vector]
-    for matrix in jacobians:
-        path.append(matrix[:4, :4] @ path[-1])
-    vectors = np.stack(path)
+    _, total = _on_closed_orbit(network)
+    values, modes = normal_modes(total[-1, :4, :4])
+    vectors = total[:, :4, :4] @ modes
     position = np.stack([vectors[:, 0, 0], vectors[:, 2, 1]], axis=-1)
     steps = np.angle(position[1:] / position[:-1])
     steps = (steps + 0.1) % (2 * np.pi) - 0.1
@@ -245,9 +271,8 @@ def off_momentum(network: LayerChain, length: float, delta: float = 1e-4) -> Off
         raise ValueError("energy needs six coordinates: TaylorNetwork.from_ring(ring, 6)")
     tunes, paths = [], []
     for side in (delta, -delta):
-        orbit = closed_orbit(network, side)
-        path, jacobians = network.jacobians(orbit)
-        tunes.append(matrix_tunes(chain(jacobians)[:4, :4]))
+        path, total = _on_closed_orbit(network, side)
+        tunes.append(matrix_tunes(total[-1, :4, :4]))
         paths.append(path)
     shift = (tunes[0] - tunes[1] + 0.5) % 1.0 - 0.5  # a tune may cross an integer in between
     change = (paths[0] - paths[1]) / (2 * delta)

@@ -11,22 +11,57 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.beam import sweeps
+from tmlattice.beam import tangents as kernels
 from tmlattice.beam.aperture import APERTURE, check_alive
+from tmlattice.beam.layers import Layers
+from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.beam.sweeps import curved
-from tmlattice.errors import BeamLostError
+from tmlattice.errors import BeamLostError, UnstableRingError
 from tmlattice.lattice.ring import Ring
 from tmlattice.maps import RingMaps, TaylorMap, ring_maps
-from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
 
 
-def chain(matrices: Array) -> Array:
-    """The product of matrices [step, n, n] in beam order: the last one stands on the left."""
-    total = np.eye(matrices.shape[1])
-    for matrix in matrices:
-        total = matrix @ total
+NO_ORBIT = (
+    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
+    "kicks are too large"
+)
+
+
+def products(matrices: Array) -> Array:
+    """From the start to behind each of the matrices [step, n, n], [step + 1, n, n]."""
+    steps, n = matrices.shape[:2]
+    total = np.empty((steps + 1, n, n))
+    kernels.products(np.ascontiguousarray(matrices), total)
     return total
+
+
+def merged(matrices: Array, ends: NDArray[np.intp]) -> Array:
+    """Products of runs of the matrices [step, n, n] in beam order, each up to and with one of the
+    rising `ends`, [end, n, n]."""
+    whole = np.empty((len(ends), *matrices.shape[1:]))
+    kernels.merge(np.ascontiguousarray(matrices), ends, whole)
+    return whole
+
+
+def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
+    """What makes good a miss of the turn, [n, row]: (1 - turn)^-1 in the coordinates that are free.
+
+    Args:
+        turn: one-turn matrix, [n, n].
+        free: coordinates of the start that are free.
+        rows: coordinates that should repeat, as many.
+
+    Raises:
+        UnstableRingError: it has no inverse.
+    """
+    solve = np.zeros((len(turn), len(rows)))
+    try:
+        solve[free] = np.linalg.inv((np.eye(len(turn)) - turn)[np.ix_(rows, free)])
+    except np.linalg.LinAlgError:
+        raise UnstableRingError(NO_ORBIT) from None
+    return solve
 
 
 def first_pass(
@@ -53,7 +88,7 @@ def first_pass(
 class LayerChain:
     """What every chain of layers has: names, launches, tracking, the map of a turn.
 
-    A chain says how its layers send states (`_forward`, `_track`) and what their Jacobians are.
+    A chain says how its layers send states (`_forward`, `_track`, `tangents`).
 
     Attributes:
         maps: what it was made from; names and places of layers and monitors.
@@ -71,9 +106,9 @@ class LayerChain:
         """Fill history [block, 1:, n, lane] from history[:, 0]: the start of every turn."""
         raise NotImplementedError
 
-    def jacobians(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
-        the layers and of the closing way there [layer + 1, n, n]."""
+    def tangents(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
+        from the start to there, d state / d launch, [layer + 2, n, n]."""
         raise NotImplementedError
 
     @property
@@ -169,8 +204,41 @@ class LayerChain:
         a composed second-order map of the turn would not be.
         """
         x = np.zeros(self.dimension) if x is None else np.asarray(x, dtype=float)
-        path, matrices = self.jacobians(x)
-        return path[-1], chain(matrices)
+        path, total = self.tangents(x)
+        return path[-1], total[-1]
+
+    def closed_orbit(
+        self,
+        start: ArrayLike | None = None,
+        *,
+        free: ArrayLike = (0, 1, 2, 3),
+        turn: ArrayLike = 0.0,
+        tolerance: float = 1e-14,
+    ) -> tuple[Array, Array]:
+        """The orbit that repeats after a turn, by Newton's method: `tangents` about it.
+
+        Args:
+            start: first guess, [n]; what is not free stays as it is here.
+            free: coordinates of the start that are free; as many, from the first on, repeat.
+            turn: what a turn should change these by, [free].
+            tolerance: m and rad, or 1e-12 of the largest free coordinate.
+
+        Raises:
+            UnstableRingError: there is none within reach.
+        """
+        x = np.zeros(self.dimension) if start is None else np.array(start, dtype=float)
+        free = np.asarray(free, dtype=np.intp)
+        rows = np.arange(len(free))
+        for _ in range(30):
+            path, total = self.tangents(x)
+            miss = (path[-1] - x)[rows] - turn
+            if not (np.isfinite(miss).all() and np.isfinite(total[-1]).all()):
+                break
+            change = closing(total[-1], free, rows) @ miss
+            x = x + change
+            if np.abs(change).max() < max(tolerance, 1e-12 * np.abs(x[free]).max()):
+                return self.tangents(x)
+        raise UnstableRingError(NO_ORBIT)
 
 
 class Chain(LayerChain):
@@ -214,12 +282,9 @@ class Chain(LayerChain):
         _, readings = first_pass(self.weights(), self.maps, start)
         return sweeps.unpack(readings, len(start))
 
-    def one_turn_weights(self) -> tuple[Array, Array, Array]:
-        """W0, W1, W2 of one whole turn as a chain: the layers, then the way to the ring's end."""
-        closing = self.maps.closing.coefficients
-        layers = self.weights()
-        W0, W1, W2 = (np.concatenate([w, c[None]]) for w, c in zip(layers, closing, strict=True))
-        return W0, W1, W2
+    def turn(self) -> Layers:
+        """One whole turn: the layers as they are now, then the way to the ring's end; a copy."""
+        return Layers.of(self.maps, self.weights())
 
     def layer_map(self, layer: int) -> TaylorMap:
         """One layer as a Taylor map."""
@@ -230,17 +295,37 @@ class Chain(LayerChain):
         sweeps.run(sweeps.forward, len(states), size, W0, W1, W2, curved(W2), states)
 
     def _track(self, size: sweeps.Size, history: Array) -> None:
-        W0, W1, W2 = self.one_turn_weights()
-        sweeps.run(sweeps.track, len(history), size, W0, W1, W2, curved(W2), history)
+        turn = self.turn()
+        sweeps.run(sweeps.track, len(history), size, *turn.W, turn.curved, history)
 
-    def jacobians(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
-        the layers and of the closing way there [layer + 1, n, n]."""
-        W0, W1, W2 = self.one_turn_weights()
-        size = sweeps.size_of(self.dimension, 1)
-        states = np.empty((1, len(W0) + 1, self.dimension, 1))
-        states[0, 0, :, 0] = x
-        sweeps.run(sweeps.forward, 1, size, W0, W1, W2, curved(W2), states)
-        path = states[0, :, :, 0]
-        slopes = np.einsum("kaij,kj->kai", second_derivatives(W2), path[:-1])
-        return path, W1 + slopes
+    def tangents(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
+        from the start to there, d state / d launch, [layer + 2, n, n]."""
+        return self.trajectory(x)
+
+    def trajectory(
+        self, x: ArrayLike, turns: int = 1, cavities: Cavities = NO_RF
+    ) -> tuple[Array, Array]:
+        """The same over many turns, with the RF: [step + 1, n] and [step + 1, n, n], a turn of
+        layer + 1 steps.
+
+        Args:
+            x: launch, [n].
+            turns: at least 1.
+            cavities: in six coordinates; see `beam.rf`.
+        """
+        turn, n = self.turn(), self.dimension
+        states = np.empty((1, turns * turn.steps + 1, n))
+        tangents = np.empty((*states.shape, n))
+        states[0, 0], tangents[0, 0] = x, np.eye(n)
+        rf = cavities.exits, cavities.values
+        kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
+        return states[0], tangents[0]
+
+
+def tangents(network: LayerChain, x: Array) -> tuple[Array, Array, Array]:
+    """States [layer + 1, n] at the launch x [n] and all exits, Jacobians M [layer + 1, n, n] of
+    them by the launch, and the inverses of these."""
+    path, total = network.tangents(x)
+    M = total[:-1]
+    return path[:-1], M, np.asarray(np.linalg.inv(M), dtype=float)

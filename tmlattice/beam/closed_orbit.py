@@ -12,14 +12,14 @@ energy's: without losses it is conserved, and what is lost is given back at the 
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import physical_constants
 
-from tmlattice.beam.chain import Chain
+from tmlattice.beam.chain import NO_ORBIT, Chain, closing
 from tmlattice.beam.settle import settle
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Ring
@@ -89,8 +89,8 @@ class ResponseModel:
 
     def __init__(self, ring: Ring, dimension: int = 6, frequency: float = 0.0) -> None:
         self.ring = ring
-        self.layers = LayerMaps(_without_rf(ring), dimension)
-        self.maps = ring_maps(self.layers.ring, dimension, self.layers)
+        self.layers = LayerMaps(ring, dimension)
+        self.maps = ring_maps(ring, dimension, self.layers)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
         self._chain = Chain(self.maps)
         self._close(frequency)
@@ -115,13 +115,12 @@ class ResponseModel:
         self._turn = np.zeros(len(self.free))
         if dimension == 6:
             self._turn[4] = self.slip * frequency / (1 + frequency)
-        self.state, self.path, steps = self._closed_orbit()
-        tangents = [np.eye(dimension)]
-        for step in steps:
-            tangents.append(step @ tangents[-1])
-        self.tangents = np.stack(tangents)
+        self.path, self.tangents = self._chain.closed_orbit(
+            free=self.free, turn=self._turn, tolerance=1e-15
+        )
+        self.state = self.path[0]
         self.inverse = np.linalg.inv(self.tangents)
-        self._solve = self._solver(self.tangents[-1])
+        self._solve = closing(self.tangents[-1], self.free, np.arange(len(self.free)))
 
         at, maps = self.maps.at, self.maps
         bent = np.einsum("maij,mj->mai", second_derivatives(maps.R2), self.path[at])
@@ -228,11 +227,11 @@ class ResponseModel:
             UnknownNameError: no such element.
             UnstableRingError: no closed orbit within reach.
         """
-        n, ring = self.dimension, self.layers.ring
-        W0, W1, W2 = self._chain.one_turn_weights()
+        n, ring = self.dimension, self.ring
+        turn = self._chain.turn()
         layer = np.empty(len(correctors), dtype=np.int64)
         replaced = []
-        paths = np.empty((len(correctors), len(W0) + 1, n))
+        paths = np.empty((len(correctors), turn.steps + 1, n))
         paths[:, 0] = self.state
         for row, (name, kick) in enumerate(zip(correctors, kicks, strict=True)):
             i = ring.index(name)
@@ -242,11 +241,10 @@ class ResponseModel:
             replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
         V0, V1, V2 = (np.stack(v) for v in zip(*replaced, strict=True))
         good = settle(
-            W0, W1, W2, W2.any(axis=(1, 2)), layer, V0, V1, V2, self._solve, self._turn, 1e-14,
-            paths,
+            *turn.W, turn.curved, layer, V0, V1, V2, self._solve, self._turn, 1e-14, paths
         )  # fmt: skip
         if not all(good):
-            raise UnstableRingError(_NO_ORBIT)
+            raise UnstableRingError(NO_ORBIT)
         return self._read(paths[:, self.maps.at])
 
     def _read(self, here: Array) -> Array:
@@ -271,7 +269,7 @@ class ResponseModel:
 
     def _kick(self, place: int, layer: int) -> tuple[Array, Array]:
         """The corrector's kick at its layer's exit, and how it depends on the state there."""
-        element = self.layers.ring.elements[place]
+        element = self.ring.elements[place]
         up, down = (
             self.layers.layer(layer, {place: element.changed(angle=element.angle + h)})[0]
             for h in (KICK, -KICK)
@@ -280,53 +278,3 @@ class ResponseModel:
         x = self.path[layer]
         bent = second_derivatives(w2[None])[0] @ x
         return w0 + (w1 + bent / 2) @ x, w1 + bent
-
-    def _solver(self, turn: Array) -> Array:
-        """[n, free]: what makes good a miss of the turn."""
-        rows = np.arange(len(self.free))
-        solve = np.zeros((self.dimension, len(rows)))
-        matrix = (np.eye(self.dimension) - turn)[np.ix_(rows, self.free)]
-        try:
-            solve[self.free] = np.linalg.inv(matrix)
-        except np.linalg.LinAlgError:
-            raise UnstableRingError(_NO_ORBIT) from None
-        return solve
-
-    def _closed_orbit(self) -> tuple[Array, Array, Array]:
-        """Newton's method: the state, the states along the ring, the layers' Jacobians."""
-        x = np.zeros(self.dimension)
-        rows = np.arange(len(self.free))
-        for _ in range(30):
-            path, steps = self._chain.jacobians(x)
-            turn = np.eye(self.dimension)
-            for step in steps:
-                turn = step @ turn
-            miss = (path[-1] - x)[rows] - self._turn
-            if not (np.isfinite(miss).all() and np.isfinite(turn).all()):
-                break
-            change = self._solver(turn) @ miss
-            x = x + change
-            if np.abs(change).max() < max(1e-15, 1e-12 * np.abs(x).max()):
-                path, steps = self._chain.jacobians(x)
-                return x, path, steps
-        raise UnstableRingError(_NO_ORBIT)
-
-
-_NO_ORBIT = (
-    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
-    "kicks are too large"
-)
-
-
-def _without_rf(ring: Ring) -> Ring:
-    """The ring with drifts in the place of its cavities."""
-    cavities = [i for i, e in enumerate(ring.elements) if e.kind == "cavity"]
-    if not cavities:
-        return ring
-    from tmlattice.lattice.ocelot import elements
-
-    drift = {
-        i: replace(ring.elements[i], source=elements.Drift(l=ring.elements[i].length))
-        for i in cavities
-    }
-    return ring.with_elements(drift)

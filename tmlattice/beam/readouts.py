@@ -1,11 +1,13 @@
-"""Where the beam is at the monitors, turn after turn, for stacked weights of any making."""
+"""Where the beam is at the monitors, turn after turn, and where it was lost."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam import sweeps
+from tmlattice.beam.layers import Layers
+from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.beam.sweeps import curved
 
 Array = NDArray[np.float64]
@@ -14,12 +16,44 @@ APERTURE = 0.05
 """m; a beam that is further from the axis at a magnet's exit is lost."""
 
 
+@dataclass(frozen=True)
+class Lost:
+    """Where a beam was lost.
+
+    Attributes:
+        shot, turn: from 0.
+        element: the magnet in which it left the aperture.
+    """
+
+    shot: int
+    turn: int
+    element: str
+
+    def __str__(self) -> str:
+        return f"shot {self.shot} is lost on turn {self.turn} in '{self.element}'"
+
+
+def lost(states: Array, names: tuple[str, ...], aperture: float = APERTURE) -> tuple[Lost, ...]:
+    """The shots whose beam leaves the aperture, and where.
+
+    Args:
+        states: at the start and at every exit, turn after turn, [shot, step + 1, n].
+        names: of the layers; a turn has one step more, the way to its end.
+        aperture: m.
+    """
+    outside = ~np.all(np.abs(states[:, :, 0:3:2]) < aperture, axis=2)  # true for NaN
+    found = []
+    for shot in np.flatnonzero(outside.any(axis=1)):
+        turn, step = divmod(max(int(outside[shot].argmax()) - 1, 0), len(names) + 1)
+        found.append(Lost(int(shot), turn, names[min(step, len(names) - 1)]))
+    return tuple(found)
+
+
 def positions(
     launches: Array,
     turns: int,
-    weights: Sequence[Array],
-    readouts: Sequence[Array],
-    at: NDArray[np.int64],
+    layers: Layers,
+    cavities: Cavities = NO_RF,
     aperture: float = APERTURE,
 ) -> Array:
     """(x, y) at every monitor on every turn, [shot, turn, monitor, 2], m; NaN once lost.
@@ -27,23 +61,26 @@ def positions(
     Args:
         launches: [shot, n].
         turns: at least 1.
-        weights: W0, W1, W2 of the whole turn, the way to the ring's end included.
-        readouts: R0, R1, R2 of the monitors.
-        at: the exit that each monitor hangs on, rising.
+        layers: of the turn.
+        cavities: in six coordinates; none on a single turn.
         aperture: m.
     """
-    n = launches.shape[1]
+    n, at = launches.shape[1], layers.at
     size = sweeps.size_of(n, len(launches))
     lanes = len(size[1])
-    states = np.empty((-(-len(launches) // lanes), len(weights[0]) + 1, n, lanes))
+    states = np.empty((-(-len(launches) // lanes), layers.steps + 1, n, lanes))
     states[:, 0] = sweeps.pack(launches, lanes)
     readings = np.empty((len(states), len(at), 2, lanes))
     beam = np.empty((len(launches), turns, len(at), 2))
-    bends, bent = curved(weights[2]), curved(readouts[2])
+    bends, bent = layers.curved, curved(layers.R[2])
     alive = np.ones(len(launches), dtype=bool)
     for turn in range(turns):
-        sweeps.run(sweeps.forward, len(states), size, *weights, bends, states)
-        sweeps.run(sweeps.read, len(states), size, *readouts, bent, at, states, readings)
+        way = len(states), size, *layers.W, bends
+        if len(cavities.exits):
+            sweeps.run(sweeps.accelerate, *way, cavities.exits, cavities.values, states)
+        else:
+            sweeps.run(sweeps.forward, *way, states)
+        sweeps.run(sweeps.read, len(states), size, *layers.R, bent, at, states, readings)
         beam[:, turn] = sweeps.unpack(readings, len(launches))
         inside = np.abs(states[:, :, 0:3:2]).max(axis=2) < aperture  # [block, exit, lane]
         inside = sweeps.unpack(np.logical_and.accumulate(inside, axis=1), len(launches))

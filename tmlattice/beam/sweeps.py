@@ -13,6 +13,7 @@ Axes: `states` [block, layer + 1, n, lane], `W0` [layer, n], `W1` [layer, n, n],
 `R2` [monitor, 2, n (n + 1) / 2].
 """
 
+import math
 from collections.abc import Callable
 
 import numba
@@ -105,6 +106,24 @@ def forward(first, last, size, W0, W1, W2, curved, states):  # type: ignore[no-u
     for block in range(first, last):
         for k in range(W0.shape[0]):
             _polynomial(size, k, W0, W1, W2, curved, states[block, k], states[block, k + 1])
+
+
+@_jit
+def accelerate(first, last, size, W0, W1, W2, curved, exits, rf, states):  # type: ignore[no-untyped-def]
+    """`forward` with the cavities of `Cavities`, and the slip of the turn at its end."""
+    lanes = len(size[1])
+    for block in range(first, last):
+        for k in range(W0.shape[0] + 1):
+            if k > 0:
+                x, y = states[block, k - 1], states[block, k]
+                _polynomial(size, k - 1, W0, W1, W2, curved, x, y)
+            for c in range(len(exits)):
+                if exits[c] == k:
+                    for v in range(lanes):
+                        angle = rf[1] - rf[2] * states[block, k, 4, v]
+                        states[block, k, 5, v] += rf[0] * math.sin(angle)
+        for v in range(lanes):
+            states[block, -1, 4, v] += rf[3]
 
 
 @_jit

@@ -1,24 +1,29 @@
 """Compiled loops of the diagnosis: tangent maps along trajectories, signatures of all hypotheses.
 
-A chain has `step` maps: the layers of every turn, each turn closed by the way to the ring's end.
+A turn has `step` maps: its layers, closed by the way to the ring's end.
 Axes: states [shot, step + 1, n], tangents C [shot, step + 1, n, n] = d state / d launch.
 """
 
+import math
+
 import numba
+import numpy as np
 
 _jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 
 
 @_jit
-def trajectories(W0, W1, W2, curved, layers, states, tangents):  # type: ignore[no-untyped-def]
+def trajectories(first, last, W0, W1, W2, curved, exits, rf, states, tangents):  # type: ignore[no-untyped-def]
     """Fill states [shot, 1:] and tangents [shot, 1:] from states[:, 0] and tangents[:, 0].
 
-    Step k applies map layers[k] of W0 [map, n], W1 [map, n, n], W2 [map, n, pairs].
+    Step k of a turn applies W0[k], W1[k], W2[k]; `exits` and `rf` are those of `Cavities`.
     """
-    n = states.shape[2]
-    for shot in range(states.shape[0]):
-        for k in range(len(layers)):
-            w = layers[k]
+    n, steps = states.shape[2], W0.shape[0]
+    for shot in range(first, last):
+        if len(exits):
+            _cavities(0, exits, rf, states[shot, 0], tangents[shot, 0])
+        for k in range(states.shape[1] - 1):
+            w = k % steps
             x, y = states[shot, k], states[shot, k + 1]
             before, after = tangents[shot, k], tangents[shot, k + 1]
             for a in range(n):
@@ -44,6 +49,60 @@ def trajectories(W0, W1, W2, curved, layers, states, tangents):  # type: ignore[
                         for j in range(n):
                             after[a, j] += slope * before[i, j]
                 y[a] = total
+            if len(exits):
+                _cavities(w + 1, exits, rf, y, after)
+                if w + 1 == steps:
+                    y[4] += rf[3]
+                    if k + 2 < states.shape[1]:
+                        _cavities(0, exits, rf, y, after)
+
+
+@_jit
+def _cavities(exit_, exits, rf, x, tangent):  # type: ignore[no-untyped-def]
+    """What the cavities at one exit give to a state, and to its tangent."""
+    for c in range(len(exits)):
+        if exits[c] == exit_:
+            angle = rf[1] - rf[2] * x[4]
+            x[5] += rf[0] * math.sin(angle)
+            slope = -rf[0] * rf[2] * math.cos(angle)
+            for j in range(len(x)):
+                tangent[5, j] += slope * tangent[4, j]
+
+
+@_jit
+def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
+    """whole [end, n, n]: the product of the steps behind the last end, up to and with this one."""
+    n, k = steps.shape[1], 0
+    row = np.empty(n)
+    for e in range(len(ends)):
+        whole[e] = steps[k]
+        for s in range(k + 1, ends[e] + 1):
+            for j in range(n):
+                for a in range(n):
+                    row[a] = 0.0
+                    for i in range(n):
+                        row[a] += steps[s, a, i] * whole[e, i, j]
+                for a in range(n):
+                    whole[e, a, j] = row[a]
+        k = ends[e] + 1
+
+
+@_jit
+def products(steps, total):  # type: ignore[no-untyped-def]
+    """total [step + 1, n, n] of matrices [step, n, n]: from the start to behind each."""
+    n = steps.shape[1]
+    for a in range(n):
+        for j in range(n):
+            total[0, a, j] = 1.0 if a == j else 0.0
+    for k in range(steps.shape[0]):
+        for a in range(n):
+            for j in range(n):
+                total[k + 1, a, j] = 0.0
+            for i in range(n):
+                slope = steps[k, a, i]
+                if slope != 0.0:
+                    for j in range(n):
+                        total[k + 1, a, j] += slope * total[k, i, j]
 
 
 @_jit

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model, Paths
 from tmlattice.challenge.case import Case, ring_of
-from tmlattice.effects import names
+from tmlattice.effects import modelled
 from tmlattice.fitting import fine_tune
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.measurement import Measurement
@@ -48,8 +48,7 @@ def baselines(case: Case) -> dict[str, Guesses]:
         launches = launches.copy()
         launches[:, whitening.columns] += moved
     residual = projection.out(residual)
-    chosen = names(case.options.get("effects"))
-    hypotheses = model.hypotheses([n for n in chosen if n != "monitor_dead"])
+    hypotheses = model.hypotheses(modelled(case.options.get("effects")))
     parts = []
     for start in range(0, len(hypotheses), CHUNK):
         some = hypotheses[start : start + CHUNK]

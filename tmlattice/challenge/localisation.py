@@ -16,7 +16,8 @@ from tqdm.auto import tqdm
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.fitting import fine_tune
-from tmlattice.fitting.weights import LayerEffects, layer_effects, read_gradient, read_network
+from tmlattice.fitting.weight_parts import LayerEffects, layer_effects
+from tmlattice.fitting.weights import read_gradient, read_network
 from tmlattice.lattice import Ring
 from tmlattice.machine import simulate
 from tmlattice.measurement import Measurement

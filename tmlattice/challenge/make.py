@@ -21,7 +21,15 @@ from tmlattice.challenge.case import (
 )
 from tmlattice.challenge.ruler import Ruler
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
-from tmlattice.effects import CATALOGUE, Cause, Settings, background_rms, find, names
+from tmlattice.effects import (
+    Cause,
+    Settings,
+    background_rms,
+    find,
+    modelled,
+    monitors_with,
+    names,
+)
 from tmlattice.errors import TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
@@ -42,9 +50,6 @@ SET_CORRECTORS = 4
 and correctors that kick wrongly or stand askew can be seen."""
 
 SET_KICK = (2e-5, 5e-5)
-
-ON_SET = ("corrector_calibration", "corrector_roll")
-"""Effects that only a corrector that is set can show: their place is one of these."""
 
 HELD_OUT = 2
 
@@ -207,7 +212,7 @@ class CaseDraw:
             else:
                 if kind is not None:
                     unknown = {"kind": "taken_out"}
-                    options["effects"] = [n for n in CATALOGUE if n != kind]
+                    options["effects"] = [n for n in names() if n != kind]
                 count = 1 if self.tier != "C" else int(self.random.integers(2, 4))
                 while len(causes) < count:
                     cause = self._cause(ruler, self.effects if kind is None else [kind])
@@ -240,7 +245,7 @@ class CaseDraw:
         for _ in range(1000):
             name = effects[int(self.random.integers(len(effects)))]
             effect = find(name)
-            places = self.set if name in ON_SET else effect.places(self.ring)
+            places = self.set if effect.acts_on_settings else effect.places(self.ring)
             if not places:
                 continue
             place = places[int(self.random.integers(len(places)))]
@@ -249,8 +254,8 @@ class CaseDraw:
             if effect.discrete:
                 forms = int(effect.largest)
                 return Cause(name, place, float(self.random.integers(1, forms + 1)))
-            if effect.power == 2 or name.startswith("radiation"):
-                sign = 1.0  # a spread and a loss have no other
+            if effect.one_sign:
+                sign = 1.0
             if self.amount is not None:
                 return Cause(name, place, sign * self.amount)
             cap = Cause(name, place, sign * effect.largest)
@@ -265,7 +270,7 @@ class CaseDraw:
 
     def _unknown_kind(self) -> str:
         """Unknowns and effects taken out share the cases half and half, each in turn."""
-        taken = [n for n in CATALOGUE if n != "monitor_dead" and CATALOGUE[n].places(self.ring)]
+        taken = [name for name in modelled() if find(name).places(self.ring)]
         kinds = list(LARGEST)
         which = self.number // 2
         pool = kinds if self.number % 2 == 0 else taken
@@ -297,7 +302,7 @@ class CaseDraw:
         return clean_readings(Machine(self.ring, [*self.small, *causes]), self.shots)
 
     def _size(self, ruler: Ruler, change: Array, causes: Sequence[Cause]) -> float:
-        if any(cause.effect == "monitor_dead" for cause in causes):
+        if not all(find(cause.effect).modelled for cause in causes):
             return float("nan")
         return ruler.size(change[: self.fit_shots])
 
@@ -339,12 +344,7 @@ class CaseDraw:
         )
 
     def _frozen_monitors(self, causes: Sequence[Cause]) -> list[int]:
-        monitors = [monitor.name for monitor in self.ring.monitors]
-        return [
-            monitors.index(str(c.element))
-            for c in causes
-            if c.effect == "monitor_dead" and c.amount == 2
-        ]
+        return [int(at) for at in np.flatnonzero(monitors_with(self.ring, causes).frozen)]
 
     def _frozen(self, clean: Array, case: Case, causes: Sequence[Cause]) -> Array:
         clean = clean.copy()

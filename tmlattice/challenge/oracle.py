@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.diagnosis.background import background_signatures
-from tmlattice.effects import Cause, RingEffect, find, names
+from tmlattice.effects import Cause, RingEffect, find, modelled
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import effective_number, free_threshold
-from tmlattice.inference.search import FALSE_ALARM
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import draw_background
 from tmlattice.observe.data import Data, joined, of_measurement
@@ -60,7 +60,7 @@ class Oracle:
         set_there = {name for setting in data.settings for name in setting}
         known, self.small = [], []  # in the ring for good, and with every reading
         for cause in (*small, *told):
-            if cause.effect == "corrector_calibration":  # acts on what a shot has set
+            if find(cause.effect).acts_on_settings:
                 self.small += [cause] * (cause.element in set_there)
             elif isinstance(find(cause.effect), RingEffect):
                 known.append(cause)
@@ -78,8 +78,7 @@ class Oracle:
             self.linear = np.einsum("h,hsrp->srp", amounts / rms, spread)
         self.whitening = Whitening(self.data, spread)
         self.projection = Projection(self.whitening.launch(self.paths.launch))
-        chosen = names(case.options.get("effects"))
-        self.hypotheses = self.model.hypotheses([n for n in chosen if n != "monitor_dead"])
+        self.hypotheses = self.model.hypotheses(modelled(case.options.get("effects")))
         self.rows = self._signatures()
         self.norm = np.einsum("hr,hr->h", self.rows, self.rows)
         self.cap = np.array([find(n).largest ** find(n).power for n, _ in self.hypotheses])
@@ -139,7 +138,7 @@ class Oracle:
         draws = np.random.default_rng([seed, 7]).standard_normal((DRAWS, self.whitening.rows))
         inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
         largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
-        return free_threshold(FALSE_ALARM, 1, effective_number(largest, 1))
+        return free_threshold(DEFAULT.false_alarm, 1, effective_number(largest, 1))
 
 
 def _best(
@@ -154,7 +153,7 @@ def _best(
 def _without_dead(data: Data, truth: Truth, monitors: Sequence[str]) -> Data:
     dropped = np.zeros(data.valid.shape, dtype=bool)
     for cause in truth.causes:
-        if cause.effect == "monitor_dead":
+        if not find(cause.effect).modelled:
             dropped[:, monitors.index(str(cause.element))] = True
     return data.without(dropped)
 
@@ -169,7 +168,7 @@ def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
     causes = truth.causes
     if len(causes) > 1:
         # a monitor without a signal is known to everybody
-        asked = [cause for cause in causes if cause.effect != "monitor_dead"]
+        asked = [cause for cause in causes if find(cause.effect).modelled]
         told = [tuple(c for c in causes if c is not cause) for cause in asked]
         return {
             "oracles": [_said(Oracle(case, truth, others), case) for others in told],

@@ -20,10 +20,9 @@ from tmlattice.cli.options import (
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
-    from tmlattice.diagnosis.response_result import ResponseDiagnosis
     from tmlattice.fitting.weights import WeightReading
     from tmlattice.lattice import Ring
-    from tmlattice.measurement import Measurement, OrbitResponse
+    from tmlattice.measurement import Measurement
 
 
 @click.command("diagnose")
@@ -45,12 +44,17 @@ if TYPE_CHECKING:
 )
 @background_option("Small errors that the machine has everywhere")
 @click.option(
-    "--max-effects", type=click.IntRange(1), default=8, show_default=True, help="Findings at most."
+    "--max-effects",
+    type=click.IntRange(1),
+    default=8,
+    show_default=True,
+    help="Findings at most; of an orbit response, steps that are kept at most.",
 )
 @click.option(
     "--effects",
     type=NameList(),
-    help="Look for these alone; else for the whole catalogue (`tmlattice effects`).",
+    help="Look for these alone, or of an orbit response fit families of these alone; else for all "
+    "usual ones (`tmlattice effects`).",
 )
 @click.option(
     "--network",
@@ -117,42 +121,44 @@ def diagnose(
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
         from tmlattice.effects import background_rms, names
-        from tmlattice.lattice import load_ring
+        from tmlattice.lattice import load_ring, save_ring
+        from tmlattice.observe.calibration import write_calibration
 
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
-        from tmlattice.measurement import OrbitResponse, read_measurement
+        from tmlattice.measurement import Measurement, OrbitResponse, read_measurement
 
         data = read_measurement(measurement)
-        if isinstance(data, OrbitResponse):
+        response = isinstance(data, OrbitResponse)
+        if response:
             _refuse(
-                "an orbit response", reference=reference, background=background, effects=effects,
-                network=network, radiation=options["radiation"],
+                "an orbit response", reference=reference, background=background, network=network,
+                radiation=options.pop("radiation"),
             )  # fmt: skip
-            response = _response(
-                load_ring(lattice, sequence, energy), data, measurement, folder, extra, lattice_out,
-                0.2 if holdout is None else holdout, missing, options["seed"], quiet,
-            )  # fmt: skip
-            if not quiet:
-                _print_response(response, out, json_file, lattice_out)
-            return
-        _refuse("first turns", lattice_out=lattice_out, missing=missing)
-        options["holdout"] = 0.33 if holdout is None else holdout
-        before = None if reference is None else trajectories(reference, "; give first turns")
+            options["missing"] = missing
+        else:
+            _refuse("first turns", lattice_out=lattice_out, missing=missing)
+            before = None if reference is None else trajectories(reference, "; give first turns")
+            options |= {"reference": before, "background": dict(background) or None}
+        options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
         ring = load_ring(lattice, sequence, energy)
+        if lattice_out:
+            _check_lattice_out(ring, lattice_out)
         with _progress(quiet) as progress:
-            result = _diagnosed(
-                ring, data, before, measurement, reference,
-                background=dict(background) or None, effects=effects, progress=progress, **options,
-            )  # fmt: skip
+            where = str(measurement) if reference is None else f"{measurement} or {reference}"
+            result = _diagnosed(ring, data, where, effects=effects, progress=progress, **options)
             reading = None
             if network:
+                assert isinstance(data, Measurement)
                 progress("network")
                 reading = _weights(ring, network, data)
             document = result.as_json()
             provenance = {**document["provenance"], "measurement": str(measurement)}
             document["provenance"] = provenance
+            if lattice_out:
+                save_ring(result.repaired, lattice_out)
+                write_calibration(calibration_beside(lattice_out), result.calibration)
             if folder:
                 progress("figures")
                 _write_folder(result, folder, provenance)
@@ -162,7 +168,7 @@ def diagnose(
             if extra:
                 write_json(extra, document)
     if not quiet:
-        _print(result, out, json_file)
+        _print(result, out, json_file, lattice_out)
         if reading:
             _print_weights(ring, reading)
 
@@ -174,81 +180,24 @@ def _refuse(kind: str, **given: Any) -> None:
             raise click.UsageError(f"--{name.replace('_', '-')} has no meaning for {kind}")
 
 
-def _response(
-    ring: "Ring",
-    data: "OrbitResponse",
-    path: Path,
-    folder: Path | None,
-    extra: Path | None,
-    lattice_out: Path | None,
-    holdout: float,
-    missing: bool,
-    seed: int,
-    quiet: bool,
-) -> "ResponseDiagnosis":
-    """Diagnose an orbit response and write what was asked for."""
-    from tmlattice.diagnosis.response import diagnose_response
-    from tmlattice.errors import MeasurementError, UnknownNameError
-    from tmlattice.files import write_json
-    from tmlattice.lattice import save_ring
-    from tmlattice.observe.calibration import write_calibration
+def _check_lattice_out(ring: "Ring", path: Path) -> None:
+    """Whether the ring can be written there, before minutes of work."""
+    from tempfile import TemporaryDirectory
 
-    with _progress(quiet) as progress:
-        try:
-            result = diagnose_response(
-                ring, data, holdout=holdout, missing=missing, seed=seed, progress=progress
-            )
-        except (MeasurementError, UnknownNameError) as error:
-            raise MeasurementError(f"{path}: {error}") from error
-        document = result.as_json()
-        document["provenance"]["measurement"] = str(path)
-        if lattice_out:
-            save_ring(result.repaired, lattice_out)
-            write_calibration(calibration_beside(lattice_out), result.calibration)
-        if folder:
-            progress("figures")
-            _write_response(result, folder, document["provenance"])
-            write_json(folder / "diagnosis.json", document)
-        if extra:
-            write_json(extra, document)
-    return result
+    from tmlattice.files import check_writable
+    from tmlattice.lattice import save_ring
+
+    if path.suffix.lower() != ".json":
+        raise click.UsageError(f"--lattice-out '{path}' does not end in .json; name a .json file")
+    for file in (path, calibration_beside(path)):
+        check_writable(file)
+    with TemporaryDirectory() as folder:
+        save_ring(ring, Path(folder) / path.name)
 
 
 def calibration_beside(lattice: Path) -> Path:
     """Where the calibration of a lattice file stands."""
     return lattice.with_name(f"{lattice.name}.calibration.json")
-
-
-def _write_response(result: "ResponseDiagnosis", folder: Path, provenance: dict[str, Any]) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from tmlattice.report.response import draw_response, response_page
-    from tmlattice.report.response_text import response_text
-
-    html = response_page(result, draw_response(result, folder), provenance)
-    (folder / "report.html").write_text(html, encoding="utf-8")
-    (folder / "report.txt").write_text(response_text(result) + "\n", encoding="utf-8")
-
-
-def _print_response(
-    result: "ResponseDiagnosis", out: Path | None, json_file: Path | None, lattice_out: Path | None
-) -> None:
-    from tmlattice.report.response_text import response_text
-
-    screen = console()
-    screen.print(response_text(result, min(screen.width, 120)), soft_wrap=True)
-    columns = len(result.measured.correctors)
-    screen.print(
-        f"\n{result.ring.name}: {columns} correctors, {int(result.held.sum())} of them held out, "
-        f"{int(result.good.sum())} monitors, seed {result.seed}, {result.seconds:.1f} s"
-    )
-    written = [f"{out}/: report.html, report.txt, diagnosis.json, figures"] if out else []
-    written += [str(json_file)] if json_file else []
-    if lattice_out:
-        written += [str(lattice_out), str(calibration_beside(lattice_out))]
-    if written:
-        screen.print(f"written: {'; '.join(written)}", soft_wrap=True)
 
 
 def _weights(ring: "Ring", path: Path, data: "Measurement") -> "WeightReading":
@@ -283,22 +232,14 @@ def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
     )
 
 
-def _diagnosed(
-    ring: Any,
-    data: "Measurement",
-    before: "Measurement | None",
-    path: Path,
-    reference: Path | None,
-    **options: Any,
-) -> "Diagnosis":
+def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
     """The diagnosis; an error of the data names their folder."""
     from tmlattice.diagnosis import diagnose as run
     from tmlattice.errors import MeasurementError, UnknownNameError
 
     try:
-        return run(ring, data, reference=before, **options)
+        return run(ring, data, **options)
     except (MeasurementError, UnknownNameError) as error:
-        where = str(path) if reference is None else f"{path} or {reference}"
         raise MeasurementError(f"{where}: {error}") from error
 
 
@@ -320,7 +261,7 @@ def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any])
 
     mpl.use("Agg")
     from tmlattice.report.page import draw, page
-    from tmlattice.report.text import report_text
+    from tmlattice.report.plain import report_text
 
     pictures = draw(result, folder)
     html = page(result, pictures, provenance)
@@ -328,19 +269,30 @@ def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any])
     (folder / "report.txt").write_text(report_text(result) + "\n", encoding="utf-8")
 
 
-def _print(result: "Diagnosis", out: Path | None, json_file: Path | None) -> None:
-    from tmlattice.report.text import report_text
+def _print(
+    result: "Diagnosis", out: Path | None, json_file: Path | None, lattice_out: Path | None
+) -> None:
+    from tmlattice.report.plain import report_text
 
     screen = console()
     screen.print(report_text(result, min(screen.width, 120)), soft_wrap=True)
-    seconds = result.provenance["seconds"]
-    shots = int(result.data.active.sum())
-    screen.print(
-        f"\n{result.ring.name}: {shots} shots in the fit, {len(result.heldout_shots)} held out, "
-        f"{len(result.explanation.first.hypotheses)} hypotheses, seed {result.provenance['seed']}, "
-        f"{seconds:.1f} s"
-    )
+    if result.kind == "trajectory":
+        view = result.trajectories
+        what = (
+            f"{int(view.data.active.sum())} shots in the fit, {len(result.heldout_shots)} held "
+            f"out, {len(view.explanation.first.hypotheses)} hypotheses"
+        )
+    else:
+        held, good = result.response.held, result.response.good
+        what = (
+            f"{len(held) - 1} correctors, {int(held.sum())} of them held out, {int(good.sum())} "
+            "monitors"
+        )
+    made = result.provenance
+    screen.print(f"\n{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s")
     written = [f"{out}/: report.html, report.txt, diagnosis.json, figures"] if out else []
     written += [str(json_file)] if json_file else []
+    if lattice_out:
+        written += [str(lattice_out), str(calibration_beside(lattice_out))]
     if written:
         screen.print(f"written: {'; '.join(written)}", soft_wrap=True)

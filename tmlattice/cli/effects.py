@@ -19,11 +19,17 @@ def effects(json_file: Path | None) -> None:
         rows = [
             {
                 "effect": effect.name,
+                "words": effect.words,
+                "group": effect.group,
                 "sits_on": effect.sits_on_text,
                 "unit": effect.unit,
                 "sign": effect.sign,
                 "background_rms": effect.background,
                 "largest_fault": effect.largest,
+                "modelled": effect.modelled,
+                "energy": effect.energy,
+                "acts_on_settings": effect.acts_on_settings,
+                "usual": effect.usual,
             }
             for effect in CATALOGUE.values()
         ]
@@ -37,6 +43,7 @@ def effects(json_file: Path | None) -> None:
         column.no_wrap = column is not shown.columns[-1]
     for effect in CATALOGUE.values():
         usual = "-" if effect.background is None else f"{effect.background:g}"
-        text = f"{effect.sits_on_text}; {effect.sign}"
+        asked = "" if effect.usual else "; looked for where it is named (--effects)"
+        text = f"{effect.sits_on_text}; {effect.sign}{asked}"
         shown.add_row(effect.name, effect.unit, f"{usual} / {effect.largest:g}", text)
     console().print(shown)

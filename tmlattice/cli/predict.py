@@ -44,7 +44,7 @@ def predict(
     """
     from tmlattice.files import output_file
     from tmlattice.lattice import load_ring
-    from tmlattice.measurement.folder import write_response_table
+    from tmlattice.measurement.write import write_response_table
     from tmlattice.observe.calibration import calibrated_response, read_calibration
 
     if kick == 0 or not abs(kick) < float("inf"):

@@ -136,9 +136,8 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--rf-step",
     type=float,
-    default=-3000.0,
-    show_default=True,
-    help="Orbit response: the step of the RF, Hz; 0 for none.",
+    default=None,
+    help="Orbit response: the step of the RF, Hz; 0 for none; else 0.5 % of energy.",
 )
 @click.option(
     "--one-sided",
@@ -168,7 +167,7 @@ def simulate(
     noise: float | None,
     correctors: tuple[str, ...],
     kick: float,
-    rf_step: float,
+    rf_step: float | None,
     one_sided: bool,
     out: Path,
     truth: Path | None,
@@ -262,7 +261,7 @@ def _response(
     if quiet:
         return
     measured, screen = simulation.measured, console()
-    rf = f", RF step {options['rf_step']:g} Hz" if options["rf_step"] else ""
+    rf = "" if measured.rf is None else f", RF step {measured.rf.step:g} Hz"
     sides = "one-sided" if options["one_sided"] else "two-sided"
     screen.print(
         f"{ring.name}: {len(measured.correctors)} correctors, {len(measured.monitors)} monitors, "

@@ -6,7 +6,41 @@
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 
-from tmlattice.diagnosis.procedure import diagnose
-from tmlattice.diagnosis.result import Diagnosis, Finding, Member
+from typing import Any
 
-__all__ = ["Diagnosis", "Finding", "Member", "diagnose"]
+from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
+from tmlattice.diagnosis.result import Diagnosis, Finding, Member
+from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement, OrbitResponse
+
+__all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"]
+
+_OF_TRAJECTORIES = ("reference", "background", "heldout", "radiation")
+
+
+def diagnose(ring: Ring, measurement: Measurement | OrbitResponse, **options: Any) -> Diagnosis:
+    """Where the gap between a ring and its measurement lies, what causes it, how far it shrinks.
+
+    Args:
+        ring: the design.
+        measurement: first turns (or a few turns) of one or more shots, or an orbit response.
+        options: for both kinds holdout, effects, max_effects, false_alarm, seed and progress; for
+            trajectories also reference, background, heldout and radiation, see
+            `diagnosis.procedure.diagnose`; for an orbit response missing, see
+            `diagnosis.response.diagnose_response`.
+
+    Raises:
+        MeasurementError: data that cannot be used, or an option without meaning for them.
+        UnknownNameError: a monitor or an effect that does not exist.
+    """
+    response = isinstance(measurement, OrbitResponse)
+    for name in _OF_TRAJECTORIES if response else ("missing",):
+        if options.pop(name, None):
+            kind = "an orbit response" if response else "first turns"
+            raise MeasurementError(f"the option '{name}' has no meaning for {kind}; leave it out")
+    if isinstance(measurement, OrbitResponse):
+        from tmlattice.diagnosis.response import diagnose_response
+
+        return diagnose_response(ring, measurement, **options)
+    return diagnose_trajectories(ring, measurement, **options)

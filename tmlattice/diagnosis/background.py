@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Hypothesis, Model, Paths
+from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import Cause
-from tmlattice.inference.newton import Fit, Problem, fit
+from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
-from tmlattice.observe.data import Data
+from tmlattice.observe.first_turns import FirstTurns
 
 Array = NDArray[np.float64]
 
@@ -31,40 +32,30 @@ class SmallErrors:
     """The background, linear about its likeliest amounts.
 
     Attributes:
-        model: with those amounts in it.
-        data: readings plus what the signatures make of the amounts.
-        spread: rms times signature of every error, [error, shot, reading, 2], m.
-        whitening: of these data with this spread.
+        problem: with those amounts in its model, and in its data what the signatures make of them.
         before: launches alone, in this model.
         hypotheses, rms: of every error.
     """
 
-    model: Model
-    data: Data
-    spread: Array
-    whitening: Whitening
+    problem: FirstTurns
     before: Fit
     hypotheses: tuple[Hypothesis, ...]
     rms: Array
 
     def estimate(self, explained: Fit, whitening: Whitening) -> list[Cause]:
         """The likeliest small errors beside an explanation, which was found in this whitening."""
-        clean = explained.projection.out(explained.residual)
-        return _causes(self.hypotheses, self.rms, self.spread, whitening, clean)
+        assert self.problem.spread is not None
+        rows = explained.clean.reshape(whitening.shots, -1)[:, :-5]
+        weights = whitening.back(rows[None])[0]
+        shares = np.einsum("esrp,srp->e", self.problem.spread, weights, optimize=True)
+        amounts = (self.rms * shares).tolist()
+        return [Cause(*h, amount) for h, amount in zip(self.hypotheses, amounts, strict=True)]
 
     def made_by(self, estimate: Sequence[Cause]) -> Array:
         """What small errors make of the readings, linearly, [shot, reading, 2], m."""
+        assert self.problem.spread is not None
         amounts = np.array([cause.amount for cause in estimate]) / self.rms
-        return np.asarray(np.einsum("e,esrp->srp", amounts, self.spread, optimize=True))
-
-
-def _causes(
-    hypotheses: Sequence[Hypothesis], rms: Array, spread: Array, whitening: Whitening, clean: Array
-) -> list[Cause]:
-    rows = clean.reshape(whitening.shots, -1)[:, :-5]
-    weights = whitening.back(rows[None])[0]
-    amounts = rms * np.einsum("esrp,srp->e", spread, weights, optimize=True)
-    return [Cause(*h, float(a)) for h, a in zip(hypotheses, amounts, strict=True)]
+        return np.asarray(np.einsum("e,esrp->srp", amounts, self.problem.spread, optimize=True))
 
 
 def background_signatures(
@@ -87,7 +78,7 @@ def background_signatures(
 
 def small_errors(
     ring: Ring,
-    data: Data,
+    plain: FirstTurns,
     known: Sequence[Cause],
     rms: Mapping[str, float],
     launches: Array,
@@ -98,27 +89,28 @@ def small_errors(
 
     Args:
         ring: the design.
-        data: all shots, those of a reference too: it is the same machine.
+        plain: all shots, those of a reference too (it is the same machine), without small errors.
         known: causes that are there anyway.
         rms: by effect.
         launches: first guess, [shot, 5].
         causes: what was found already: small errors act along the orbit that it makes.
         estimate: the likeliest small errors beside it.
     """
-    fixed = tuple(causes)
+    fixed, data = tuple(causes), plain.data
     for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
-        alone = fit(Problem(model, data, Whitening(data), {}, fixed), (), launches)
-        hypotheses, scale, spread = background_signatures(model, alone.paths, launches, rms)
+        alone = fit(replace(plain, model=model, fixed=fixed), (), launches)
+        paths = alone.point.view
+        hypotheses, scale, spread = background_signatures(model, paths, alone.nuisances, rms)
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
         moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
         shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
-        whitening = Whitening(shifted, spread)
-        explained = fit(Problem(model, shifted, whitening, {}, fixed), (), alone.launches)
-        launches = explained.launches
-        clean = explained.projection.out(explained.residual)
-        estimate = _causes(hypotheses, scale, spread, whitening, clean)
-    before = explained
+        problem = replace(plain, model=model, data=shifted, fixed=fixed, spread=spread, white=None)
+        explained = fit(problem, (), alone.nuisances)
+        launches = explained.nuisances
+        problem = replace(problem, fixed=())
+        small = SmallErrors(problem, explained, tuple(hypotheses), scale)
+        estimate = small.estimate(explained, problem.whitening)
     if fixed:
-        before = fit(Problem(model, shifted, whitening, {}), (), launches)
-    return SmallErrors(model, shifted, spread, whitening, before, tuple(hypotheses), scale)
+        small = replace(small, before=fit(problem, (), launches))
+    return small

@@ -15,7 +15,7 @@ from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.search import Rival
+from tmlattice.inference.rivals import Rival
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data

@@ -1,20 +1,30 @@
-"""What a diagnosis says: findings with what else each could be, the gap, and the file format."""
+"""What a diagnosis says, whatever was measured: findings with what else each could be, amounts with
+errors, the gap, and the file format."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
-from tmlattice.diagnosis.gap import Gap, Misfit
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.search import Detection, Explanation
+from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.rivals import Detection
+from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.maps.magnets import ring_matrix
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.calibration import CALIBRATES
 from tmlattice.observe.data import Data
 from tmlattice.optics import matrix_tunes
+
+if TYPE_CHECKING:
+    from tmlattice.diagnosis.dense import Step
+    from tmlattice.diagnosis.missing import Weighed
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
@@ -99,6 +109,39 @@ class Finding:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class TrajectoryView:
+    """What only trajectories have, for plots.
+
+    Attributes:
+        explanation, data, model: the search.
+    """
+
+    explanation: Explanation
+    data: Data
+    model: Model
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseView:
+    """What only an orbit response has, for plots.
+
+    Attributes:
+        measured: the response, its monitors in the ring's order.
+        data: measured, the RF last, m, [column, monitor, 2].
+        design, model: the model's, before and after.
+        held: correctors held out, [column], the RF last.
+        good: monitors kept, [monitor].
+    """
+
+    measured: OrbitResponse
+    data: NDArray[np.float64]
+    design: NDArray[np.float64]
+    model: NDArray[np.float64]
+    held: NDArray[np.bool_]
+    good: NDArray[np.bool_]
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """What a measurement says of a ring. See `as_json` for the file format.
@@ -106,20 +149,30 @@ class Diagnosis:
     Attributes:
         verdict: the least certain of the findings', see `VERDICTS`.
         findings: by falling statistic.
-        fit_before, fit_after: misfit of the shots of the fit.
-        heldout: of the held-out shots, before, each finding added, after; or None.
-        heldout_shots: their ids.
-        unexplained: p-value of what is left, and where it sits.
+        fit_before, fit_after: misfit of the readings of the fit.
+        heldout: of held-out readings, before, each finding or step added, after; or None.
+        heldout_shots: their ids, of trajectories.
+        unexplained: p-value of what is left, where it sits, and its patterns (orbit response).
         tunes: fractions of Qx, Qy of the design and of the ring with the causes; None: unstable.
         next: the shot that would tell the likeliest rivals apart, or None.
         sensitivity: by effect, the amount that would be seen at half of its places.
         warnings: what a reader should know.
+        left_out: single readings that the search left out: shot, turn, monitor, plane.
         noise: rms of a reading, m, (x, y).
         noise_estimated: whether it comes from the data.
-        provenance: package, lattice, options, seed, seconds.
+        provenance: package, lattice, options as used, seed, seconds.
         ring: the design.
-        repaired: the ring with the named causes in it.
-        explanation, data, model: the search, for plots.
+        repaired: the ring with the named causes in it; monitors and correctors are in
+            `calibration`.
+        causes: of ring, beam, correctors and monitors.
+        errors: standard error of each one's amount, the same length.
+        view: what figures need; it says what was measured.
+        steps: of a dense fit, those kept; the first is the design's, the last the result's.
+        refused: those that did not help.
+        bad_monitors: names of those left out.
+        priors: rms of the families' priors, as the data have them, by name.
+        degenerate: what the data alone do not settle, in words.
+        hypotheses: effects that may be missing, weighed; None: not asked.
     """
 
     verdict: str
@@ -139,13 +192,60 @@ class Diagnosis:
     ring: Ring = field(repr=False)
     repaired: Ring = field(repr=False)
     causes: tuple[Cause, ...]
-    explanation: Explanation = field(repr=False)
-    data: Data = field(repr=False)
-    model: Model = field(repr=False)
+    errors: tuple[float, ...]
+    view: TrajectoryView | ResponseView = field(repr=False)
+    left_out: tuple[dict[str, Any], ...] = ()
+    steps: "tuple[Step, ...]" = ()
+    refused: "tuple[Step, ...]" = ()
+    bad_monitors: tuple[str, ...] = ()
+    priors: Mapping[str, float] = field(default_factory=dict)
+    degenerate: tuple[str, ...] = ()
+    hypotheses: "tuple[Weighed, ...] | None" = None
+
+    @property
+    def kind(self) -> str:
+        """Of the measurement: "trajectory" or "orbit_response"."""
+        return "trajectory" if isinstance(self.view, TrajectoryView) else "orbit_response"
+
+    @property
+    def trajectories(self) -> TrajectoryView:
+        """The view of trajectories; TypeError for another kind."""
+        if not isinstance(self.view, TrajectoryView):
+            raise TypeError(f"the diagnosis is of an {self.kind}, not of trajectories")
+        return self.view
+
+    @property
+    def response(self) -> ResponseView:
+        """The view of an orbit response; TypeError for another kind."""
+        if not isinstance(self.view, ResponseView):
+            raise TypeError(f"the diagnosis is of a {self.kind}, not of an orbit response")
+        return self.view
+
+    @property
+    def explanation(self) -> Explanation:
+        """The search, of trajectories."""
+        return self.trajectories.explanation
+
+    @property
+    def calibration(self) -> tuple[Cause, ...]:
+        """What monitors and correctors do, for `write_calibration`."""
+        bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
+        return (*(c for c in self.causes if c.effect in CALIBRATES), *bad)
+
+    def error(self, effect: str, element: str | None) -> tuple[float, float]:
+        """Amount and standard error of a cause.
+
+        Raises:
+            KeyError: it is not among the causes.
+        """
+        for cause, sigma in zip(self.causes, self.errors, strict=True):
+            if (cause.effect, cause.element) == (effect, element):
+                return cause.amount, sigma
+        raise KeyError((effect, element))
 
     @property
     def gap(self) -> dict[str, Any]:
-        """Before and after on the fit's shots and on the held-out ones."""
+        """Before and after on the fit's readings and on held-out ones."""
 
         def both(before: Misfit, after: Misfit) -> dict[str, Any]:
             return {"before": dict(vars(before)), "after": dict(vars(after))}
@@ -156,7 +256,7 @@ class Diagnosis:
             heldout = {
                 **both(gap.misfits[0], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
-                "monitors": "odd",
+                "monitors": "odd" if self.kind == "trajectory" else "half",
                 "steps": [dict(vars(m)) for m in gap.misfits],
             }
         interval = None if gap is None or gap.interval is None else list(gap.interval)
@@ -172,18 +272,31 @@ class Diagnosis:
         """The result in the format `tmlattice-diagnosis`, version 1 (see `schemas/`)."""
         from tmlattice import __version__
 
+        weighed = self.hypotheses
         return {
             "format": "tmlattice-diagnosis",
             "version": 1,
             "package": __version__,
+            "kind": self.kind,
             "verdict": self.verdict,
             "findings": [finding.as_json() for finding in self.findings],
+            "steps": [step.as_json() for step in self.steps],
+            "refused": [step.as_json() for step in self.refused],
+            "bad_monitors": list(self.bad_monitors),
+            "degenerate": list(self.degenerate),
+            "priors": dict(self.priors),
+            "errors": [
+                {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
+                for c, s in zip(self.causes, self.errors, strict=True)
+            ],
+            "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             "gap": self.gap,
-            "unexplained": self.unexplained,
+            "unexplained": {"patterns": None, **self.unexplained},
             "tunes": self.tunes,
             "next_measurement": None if self.next is None else self.next.as_json(),
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
+            "left_out": [dict(row) for row in self.left_out],
             "provenance": self.provenance,
         }
 

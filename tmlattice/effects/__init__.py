@@ -16,6 +16,7 @@ from tmlattice.effects import insertion_devices as insertion_devices
 from tmlattice.effects import monitors as monitors
 from tmlattice.effects import beam as beam
 from tmlattice.effects import radiation as radiation
+from tmlattice.effects import wakes as wakes
 
 # isort: on
 from tmlattice.effects.apply import (
@@ -37,10 +38,11 @@ from tmlattice.effects.effect import (
     ReadingEffect,
     RingEffect,
     find,
+    modelled,
     names,
     register,
 )
-from tmlattice.effects.radiation import expected_loss
+from tmlattice.effects.radiation import expected_loss, expected_radiation
 from tmlattice.effects.sizes import background_rms
 
 __all__ = [
@@ -60,7 +62,9 @@ __all__ = [
     "check",
     "directions",
     "expected_loss",
+    "expected_radiation",
     "find",
+    "modelled",
     "monitors_with",
     "names",
     "register",

@@ -90,7 +90,7 @@ def _set(element: Element, attribute: str, amount: float) -> Element:
             return element.changed(k2=element.k2 * (1 + amount))
     raise EffectError(
         f"{element.kind} '{element.name}' has no setting '{attribute}'; correctors have kick, "
-        "quadrupoles k1_relative, sextupoles k2_relative, rf frequency_relative"
+        "quadrupoles and bends k1_relative, sextupoles k2_relative, rf frequency_relative"
     )
 
 

@@ -17,6 +17,10 @@ class EnergyOffset(LaunchEffect):
     """All shots arrive with another energy than the ring's."""
 
     name = "energy_offset"
+    words = "energy deviation of the beam"
+    headline = True
+    energy = True
+    shifts = 5
     unit = "relative"
     sign = "p of the launch += amount, common to all shots"
     largest = 5e-3
@@ -33,6 +37,9 @@ class EnergySpread(LaunchEffect):
     """Particles of a shot differ in energy; a monitor reads their centroid."""
 
     name = "energy_spread"
+    words = "energy spread of the beam"
+    energy = True
+    one_sign = True
     unit = "relative"
     sign = "rms of the particles' relative energy deviation"
     largest = 3e-3

@@ -4,11 +4,14 @@ OCELOT's `tilt` and `angle` change the geometry, so neither is an error: a bend'
 spread over its body (in its middle, which for a body of 28 mrad is the same to 3e-5).
 """
 
+from tmlattice.effects.build import Build
 from tmlattice.effects.effect import RingEffect, register
 from tmlattice.lattice import Element
 
 
 class _OnBend(RingEffect):
+    group = "bends"
+    headline = True
     sits_on_text = "bends"
 
     def sits_on(self, element: Element) -> bool:
@@ -21,6 +24,7 @@ class DipoleField(_OnBend):
     """A bend's field is off."""
 
     name = "dipole_field"
+    words = "wrong field of a bending magnet"
     unit = "relative"
     sign = "px -= angle x amount: a stronger field bends towards the inside"
     background = 5e-4
@@ -30,12 +34,17 @@ class DipoleField(_OnBend):
         """A horizontal kick."""
         return element.with_errors(kick_x=-element.angle * amount)
 
+    def build(self, it: Build, amount: float) -> None:
+        """Another field."""
+        it.scale *= 1 + amount
+
 
 @register
 class DipoleRoll(_OnBend):
     """A bend turned about the beam axis: its field has a horizontal part."""
 
     name = "dipole_roll"
+    words = "bending magnet rolled about the beam axis"
     unit = "rad"
     sign = "kick (amount^2 angle / 2, -amount angle)"
     background = 2e-4
@@ -46,3 +55,7 @@ class DipoleRoll(_OnBend):
         return element.with_errors(
             kick_x=amount**2 * element.angle / 2, kick_y=-amount * element.angle
         )
+
+    def build(self, it: Build, amount: float) -> None:
+        """A turned magnet."""
+        it.roll += amount

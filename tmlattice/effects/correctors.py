@@ -5,6 +5,7 @@ from tmlattice.lattice import Element
 
 
 class _OnCorrector(RingEffect):
+    group = "correctors"
     sits_on_text = "correctors"
 
     def sits_on(self, element: Element) -> bool:
@@ -13,6 +14,7 @@ class _OnCorrector(RingEffect):
 
 
 class _Kick(_OnCorrector):
+    headline = True
     unit = "rad"
     largest = 2e-4
 
@@ -22,6 +24,7 @@ class CorrectorKickX(_Kick, ErrorEffect):
     """A horizontal kick that nobody set."""
 
     name = "corrector_kick_x"
+    words = "corrector that kicks horizontally beyond its setting"
     error = "kick_x"
     sign = "px += amount, whatever the setting"
 
@@ -31,6 +34,7 @@ class CorrectorKickY(_Kick, ErrorEffect):
     """A vertical kick that nobody set."""
 
     name = "corrector_kick_y"
+    words = "corrector that kicks vertically beyond its setting"
     error = "kick_y"
     sign = "py += amount, whatever the setting"
 
@@ -40,6 +44,9 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     """A corrector kicks more or less than it is told to."""
 
     name = "corrector_calibration"
+    words = "wrong calibration of a corrector"
+    acts_on_settings = True
+    calibrates = True
     strength = "angle"
     unit = "relative"
     sign = "kick = (1 + amount) x setting; -2 is a reversed one"
@@ -52,6 +59,9 @@ class CorrectorRoll(_OnCorrector, ErrorEffect):
     """A corrector turned about the beam axis."""
 
     name = "corrector_roll"
+    words = "corrector rolled about the beam axis"
+    acts_on_settings = True
+    calibrates = True
     error = "roll"
     unit = "rad"
     sign = "positive turns the kick from x towards y"

@@ -51,6 +51,26 @@ class Directions:
     E1: Array
     E2: Array
 
+    def replaced(self, which: Sequence[int], fresh: "Directions") -> "Directions":
+        """With the rows of `fresh`, whose hypotheses are `which` of these, instead of theirs."""
+        owner = np.array(which, dtype=np.int64)
+        keep = ~np.isin(self.owner, owner)
+        keep_read = ~np.isin(self.read_owner, owner)
+        joined = {
+            name: np.concatenate([getattr(self, name)[kept], getattr(fresh, name)])
+            for names, kept in (
+                (("layer", "D0", "D1", "D2"), keep),
+                (("monitor", "E0", "E1", "E2"), keep_read),
+            )
+            for name in names
+        }
+        return Directions(
+            hypotheses=self.hypotheses,
+            owner=np.concatenate([self.owner[keep], owner[fresh.owner]]),
+            read_owner=np.concatenate([self.read_owner[keep_read], owner[fresh.read_owner]]),
+            **joined,
+        )
+
 
 def directions(
     layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], step: float = STEP

@@ -2,22 +2,29 @@
 
 There are three kinds, by what they act on: the ring (a magnet has another map), the readings (a
 monitor tells something else than where the beam is), and the launch (the beam starts otherwise).
-To add an effect, write a class of one of them and `register` it; a test fails until it has its own.
+To add an effect, write a class of one of them and `register` it: see docs/new_effect.md.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.effects.build import Build, Where
 from tmlattice.effects.cause import Cause
-from tmlattice.errors import EffectError, unknown_name
+from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.ring import Slopes
 
 Array = NDArray[np.float64]
+
+Group = Literal[
+    "quadrupoles", "bends", "correctors", "sextupoles", "insertion devices", "monitors", "beam"
+]
+"""Effects that a figure draws in one colour."""
 
 
 class Effect(ABC):
@@ -25,6 +32,8 @@ class Effect(ABC):
 
     Attributes:
         name: in commands, reports and files.
+        words: what it is, in the words of a control room: "wrong strength of a quadrupole".
+        group: of what it is drawn with.
         unit: of the amount; "relative" and "discrete" have none.
         sign: what a positive amount does.
         background: rms of the amount on a machine in good order, or None where such a machine
@@ -33,11 +42,21 @@ class Effect(ABC):
         sits_on_text: the elements it can sit on, for people.
         power: readings change as amount ** power to leading order.
         discrete: it is there or not; the amount says in which form.
+        forms: what the amounts of a discrete effect stand for, where there are several.
         curved: the square of an amount within the largest fault acts as much as the amount: what
             is linear about none of it misleads.
+        one_sign: a fault's amount is positive.
+        energy: it needs six coordinates.
+        modelled: an amount can be fitted; else it is named from the data alone.
+        acts_on_settings: it changes what an element makes of its setting: nothing without one.
+        calibrates: a file of calibrations may hold it.
+        headline: a short report states how little of it would be seen.
+        usual: looked for, and drawn by the challenge, where nobody says which effects to take.
     """
 
     name: ClassVar[str]
+    words: ClassVar[str]
+    group: ClassVar[Group]
     unit: ClassVar[str]
     sign: ClassVar[str]
     background: ClassVar[float | None] = None
@@ -45,7 +64,20 @@ class Effect(ABC):
     sits_on_text: ClassVar[str]
     power: ClassVar[int] = 1
     discrete: ClassVar[bool] = False
+    forms: ClassVar[Mapping[float, str]] = {}
     curved: ClassVar[bool] = False
+    one_sign: ClassVar[bool] = False
+    energy: ClassVar[bool] = False
+    modelled: ClassVar[bool] = True
+    acts_on_settings: ClassVar[bool] = False
+    calibrates: ClassVar[bool] = False
+    headline: ClassVar[bool] = False
+    usual: ClassVar[bool] = True
+
+    @property
+    def label(self) -> str:
+        """Its name where there is little room."""
+        return self.name.replace("_", " ")
 
     @abstractmethod
     def places(self, ring: Ring) -> list[str | None]:
@@ -63,6 +95,10 @@ class Effect(ABC):
         if self.discrete and cause.amount not in range(int(self.largest) + 1):
             raise EffectError(f"{self.name} is there or not: {self.sign}; not {cause.amount:g}")
         places = self._allowed(ring)
+        if not places:
+            raise EffectError(
+                f"{self.name} has no place in '{ring.name}'; it sits on: {self.sits_on_text}"
+            )
         if None in places:
             if cause.element is not None:
                 raise EffectError(f"{self.name} has no element; leave '{cause.element}' out")
@@ -70,7 +106,12 @@ class Effect(ABC):
         if cause.element is None:
             raise EffectError(f"{self.name} needs an element: {self.sits_on_text}")
         if cause.element.casefold() not in places:
-            kind = ring[cause.element].kind
+            try:
+                kind = ring[cause.element].kind
+            except UnknownNameError:
+                known = dict.fromkeys([p or "" for p in self.places(ring)])
+                known |= dict.fromkeys(element.name for element in ring.elements)
+                raise unknown_name("element", cause.element, known) from None
             raise EffectError(
                 f"{self.name} cannot sit on '{cause.element}', a {kind}; "
                 f"it sits on: {self.sits_on_text}"
@@ -103,14 +144,18 @@ class RingEffect(Effect):
 
     @abstractmethod
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """The element with this much of it more; energy in GeV."""
+        """The element with this much of it more, as the model sees it; energy in GeV."""
+
+    @abstractmethod
+    def build(self, it: Build, amount: float) -> None:
+        """Put it, all causes at the element added up, into what another engine is to build."""
 
 
 class ErrorEffect(RingEffect):
     """An effect that is one of the errors which an element can carry.
 
     Attributes:
-        error: its name in `lattice.ring.Errors`.
+        error: its name in `lattice.ring.Errors`, and in `Build`: dx, dy, roll, kick_x or kick_y.
     """
 
     error: ClassVar[str]
@@ -118,6 +163,30 @@ class ErrorEffect(RingEffect):
     def changed(self, element: Element, amount: float, energy: float) -> Element:
         """The element with this much more of the error."""
         return element.with_errors(**{self.error: amount})
+
+    def build(self, it: Build, amount: float) -> None:
+        """Add to what an engine calls the same."""
+        setattr(it, self.error, getattr(it, self.error) + amount)
+
+
+class ThinKickEffect(RingEffect):
+    """A thin kick that grows with the beam's displacement.
+
+    Attributes:
+        slopes: (d px / dx, d px / dy, d py / dx, d py / dy) of amount 1.
+        where: "entrance" or "middle" of the element.
+    """
+
+    slopes: ClassVar[Slopes]
+    where: ClassVar[Where] = "middle"
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """The element with this much more of the kick."""
+        return element.with_errors(**{self.where: tuple(amount * slope for slope in self.slopes)})
+
+    def build(self, it: Build, amount: float) -> None:
+        """The kick as a matrix."""
+        it.add_slopes(self.where, *(amount * slope for slope in self.slopes))
 
 
 class StrengthEffect(RingEffect):
@@ -136,11 +205,16 @@ class StrengthEffect(RingEffect):
             return element
         return element.changed(**{self.strength: strength * (1 + amount)})
 
+    def build(self, it: Build, amount: float) -> None:
+        """Scale the whole."""
+        it.scale *= 1 + amount
+
 
 class ReadingEffect(Effect):
     """An effect on what one monitor tells."""
 
     sits_on_text: ClassVar[str] = "monitors"
+    group: ClassVar[Group] = "monitors"
 
     def places(self, ring: Ring) -> list[str | None]:
         """All monitors."""
@@ -156,9 +230,16 @@ class ReadingEffect(Effect):
 
 
 class LaunchEffect(Effect):
-    """An effect on the beam at its start."""
+    """An effect on the beam at its start.
+
+    Attributes:
+        shifts: the coordinate of (x, px, y, py, tau, p) to which it adds the amount in every shot;
+            None where it moves no centroid.
+    """
 
     sits_on_text: ClassVar[str] = "the beam"
+    group: ClassVar[Group] = "beam"
+    shifts: ClassVar[int | None] = None
 
     def places(self, ring: Ring) -> list[str | None]:
         """The beam."""
@@ -248,8 +329,13 @@ def find(name: str) -> Effect:
 
 
 def names(chosen: Iterable[str] | None = None) -> list[str]:
-    """Names of the chosen effects, checked, in the catalogue's order; all of them by default."""
+    """Names of the chosen effects, checked, in the catalogue's order; all usual ones by default."""
     if chosen is None:
-        return list(CATALOGUE)
+        return [name for name, effect in CATALOGUE.items() if effect.usual]
     wanted = {find(name).name for name in chosen}
     return [name for name in CATALOGUE if name in wanted]
+
+
+def modelled(chosen: Iterable[str] | None = None) -> list[str]:
+    """Those of `names` whose amount can be fitted."""
+    return [name for name in names(chosen) if CATALOGUE[name].modelled]

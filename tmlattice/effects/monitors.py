@@ -1,5 +1,7 @@
 """What goes wrong with monitors: see `Monitors` for all of it at once."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ Array = NDArray[np.float64]
 
 
 class _Offset(ReadingEffect):
+    headline = True
     unit = "m"
     sign = "reading minus beam"
     background = 2e-4
@@ -31,6 +34,7 @@ class MonitorOffsetX(_Offset):
     """A monitor whose zero is not on the axis, in x."""
 
     name = "monitor_offset_x"
+    words = "horizontal offset of a monitor"
     plane = 0
 
 
@@ -39,10 +43,13 @@ class MonitorOffsetY(_Offset):
     """A monitor whose zero is not on the axis, in y."""
 
     name = "monitor_offset_y"
+    words = "vertical offset of a monitor"
     plane = 1
 
 
 class _Gain(ReadingEffect):
+    headline = True
+    calibrates = True
     unit = "relative"
     sign = "reading = (1 + amount) beam; -2 is a reversed one"
     background = 0.025
@@ -65,6 +72,7 @@ class MonitorGainX(_Gain):
     """A monitor that reads x too large or too small."""
 
     name = "monitor_gain_x"
+    words = "wrong horizontal gain of a monitor"
     plane = 0
 
 
@@ -73,6 +81,7 @@ class MonitorGainY(_Gain):
     """A monitor that reads y too large or too small."""
 
     name = "monitor_gain_y"
+    words = "wrong vertical gain of a monitor"
     plane = 1
 
 
@@ -81,6 +90,8 @@ class MonitorRoll(ReadingEffect):
     """A monitor turned about the beam axis."""
 
     name = "monitor_roll"
+    words = "monitor rolled about the beam axis"
+    calibrates = True
     unit = "rad"
     sign = "x_read = x cos + y sin, y_read = -x sin + y cos"
     background = 5e-3
@@ -101,6 +112,8 @@ class MonitorCoupling(ReadingEffect):
     """A monitor whose electronics mix the planes."""
 
     name = "monitor_coupling"
+    words = "monitor that mixes its planes"
+    calibrates = True
     unit = "relative"
     sign = "x_read += amount y, y_read += amount x"
     background = 5e-3
@@ -120,6 +133,8 @@ class MonitorSwap(ReadingEffect):
     """A monitor whose two planes are exchanged."""
 
     name = "monitor_swap"
+    words = "monitor with its planes exchanged"
+    calibrates = True
     unit = "discrete"
     sign = "1: x and y are exchanged"
     largest = 1.0
@@ -139,6 +154,10 @@ class MonitorDead(ReadingEffect):
     """A monitor without a signal, or one whose reading is frozen."""
 
     name = "monitor_dead"
+    words = "dead monitor"
+    calibrates = True
+    modelled = False
+    forms: ClassVar = {1.0: "no signal", 2.0: "frozen readings"}
     unit = "discrete"
     sign = "1: no signal; 2: frozen at its first reading of the measurement"
     largest = 2.0

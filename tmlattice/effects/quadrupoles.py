@@ -2,11 +2,13 @@
 
 from collections import Counter
 
+from tmlattice.effects.build import Build
 from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
 from tmlattice.lattice import Element, Ring
 
 
 class _OnQuadrupole(RingEffect):
+    group = "quadrupoles"
     sits_on_text = "quadrupoles with k1 not 0"
 
     def sits_on(self, element: Element) -> bool:
@@ -19,6 +21,8 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
     """A quadrupole's strength is not what its setting says."""
 
     name = "quadrupole_gradient"
+    words = "wrong strength of a quadrupole"
+    headline = True
     strength = "k1"
     unit = "relative"
     sign = "k1 becomes (1 + amount) k1"
@@ -27,6 +31,7 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
 
 
 class _Gradient(RingEffect):
+    group = "quadrupoles"
     unit = "1/m"
     largest = 0.03
     sits_on_text = "quadrupoles, skew quadrupoles, sextupoles, wigglers, markers"
@@ -41,8 +46,13 @@ class GradientAbsolute(_Gradient, ErrorEffect):
     """A gradient where the model has none, or more than it has."""
 
     name = "gradient_absolute"
+    words = "focusing error (quadrupole field) in the middle of an element"
     error = "k1l"
     sign = "integrated k1 L, thin, in the middle: px -= amount x, py += amount y"
+
+    def build(self, it: Build, amount: float) -> None:
+        """A thin quadrupole."""
+        it.add_gradient("middle", normal=amount)
 
 
 @register
@@ -50,8 +60,13 @@ class SkewGradient(_Gradient, ErrorEffect):
     """A skew gradient."""
 
     name = "skew_gradient"
+    words = "skew quadrupole field in the middle of an element"
     error = "k1sl"
     sign = "integrated k1s L, thin, in the middle: px += amount y, py += amount x"
+
+    def build(self, it: Build, amount: float) -> None:
+        """A thin skew quadrupole."""
+        it.add_gradient("middle", skew=amount)
 
 
 @register
@@ -59,6 +74,8 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
     """A quadrupole turned about the beam axis."""
 
     name = "quadrupole_roll"
+    words = "quadrupole rolled about the beam axis"
+    headline = True
     error = "roll"
     unit = "rad"
     sign = "positive turns the magnet's x axis towards y"
@@ -71,6 +88,8 @@ class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
     """A quadrupole that stands beside its axis."""
 
     name = "quadrupole_offset_x"
+    words = "quadrupole displaced horizontally"
+    headline = True
     error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
@@ -83,6 +102,8 @@ class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
     """A quadrupole that stands above or below its axis."""
 
     name = "quadrupole_offset_y"
+    words = "quadrupole displaced vertically"
+    headline = True
     error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
@@ -95,6 +116,7 @@ class FamilyGradient(_OnQuadrupole, StrengthEffect):
     """The power supply of a family of quadrupoles is off: all of them have the same error."""
 
     name = "family_gradient"
+    words = "wrong strength of a whole family of quadrupoles"
     strength = "k1"
     unit = "relative"
     sign = "k1 of every member becomes (1 + amount) k1"

@@ -7,7 +7,9 @@ focusing does: k = mean of h^2, and R33 = cos(sqrt(k) L).
 
 import numpy as np
 
-from tmlattice.effects.effect import RingEffect, register
+from tmlattice.effects.build import Build
+from tmlattice.effects.cause import Cause
+from tmlattice.effects.effect import CATALOGUE, RingEffect, register
 from tmlattice.lattice import Element, Ring
 
 C_GAMMA = 8.846e-5
@@ -28,6 +30,9 @@ def expected_loss(element: Element, energy: float) -> float:
 
 
 class _Loss(RingEffect):
+    group = "beam"
+    energy = True
+    one_sign = True
     unit = "scale"
     sign = "0: no loss, 1: the expected loss; adds to what the model has"
     largest = 1.2
@@ -49,12 +54,22 @@ class _Loss(RingEffect):
         """The expected loss times the amount."""
         return element.with_errors(loss=amount * expected_loss(element, energy))
 
+    def build(self, it: Build, amount: float) -> None:
+        """A share of the loss that the engine expects."""
+        it.loss += amount
+
+    @property
+    def label(self) -> str:
+        """Loss in bends, or in wigglers."""
+        return f"loss in {self.kind}s"
+
 
 @register
 class RadiationLossBends(_Loss):
     """Radiation in all bends."""
 
     name = "radiation_loss_bends"
+    words = "energy loss by radiation in the bends"
     kind = "bend"
     sits_on_text = "all bends at once"
 
@@ -64,5 +79,12 @@ class RadiationLossWigglers(_Loss):
     """Radiation in all wigglers."""
 
     name = "radiation_loss_wigglers"
+    words = "energy loss by radiation in the wigglers"
     kind = "wiggler"
     sits_on_text = "all wigglers at once"
+
+
+def expected_radiation(ring: Ring) -> list[Cause]:
+    """All that radiates in a ring, as expected."""
+    losses = [effect for effect in CATALOGUE.values() if isinstance(effect, _Loss)]
+    return [Cause(effect.name, None, 1.0) for effect in losses if effect.places(ring)]

@@ -5,6 +5,7 @@ from tmlattice.lattice import Element
 
 
 class _OnSextupole(RingEffect):
+    group = "sextupoles"
     sits_on_text = "sextupoles with k2 not 0"
 
     def sits_on(self, element: Element) -> bool:
@@ -17,6 +18,8 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
     """A sextupole's strength is not what its setting says."""
 
     name = "sextupole_strength"
+    words = "wrong strength of a sextupole"
+    headline = True
     strength = "k2"
     unit = "relative"
     sign = "k2 becomes (1 + amount) k2; -2 is a reversed one"
@@ -29,6 +32,7 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     """A sextupole that stands beside its axis."""
 
     name = "sextupole_offset_x"
+    words = "sextupole displaced horizontally"
     curved = True  # the field at the offset is quadratic
     error = "dx"
     unit = "m"
@@ -42,6 +46,7 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     """A sextupole that stands above or below its axis."""
 
     name = "sextupole_offset_y"
+    words = "sextupole displaced vertically"
     curved = True  # the field at the offset is quadratic
     error = "dy"
     unit = "m"

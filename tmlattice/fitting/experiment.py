@@ -21,7 +21,7 @@ from tmlattice.lattice import Ring, middle_of_first_arc
 from tmlattice.maps import element_map, ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
-from tmlattice.network.network import NetworkChain
+from tmlattice.network.base import NetworkChain
 from tmlattice.optics import matrix_tunes, one_turn_optics
 
 Array = NDArray[np.float64]

@@ -4,8 +4,8 @@ from enum import StrEnum
 from typing import Any
 
 from tmlattice.fitting.adam import FitResult, fit_adam
-from tmlattice.fitting.prior import fit_map
-from tmlattice.fitting.sparse import fit_sparse
+from tmlattice.fitting.few import fit_sparse
+from tmlattice.fitting.many import fit_map
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
 
@@ -32,8 +32,8 @@ def fine_tune(
         measurement: launches and readings.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
-            (`fitting.prior.fit_map`); "sparse", as few changed magnets as the evidence asks for
-            (`fitting.sparse.fit_sparse`). The last two state the error of their tunes.
+            (`fitting.many.fit_map`); "sparse", as few changed magnets as the evidence asks for
+            (`fitting.few.fit_sparse`). The last two state the error of their tunes.
         options: of the method, see there.
 
     Raises:

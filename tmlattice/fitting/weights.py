@@ -25,121 +25,31 @@ all magnets, of monitors or of the beam.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam import tangents as kernels
 from tmlattice.beam.model import Hypothesis, Model
-from tmlattice.effects import CATALOGUE, RingEffect, directions, names
 from tmlattice.errors import LatticeError, MeasurementError
-from tmlattice.inference.metric import behind
-from tmlattice.inference.newton import Problem, fit
+from tmlattice.fitting.weight_parts import (
+    PARTS,
+    LayerEffects,
+    Split,
+    Trajectories,
+    layer_effects,
+    split,
+    stacked,
+)
 from tmlattice.inference.scan import BLIND
-from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
-from tmlattice.maps import LayerMaps
-from tmlattice.maps.taylor import kronecker_exponents, symplectic_form
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
-from tmlattice.observe.data import of_measurement
-from tmlattice.observe.noise import estimate
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-PARTS = ("physical", "symplectic", "non-symplectic")
-"""Of a change: effects of the catalogue, other symplectic changes, the rest."""
-
-ALIKE = 1e-6
-"""Effects of which others leave less than this share are no directions of their own."""
-
-DEPENDENT = 1e-3
-"""The same for symplectic changes beside effects: an offset of a thick sextupole, in second-order
-maps, is symplectic but for its third order, which is cut."""
-
-UNSEEN = 1e-10
-"""A kick of which launches leave less than this share of information is not seen."""
-
-
-@dataclass(frozen=True)
-class LayerEffects:
-    """The catalogue as directions in the weights of single layers.
-
-    Attributes:
-        ring, dimension: whose.
-        hypotheses: (effect, element).
-        layer: of each, [hypothesis].
-        D0, D1, D2: d weights / d amount, [hypothesis, n], [hypothesis, n, n],
-            [hypothesis, n, n (n + 1) / 2].
-    """
-
-    ring: Ring = field(repr=False)
-    dimension: int
-    hypotheses: tuple[Hypothesis, ...] = field(repr=False)
-    layer: Indices = field(repr=False)
-    D0: Array = field(repr=False)
-    D1: Array = field(repr=False)
-    D2: Array = field(repr=False)
-
-
-def layer_effects(
-    ring: Ring, dimension: int = 4, effects: Sequence[str] | None = None
-) -> LayerEffects:
-    """Directions of all effects that act through one layer and move no read-out.
-
-    Args:
-        ring: the design.
-        dimension: of the network, 4 or 6.
-        effects: names; else the whole catalogue.
-
-    Raises:
-        UnknownNameError: an effect that does not exist.
-    """
-    chosen = [name for name in names(effects) if isinstance(CATALOGUE[name], RingEffect)]
-    if dimension == 4:
-        chosen = [name for name in chosen if not name.startswith("radiation")]
-    asked = [(name, place) for name in chosen for place in CATALOGUE[name].places(ring)]
-    d = directions(LayerMaps(ring, dimension), asked)
-    rows = np.bincount(d.owner, minlength=len(asked))
-    moves = np.isin(np.arange(len(asked)), d.read_owner)
-    kept = ((rows == 1) & ~moves)[d.owner] & (d.layer < len(ring.magnets))
-    return LayerEffects(
-        ring,
-        dimension,
-        tuple(asked[i] for i in d.owner[kept]),
-        d.layer[kept],
-        d.D0[kept],
-        d.D1[kept],
-        d.D2[kept],
-    )
-
-
-@dataclass(frozen=True)
-class Split:
-    """A change of every layer taken apart, over many trajectories of the measured size.
-
-    Attributes:
-        amount, sigma: of every effect, all effects of its layer at once, in its unit; the smallest
-            ones where effects are alike, [hypothesis].
-        parts: norms of the parts, see `PARTS`, in sigma, [layer, 3].
-        freedom: number of directions that each part has, [layer, 3].
-    """
-
-    amount: Array
-    sigma: Array
-    parts: Array
-    freedom: Indices
-
-    @property
-    def shares(self) -> Array:
-        """Of the parts in the squared norm of a layer's change, [layer, 3]; 0 without a change."""
-        squares = self.parts**2
-        whole = squares.sum(axis=1, keepdims=True)
-        return np.asarray(squares / np.where(whole > 0, whole, 1.0))
 
 
 @dataclass(frozen=True)
@@ -297,7 +207,7 @@ def _read(
     if effects.ring is not ring or effects.dimension != n:
         raise ValueError("these effects are of another ring or of other coordinates")
     measurement.states(n)  # says where four coordinates do not do
-    seen = _Trajectories(ring, measurement.select(turns=[0]), n)
+    seen = Trajectories(ring, measurement.select(turns=[0]), n)
     if network is not None:
         change = _change(seen.model, network)
     directions_ = (effects.D0, effects.D1, effects.D2)
@@ -316,7 +226,7 @@ def _read(
         inner = np.einsum("shi,shij,shj->h", kicks, M, own)
         raw = _euclidean(change)
     safe = np.where(visible, norm, 1.0)
-    stacked = _stacked(gradient if network is None else change)
+    rows = stacked(gradient if network is None else change)
     return WeightReading(
         kind="gradient" if network is None else "change",
         ring=ring,
@@ -329,7 +239,7 @@ def _read(
         launches=seen.launches,
         chi2=seen.chi2,
         readings=seen.readings,
-        _take_apart=partial(_split, seen, effects, stacked, network is None),
+        _take_apart=partial(split, seen, effects, rows, network is None),
     )
 
 
@@ -349,203 +259,4 @@ def _change(model: Model, network: TaylorNetwork) -> tuple[Array, Array, Array]:
 
 
 def _euclidean(weights: Sequence[Array]) -> Array:
-    return np.asarray(np.sqrt((_stacked(weights) ** 2).sum(axis=(1, 2))))
-
-
-def _stacked(weights: Sequence[Array]) -> Array:
-    """[layer, n, 1 + n + n (n + 1) / 2] of W0, W1, W2."""
-    return np.concatenate([weights[0][..., None], *weights[1:]], axis=-1)
-
-
-class _Trajectories:
-    """The measured trajectories through the design, and what readings know of kicks on them.
-
-    Attributes:
-        states: at every exit, [shot, layer + 2, n].
-        whole, information: of the readings on a kick at a layer's exit, before and after the
-            launch is projected out, [shot, layer, n, n].
-        pull: -d (chi-square / 2) / d kick, [shot, layer, n].
-        launches, chi2, readings: see `WeightReading`.
-    """
-
-    def __init__(self, ring: Ring, measurement: Measurement, n: int) -> None:
-        data = of_measurement(ring, measurement)
-        launch_sigma = data.launch_sigma.copy()
-        if n == 4:
-            launch_sigma[:, 4] = 0.0
-        data = replace(data, launch_sigma=launch_sigma)
-        self.model = model = Model(ring, data.settings, dimension=n)
-        if not np.isfinite(data.sigma[data.valid]).all():
-            rough = data.with_sigma(np.array([1e-4, 1e-4]))
-            first = fit(Problem(model, rough, Whitening(rough), {}), (), data.launches)
-            noise = estimate(data, first.paths)
-            if not (noise > 0).all():
-                raise MeasurementError(
-                    "the noise of the readings is not given and cannot be estimated from so few; "
-                    "give it"
-                )
-            data = data.with_sigma(noise)
-        whitening = Whitening(data)
-        found = fit(Problem(model, data, whitening, {}), (), data.launches)
-        self.launches, self.chi2 = found.launches, found.chi2
-        self.readings = int(data.valid.sum())
-        paths = found.paths
-        self.states = np.ascontiguousarray(paths.states)
-
-        shots, count = data.shots, len(model.at)
-        G = (paths.beam_launch * whitening.weight[..., None]).reshape(shots, count, 2, n)
-        Q = found.projection.Q[:, :-5].reshape(shots, count, 2, -1)
-        clean = found.projection.out(found.residual).reshape(shots, -1)[:, :-5]
-        clean = clean.reshape(shots, count, 2)
-        # of a change of the launch that only the monitors from each one on see
-        H = behind(np.einsum("smpi,smpj->smij", G, G))
-        K = behind(np.einsum("smpi,smpq->smiq", G, Q))
-        g = behind(np.einsum("smpi,smp->smi", G, clean))
-        layers = len(model.maps.layers)
-        start = model.maps.start[1 : layers + 1]
-        back = np.linalg.inv(paths.tangents[:, 1 : layers + 1])  # kick -> change of the launch
-        forth = back.swapaxes(-1, -2)
-        H, K, g = H[:, start], K[:, start], g[:, start]
-        self.whole = forth @ H @ back
-        self.information = forth @ (H - K @ K.swapaxes(-1, -2)) @ back
-        self.pull = np.einsum("skij,skj->ski", forth, g)
-
-    def kicks(self, layer: Indices, weights: Sequence[Array]) -> Array:
-        """At the exits of layers, by weights' rows, along the trajectories, [shot, row, n]."""
-        out = np.empty((len(self.states), 1, len(layer), self.states.shape[2]))
-        D0, D1, D2 = (np.ascontiguousarray(w) for w in weights)
-        kernels.kicks(layer, D0, D1, D2, self.states, self.states.shape[1] - 1, out)
-        return out[:, 0]
-
-    def gradient(self) -> tuple[Array, Array, Array]:
-        """d (chi-square / 2) / d weights of every layer, launch fitted."""
-        x = self.states[:, : self.pull.shape[1]]
-        i, j = np.triu_indices(x.shape[2])
-        return (
-            -self.pull.sum(axis=0),
-            -np.einsum("ski,skj->kij", self.pull, x),
-            -np.einsum("ski,skj->kij", self.pull, x[..., i] * x[..., j]),
-        )
-
-    def ensemble(self) -> Array:
-        """A root of the second moments of (1, x, x^[2]), [P, P]: root root^T."""
-        n = self.states.shape[2]
-        rms = np.sqrt((self.states**2).mean(axis=(0, 1)))
-        i, j = np.triu_indices(n)
-        eye = np.eye(n)
-        moments = np.zeros((1 + n + len(i),) * 2)
-        moments[0, 0] = 1.0
-        moments[1 : 1 + n, 1 : 1 + n] = eye
-        moments[0, 1 + n :] = moments[1 + n :, 0] = eye[i, j]
-        moments[1 + n :, 1 + n :] = (  # of four Gaussian numbers, pair by pair
-            np.outer(eye[i, j], eye[i, j])
-            + eye[np.ix_(i, i)] * eye[np.ix_(j, j)]
-            + eye[np.ix_(i, j)] * eye[np.ix_(j, i)]
-        )
-        scale = np.concatenate([[1.0], rms, rms[i] * rms[j]])
-        return np.asarray(scale[:, None] * np.linalg.cholesky(moments))
-
-    def roots(self) -> Array:
-        """A root of the information on a kick at each exit, all shots, [layer, n, n]: root root^T;
-        zero along what is not seen."""
-        whole, information = self.whole.sum(axis=0), self.information.sum(axis=0)
-        size = np.sqrt(np.einsum("kii->ki", whole))
-        safe = np.where(size > 0, size, 1.0)
-        values, vectors = np.linalg.eigh(information / safe[:, :, None] / safe[:, None])
-        values = np.where(values > UNSEEN, values, 0.0)
-        return np.asarray(size[:, :, None] * vectors * np.sqrt(values)[:, None])
-
-
-def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
-    """Changes of a layer that keep it symplectic to second order.
-
-    The layer is followed by the flow of a polynomial H of degree 1, 2 or 3: d image = S grad H at
-    the image, truncated at second order.
-
-    Args:
-        W0, W1, W2: one layer, [n], [n, n], [n, n (n + 1) / 2].
-
-    Returns:
-        A row for each monomial of H, [generator, n, 1 + n + n (n + 1) / 2]: changes of W0, W1, W2
-        side by side. They are independent where W1 is regular.
-    """
-    n = len(W0)
-    i, j = np.triu_indices(n)
-    pair = np.empty((n, n), dtype=np.intp)
-    pair[i, j] = pair[j, i] = np.arange(len(i))
-    # the image's monomials 1, z, z^[2] as polynomials of x, truncated
-    image = np.concatenate([W0[:, None], W1, W2], axis=1)
-    products = np.zeros((len(i), image.shape[1]))
-    products[:, 0] = W0[i] * W0[j]
-    products[:, 1 : 1 + n] = W0[i, None] * W1[j] + W0[j, None] * W1[i]
-    products[:, 1 + n :] = W0[i, None] * W2[j] + W0[j, None] * W2[i]
-    for a in range(n):
-        for b in range(n):
-            products[:, 1 + n + pair[a, b]] += W1[i, a] * W1[j, b]
-    one = np.zeros((1, image.shape[1]))
-    one[0, 0] = 1.0
-    monomials = np.concatenate([one, image, products])
-    index = {e: m for m, e in enumerate(e for d in range(3) for e in kronecker_exponents(n, d))}
-    form = symplectic_form(n)
-    found = []
-    for degree in (1, 2, 3):
-        for exponents in kronecker_exponents(n, degree):
-            slope = np.zeros((n, image.shape[1]))  # grad H
-            for v in range(n):
-                if exponents[v]:
-                    lower = tuple(e - (u == v) for u, e in enumerate(exponents))
-                    slope[v] = exponents[v] * monomials[index[lower]]
-            found.append(form @ slope)
-    return np.array(found)
-
-
-def _split(seen: _Trajectories, effects: LayerEffects, weights: Array, gradient: bool) -> Split:
-    """Effects, other symplectic changes, the rest.
-
-    Args:
-        weights: change, or gradient, [layer, n, P].
-        gradient: whether it is one.
-    """
-    maps = seen.model.maps
-    kicked, trajectory = seen.roots(), seen.ensemble()
-    rows = _stacked((effects.D0, effects.D1, effects.D2))
-    together, sigma = np.zeros(len(rows)), np.full(len(rows), np.inf)
-    parts, freedom = np.zeros((len(weights), 3)), np.zeros((len(weights), 3), dtype=np.int64)
-    order = np.argsort(effects.layer, kind="stable")
-    first = np.searchsorted(effects.layer[order], np.arange(len(weights) + 1))
-    for k in np.flatnonzero(kicked.any(axis=(1, 2))):
-        left, right = kicked[k].T, trajectory  # change -> root^T change root: sigma
-
-        def sized(change: Array, left: Array = left, right: Array = right) -> Array:
-            return np.asarray(left @ change @ right).reshape(*change.shape[:-2], -1)
-
-        if gradient:  # the step -information^-1 gradient
-            step = np.linalg.pinv(left).T @ -weights[k] @ np.linalg.pinv(right).T
-            vector = step.reshape(-1)
-        else:
-            vector = sized(weights[k])
-        own = order[first[k] : first[k + 1]]
-        columns = sized(rows[own]).T
-        size = np.linalg.norm(columns, axis=0)
-        unit = columns / np.where(size > 0, size, 1.0)
-        U, values, V = np.linalg.svd(unit, full_matrices=False)
-        kept = values > ALIKE
-        physical = U[:, kept]
-        inside = physical.T @ vector
-        size = np.where(size > 0, size, np.inf)
-        inverse = V[kept].T / values[kept]
-        together[own] = inverse @ inside / size
-        sigma[own] = np.where(size < np.inf, np.linalg.norm(inverse, axis=1) / size, np.inf)
-        other = sized(symplectic_directions(maps.W0[k], maps.W1[k], maps.W2[k])).T
-        size = np.linalg.norm(other, axis=0)
-        other = other[:, size > 0] / size[size > 0]
-        other -= physical @ (physical.T @ other)
-        U, values, _ = np.linalg.svd(other, full_matrices=False)
-        symplectic = U[:, values > DEPENDENT]
-        along = symplectic.T @ vector
-        rest = vector - physical @ inside - symplectic @ along
-        parts[k] = [np.linalg.norm(part) for part in (inside, along, rest)]
-        seen_weights = np.linalg.matrix_rank(left) * np.linalg.matrix_rank(right)
-        freedom[k, :2] = physical.shape[1], symplectic.shape[1]
-        freedom[k, 2] = seen_weights - freedom[k, :2].sum()
-    return Split(together, sigma, parts, freedom)
+    return np.asarray(np.sqrt((stacked(weights) ** 2).sum(axis=(1, 2))))

@@ -1,31 +1,24 @@
-"""Products of signatures with data and with one another, launches projected out.
+"""Products of signatures with data and with one another, nuisances projected out.
 
-A scan needs no signature itself, only its square and its products with data. Most signatures are a
-launch's own from a reading on (a single kick), or live at one monitor (an effect on readings): sums
-over the readings behind each, taken once, give all their products. The others are made in chunks.
-Two kinds of noise have two ways to do this: readings that are independent, and readings that a
-background of small errors correlates over all shots.
+A scan needs no signature itself, only its square and its products with data. A kind of measurement
+says what the signatures are (`rows`), and may know quicker ways for some of them (`quick`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Hypothesis, Model, Paths
-from tmlattice.effects import ReadingEffect, find
-from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Hypothesis = tuple[str, str | None]
+"""An effect and the place where it might sit."""
 
 CHUNK = 512
 """Hypotheses at a time: the memory of a scan does not grow with their number."""
-
-KICKS = 128
-"""Layers at a time, of free kicks."""
 
 
 @dataclass(frozen=True)
@@ -52,314 +45,47 @@ class Products:
         self.whole[at], self.inside[at], self.inner[at] = whole, inside, inner
 
 
-def behind(values: Array) -> Array:
-    """Sums over all readings from each one on, [shot, reading, ...] -> [shot, reading + 1, ...]."""
-    zero = np.zeros_like(values[:, :1])
-    return np.concatenate([np.cumsum(values[:, ::-1], axis=1)[:, ::-1], zero], axis=1)
-
-
 class Metric:
-    """Products about one set of trajectories; this one makes every signature.
+    """Products about one point; this one makes every signature.
 
     Args:
-        model, paths: the base.
-        whitening, projection: of the data, and of the launches.
-        active: shots in which a cause would be there, [shot].
+        projection: of the nuisances.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        paths: Paths,
-        whitening: Whitening,
-        projection: Projection,
-        active: NDArray[np.bool_],
-    ) -> None:
-        self.model, self.paths = model, paths
-        self.whitening, self.projection = whitening, projection
-        self.active = active
-        self.shots = np.flatnonzero(active)
-        self.weight = whitening.weight * active[:, None, None]
+    def __init__(self, projection: Projection) -> None:
+        self.projection = projection
 
-    # --- named hypotheses -----------------------------------------------------------------------
-    def products(self, hypotheses: Sequence[Hypothesis], launches: Array, data: Array) -> Products:
-        """Of every hypothesis.
+    def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
+        """Whitened signatures, d rows / d amount ** power, [hypothesis, row]; of what is discrete
+        the change when it is there."""
+        raise NotImplementedError
 
-        Args:
-            hypotheses: see `Model.hypotheses`.
-            launches: those of the trajectories.
-            data: whitened rows, launches projected out, [data, row].
-        """
+    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
+        """Put in what needs no signature; returns which of the hypotheses these are."""
+        return np.zeros(0, dtype=np.intp)
+
+    def products(self, hypotheses: Sequence[Hypothesis], data: Array) -> Products:
+        """Of every hypothesis with itself and with data, [data, row], nuisances projected out."""
         found = Products.empty(len(hypotheses), len(data))
         rest = np.ones(len(hypotheses), dtype=bool)
-        for done in (self.kicks(hypotheses, data, found), self.readings(hypotheses, data, found)):
-            rest[done] = False
+        rest[self.quick(hypotheses, data, found)] = False
         left = np.flatnonzero(rest)
         for start in range(0, len(left), CHUNK):
             part = left[start : start + CHUNK]
-            some = [hypotheses[i] for i in part]
-            signatures = np.nan_to_num(self.model.signatures(self.paths, some, launches))
-            rows = self.whitening.signature(signatures * self.active[:, None, None])
+            rows = self.rows([hypotheses[i] for i in part])
             whole = np.einsum("hr,hr->h", rows, rows)
             found.put(part, whole, self.projection.inside(rows), rows @ data.T)
         return found
 
-    def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in what is a single kick; returns which of the hypotheses these are."""
-        return np.zeros(0, dtype=np.intp)
-
-    def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in what acts on readings; returns which of the hypotheses these are."""
-        return np.zeros(0, dtype=np.intp)
-
-    def _on_readings(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Indices, Indices]]:
-        """By effect on readings: which of the hypotheses, and at which monitors."""
-        monitor = {name: m for m, name in enumerate(self.model.maps.monitors)}
-        members: dict[str, list[tuple[int, int]]] = {}
-        for i, (name, place) in enumerate(hypotheses):
-            if place is not None and isinstance(find(name), ReadingEffect):
-                members.setdefault(name, []).append((i, monitor[place]))
-        return {
-            name: (np.array([i for i, _ in some]), np.array([m for _, m in some]))
-            for name, some in members.items()
-        }
-
-    def _changed_readings(self, name: str) -> Array:
-        """d readings / d amount of an effect at every monitor, [shot, reading, 2]."""
-        effect = find(name)
-        assert isinstance(effect, ReadingEffect)
-        h = 1.0 if effect.discrete else 1e-6
-        return np.asarray(np.nan_to_num(effect.change(self.paths.beam, h) / h))
-
-    # --- what has no name -----------------------------------------------------------------------
-    def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
-        """Information of a kick (px, py) in every active shot in the middle of layers' magnets, and
-        its product with data.
+    def free_kicks(self, places: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+        """Information of a free kick at places, and its product with data.
 
         Returns:
-            [layer, block, p, p] and [layer, block, p]; parameters of different blocks are
+            [place, block, p, p] and [place, block, p]; parameters of different blocks are
             independent.
         """
-        grams, inners = [], []
-        for start in range(0, len(layers), KICKS):
-            rows, parts = self._free_rows(layers[start : start + KICKS], clean)
-            grams.append(np.einsum("kbpr,kbqr->kbpq", rows, rows, optimize=True))
-            inners.append(np.einsum("kbpr,br->kbp", rows, parts, optimize=True))
-        return np.concatenate(grams), np.concatenate(inners)
-
-    def _free_rows(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
-        """Whitened signatures of free kicks [layer, block, p, row], and data [block, row]."""
-        kicked = self.model.kick_signatures(self.paths, layers)
-        alone = np.zeros((len(kicked), len(self.shots), *kicked.shape[1:]))
-        for i, shot in enumerate(self.shots):
-            alone[:, i, :, shot] = kicked[:, :, shot]
-        rows = self.projection.out(self.whitening.signature(alone))
-        return rows.reshape(len(kicked), 1, -1, len(clean)), clean[None]
+        raise NotImplementedError
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """The same for all readings of a monitor, in every active shot and turn, [monitor, ...]."""
-        precision = self.whitening.projected_precision(self.projection)
-        data = self.whitening.back(clean.reshape(self.whitening.shots, -1)[:, :-5])
-        monitors, weight = len(self.model.at), self.whitening.weight
-        flat = np.arange(weight.size).reshape(weight.shape)
-        grams, inners = [], []
-        for m in range(monitors):
-            own = flat[self.shots][:, m::monitors].ravel()
-            scale = weight.ravel()[own]
-            grams.append((scale[:, None] * precision[np.ix_(own, own)] * scale)[None])
-            inners.append(data.ravel()[own][None])
-        return np.stack(grams), np.stack(inners)
-
-
-class IndependentMetric(Metric):
-    """Where every reading has a noise of its own."""
-
-    @cached_property
-    def _slopes(self) -> Array:
-        """d readings / d launch in units of the noise, [shot, reading, 2, n]."""
-        return np.asarray(self.whitening.weight[..., None] * self.model.slopes(self.paths))
-
-    @cached_property
-    def _known(self) -> Array:
-        """The launches' directions in the readings, [shot, reading, 2, direction]."""
-        shots, readings = self.weight.shape[:2]
-        return self.projection.Q[:, :-5].reshape(shots, readings, 2, -1)
-
-    def _rows(self, data: Array) -> Array:
-        """Data without the launches' rows, [data, shot, reading, 2]."""
-        shots, readings = self.weight.shape[:2]
-        return data.reshape(len(data), shots, -1)[:, :, :-5].reshape(-1, shots, readings, 2)
-
-    def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Sums over the readings behind each monitor give every product."""
-        which, start, pulled = self.model.single_kicks(self.paths, hypotheses)
-        if not len(which):
-            return which
-        pulled = pulled * self.active[:, None, None]
-        slopes = self._slopes
-        gram = behind(np.einsum("smpi,smpj->smij", slopes, slopes, optimize=True))
-        along = behind(np.einsum("smpi,smpq->smiq", slopes, self._known, optimize=True))
-        whole = np.einsum("ski,skij,skj->k", pulled, gram[:, start], pulled, optimize=True)
-        inside = np.einsum("ski,skiq->skq", pulled, along[:, start], optimize=True)
-        inner = np.empty((len(which), len(data)))
-        for d, row in enumerate(self._rows(data)):
-            sums = behind(np.einsum("smpi,smp->smi", slopes, row))
-            inner[:, d] = np.einsum("ski,ski->k", pulled, sums[:, start])
-        found.put(which, whole, np.einsum("skq,skq->k", inside, inside), inner)
-        return which
-
-    def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """A signature lives in the readings of one monitor."""
-        shape = (len(self.active), self.model.turns, len(self.model.at), 2)
-        Q, rows = self._known.reshape(*shape, -1), self._rows(data).reshape(-1, *shape)
-        done = [np.zeros(0, dtype=np.intp)]
-        for name, (which, at) in self._on_readings(hypotheses).items():
-            change = (self.weight * self._changed_readings(name)).reshape(shape)
-            along = np.einsum("stmp,stmpq->smq", change, Q, optimize=True)
-            found.put(
-                which,
-                np.einsum("stmp,stmp->m", change, change)[at],
-                np.einsum("smq,smq->m", along, along)[at],
-                np.einsum("stmp,dstmp->md", change, rows, optimize=True)[at],
-            )
-            done.append(which)
-        return np.concatenate(done)
-
-    def _free_rows(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
-        """A kick reaches the rows of its own shot alone: shots are the blocks."""
-        kicked = self.model.kick_signatures(self.paths, layers)
-        rows = self.projection.out(self.whitening.signature(kicked))
-        by_shot = rows.reshape(len(kicked), 2, len(self.active), -1).swapaxes(1, 2)
-        return by_shot[:, self.shots], clean.reshape(len(self.active), -1)[self.shots]
-
-    def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Blocks are shots: a monitor's rows there, less what the launch's directions have."""
-        monitors, count = len(self.model.at), len(self.active)
-        rows = np.arange(self.weight[0].size).reshape(self.model.turns, monitors, 2)
-        at = rows.swapaxes(0, 1).reshape(monitors, -1)  # [monitor, turn * plane]
-        weight = self.whitening.weight.reshape(count, -1)[self.shots][:, at]
-        Q = self.projection.Q[self.shots][:, at]  # [shot, monitor, p, direction]
-        gram = np.eye(at.shape[1]) - np.einsum("smpd,smqd->smpq", Q, Q)
-        gram = weight[..., :, None] * gram * weight[..., None, :]
-        inner = weight * clean.reshape(count, -1)[self.shots][:, at]
-        return gram.swapaxes(0, 1), inner.swapaxes(0, 1)
-
-
-class DenseMetric(Metric):
-    """Where a background correlates all readings of all shots, of one turn.
-
-    Readings stand monitor by monitor. The launches' signatures behind each monitor have a Gram
-    matrix that grows by that monitor's rows: all of them cost one product of the precision with
-    the slopes.
-    """
-
-    @cached_property
-    def _precision(self) -> Array:
-        """Less what launches explain, in units of the noise, [monitor shot plane, the same]."""
-        order = np.arange(self.weight.size).reshape(self.weight.shape).swapaxes(0, 1).ravel()
-        precision = self.whitening.projected_precision(self.projection)
-        return precision[np.ix_(order, order)]
-
-    def _block(self, m: int) -> Array:
-        """That of one monitor's readings, [shot plane, shot plane]."""
-        own = slice(2 * len(self.active) * m, 2 * len(self.active) * (m + 1))
-        return np.asarray(self._precision[own, own])
-
-    def _data(self, rows: Array) -> Array:
-        """Precision times data, for products with signatures: [data, shot, reading, 2]."""
-        parts = rows.reshape(len(rows), len(self.active), -1)[:, :, :-5]
-        return self.whitening.back(parts) * (self.weight > 0)
-
-    @cached_property
-    def _slopes(self) -> Array:
-        """d readings / d launch, [shot, reading, 2, n]."""
-        return self.model.slopes(self.paths)
-
-    @cached_property
-    def _grams(self) -> Array:
-        """Of the launches' signatures from each reading on, [reading + 1, shot n, shot n]."""
-        slopes = self.weight[..., None] * self._slopes
-        shots, monitors, _, n = slopes.shape
-        spread = np.zeros((monitors, shots, 2, shots, n))
-        for shot in range(shots):
-            spread[:, shot, :, shot] = slopes[shot]
-        H = spread.reshape(monitors, 2 * shots, shots * n)
-        rows = H.reshape(-1, shots * n)
-        grams = np.zeros((monitors + 1, shots * n, shots * n))
-        for m in range(monitors - 1, -1, -1):
-            own = slice(2 * shots * m, 2 * shots * (m + 1))
-            rest = slice(2 * shots * (m + 1), None)
-            cross = H[m].T @ (self._precision[own, rest] @ rows[rest])
-            grams[m] = grams[m + 1] + cross + cross.T + H[m].T @ self._block(m) @ H[m]
-        return grams
-
-    def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """A kick's change of the launch, between the Gram matrices of what lies behind."""
-        which, start, pulled = self.model.single_kicks(self.paths, hypotheses)
-        if not len(which):
-            return which
-        stacked = np.moveaxis(pulled, 0, 1).reshape(len(which), -1)  # [kick, shot n]
-        whole = np.empty(len(which))
-        for m in np.unique(start):
-            at = start == m
-            whole[at] = np.einsum("ki,ij,kj->k", stacked[at], self._grams[m], stacked[at])
-        inner = np.empty((len(which), len(data)))
-        for d, row in enumerate(self._data(data)):
-            sums = behind(np.einsum("smpi,smp->smi", self._slopes, row))
-            inner[:, d] = np.einsum("ski,ski->k", pulled, sums[:, start])
-        found.put(which, whole, 0.0, inner)
-        return which
-
-    def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """One monitor's block of the precision."""
-        rows = self._data(data)
-        done = [np.zeros(0, dtype=np.intp)]
-        for name, (which, at) in self._on_readings(hypotheses).items():
-            change = self._changed_readings(name)
-            weighted = self.weight * change
-            whole = np.array([weighted[:, m].ravel() @ self._block(m) @ weighted[:, m].ravel()
-                              for m in at])  # fmt: skip
-            found.put(which, whole, 0.0, np.einsum("smp,dsmp->md", change, rows)[at])
-            done.append(which)
-        return np.concatenate(done)
-
-    def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
-        """One block for all shots: the background correlates them."""
-        first, pulled = self.model.free_kicks(self.paths, layers)  # [layer, 2, shot, n]
-        sums = behind(np.einsum("smpi,smp->smi", self._slopes, self._data(clean[None])[0]))
-        size = 2 * len(self.shots)
-        gram, inner = np.empty((len(layers), 1, size, size)), np.empty((len(layers), 1, size))
-        for k, m in enumerate(first):
-            alone = np.zeros((len(self.shots), 2, len(self.active), pulled.shape[3]))
-            for i, shot in enumerate(self.shots):
-                alone[i, :, shot] = pulled[k, :, shot]
-            flat = alone.reshape(size, -1)
-            gram[k, 0] = flat @ self._grams[m] @ flat.T
-            inner[k, 0] = flat @ sums[:, m].ravel()
-        return gram, inner
-
-    def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """The blocks of the active shots' readings."""
-        data = self._data(clean[None])[0]
-        monitors = self.weight.shape[1]
-        size = 2 * len(self.shots)
-        scale = self.weight.swapaxes(0, 1)[:, self.shots].reshape(monitors, size)
-        blocks = np.stack([self._block(m) for m in range(monitors)])
-        own = (2 * self.shots[:, None] + np.arange(2)).ravel()
-        gram = scale[:, :, None] * blocks[:, own][:, :, own] * scale[:, None, :]
-        inner = data[self.shots].swapaxes(0, 1).reshape(monitors, size)
-        return gram[:, None], inner[:, None]
-
-
-def metric(
-    model: Model,
-    paths: Paths,
-    whitening: Whitening,
-    projection: Projection,
-    active: NDArray[np.bool_],
-) -> Metric:
-    """The quickest metric for this noise: see `Metric` for the arguments."""
-    if not whitening.dense:
-        return IndependentMetric(model, paths, whitening, projection, active)
-    kind = DenseMetric if model.turns == 1 else Metric
-    return kind(model, paths, whitening, projection, active)
+        """The same for all readings of a monitor, [monitor, ...]."""
+        raise NotImplementedError

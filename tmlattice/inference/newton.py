@@ -1,79 +1,58 @@
-"""Causes, free kicks and launches fitted together through the full nonlinear model.
+"""Causes, free kicks and nuisances fitted together through the full nonlinear model.
 
-Gauss and Newton on amounts and launches; the launches are eliminated by projection, a step that
-makes things worse is halved. The evidence of a set of causes weighs its misfit against what it
-assumes: amounts are spread evenly over their logarithm up to the largest fault, so that the cost of
-an amount is that of its relative error, whatever the effect.
+Gauss and Newton on amounts; the nuisances are eliminated by projection, a step that makes things
+worse is halved. The evidence of a set of causes weighs its misfit against what it assumes.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Hypothesis, Kicks, Model, Paths
 from tmlattice.effects import Cause, find
+from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.scan import evidence_of_scale
-from tmlattice.inference.whitening import Projection, Whitening
-from tmlattice.observe.data import Data
+from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 
-DECADES = 4.0
-"""Amounts of a fault reach from its largest down by so many powers of ten."""
-
-SAME = 0.02
-"""A slope is good while amount and orbit change by no more than this share."""
-
-UNKNOWN = 0.05
-"""Prior share of faults that the catalogue does not hold."""
+SHRINK = (1.0, 0.5, 0.25, 0.0625)
+"""Shares of a step that are tried, until one makes things better."""
 
 
-@dataclass(frozen=True)
-class Problem:
-    """What a fit needs and does not change.
+class Outcome(StrEnum):
+    """How a fit ended; all but the first are told to whoever reads the result."""
 
-    Attributes:
-        model: the ring with what is known.
-        data: readings.
-        whitening: their noise.
-        places: number of places of each effect, for the prior.
-        fixed: causes that are there and are not fitted.
-    """
-
-    model: Model
-    data: Data
-    whitening: Whitening
-    places: Mapping[str, int]
-    fixed: tuple[Cause, ...] = ()
-
-    def prior(self, hypothesis: Hypothesis) -> float:
-        """Log probability of one effect at one place, before the data."""
-        count = len(self.places) * self.places.get(hypothesis[0], 1)
-        return float(np.log((1 - UNKNOWN) / count))
-
-    def unknown_prior(self, places: int) -> float:
-        """The same for something unknown at one of so many places."""
-        return float(np.log(UNKNOWN / 2 / places))
+    CONVERGED = "converged"
+    STEPS = "the fit ran out of steps while it still gained: allow more"
+    STUCK = "no step along the slopes helped: the model is too curved here, or its slopes are wrong"
+    GIVEN_UP = "given up: its rivals explain far more"
+    SINGULAR = "the amounts cannot be told apart by these readings"
+    LOST = "the model has no answer there"
 
 
 @dataclass(frozen=True)
 class Slope:
     """d rows / d amount of one cause, [row], and where it was taken: at which amount, and with
-    which orbit, [shot, reading, 2], m."""
+    which orbit."""
 
     row: Array
     amount: float
-    beam: Array
+    orbit: Array
 
-    def holds(self, amount: float, beam: Array) -> bool:
-        """Whether amount and orbit are still nearly the same."""
-        if abs(amount - self.amount) > SAME * abs(amount):
+    def holds(self, amount: float, orbit: Array, same: float) -> bool:
+        """Whether amount and orbit are still the same within a share."""
+        if abs(amount - self.amount) > same * abs(amount):
             return False
-        if beam is self.beam:
+        if orbit is self.orbit:
             return True
-        return bool(np.linalg.norm(beam - self.beam) <= SAME * np.linalg.norm(beam))
+        return bool(np.linalg.norm(orbit - self.orbit) <= same * np.linalg.norm(orbit))
+
+
+Slopes = Mapping[Hypothesis, Slope]
+NO_SLOPES: Slopes = {}
 
 
 @dataclass(frozen=True)
@@ -81,232 +60,226 @@ class Fit:
     """Causes with their best amounts, and what they leave.
 
     Attributes:
-        causes: named, with amounts.
-        kicks: free ones by layer, [shot, 2], rad.
-        launches: [shot, 5].
-        paths: of the fitted model.
-        residual: whitened rows.
-        projection: of the launches.
-        chi2: residual squared, prior rows included.
-        information: of the amounts, launches eliminated, [cause, cause]; discrete ones left out.
-        covariance: of the amounts, [cause, cause]; zero for discrete ones.
-        log_evidence: up to a constant of the data.
-        converged: false where the last step was still significant.
+        point: the model there.
+        covariance: of the amounts, nuisances and kicks eliminated, [cause, cause]; zero for
+            discrete ones.
+        log_evidence: up to a constant of the data; -inf where the fit failed.
+        outcome: how it ended.
         slopes: of the causes that are not discrete, by cause.
     """
 
-    causes: tuple[Cause, ...]
-    kicks: Kicks
-    launches: Array
-    paths: Paths = field(repr=False)
-    residual: Array = field(repr=False)
-    projection: Projection = field(repr=False)
-    chi2: float
+    point: Point
     covariance: Array
     log_evidence: float
-    converged: bool
-    slopes: Mapping[Hypothesis, Slope] = field(default_factory=dict, repr=False)
+    outcome: Outcome
+    slopes: Slopes = field(default_factory=dict, repr=False)
 
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """With their amounts."""
+        return self.point.causes
 
-def amount_prior(cause: Cause) -> float:
-    """Log density of an amount: even in log |amount| up to the largest fault, thin beyond."""
-    effect = find(cause.effect)
-    if effect.discrete:
-        return 0.0
-    size = max(abs(cause.amount), 1e-300)
-    density = -np.log(2 * size * DECADES * np.log(10))
-    if size > effect.largest:
-        density -= 8 * np.log(size / effect.largest)
-    return float(density)
+    @property
+    def kicks(self) -> Kicks:
+        """Free ones, by place."""
+        return self.point.kicks
+
+    @property
+    def nuisances(self) -> Array:
+        """As fitted."""
+        return self.point.nuisances
+
+    @property
+    def residual(self) -> Array:
+        """Whitened rows."""
+        return self.point.residual
+
+    @property
+    def projection(self) -> Projection:
+        """Of the nuisances."""
+        assert self.point.projection is not None, self.point.lost
+        return self.point.projection
+
+    @property
+    def clean(self) -> Array:
+        """What is left, nuisances projected out, [row]."""
+        return self.projection.out(self.residual)
+
+    @property
+    def chi2(self) -> float:
+        """Residual squared, the rows of what is known of the nuisances included."""
+        return self.point.chi2
+
+    @property
+    def good(self) -> bool:
+        """Whether amounts, errors and evidence mean something."""
+        return self.outcome in (Outcome.CONVERGED, Outcome.STEPS, Outcome.STUCK)
 
 
 def fit(
     problem: Problem,
     causes: Sequence[Cause],
-    launches: Array,
-    kicks: Kicks | None = None,
+    nuisances: Array,
+    kicks: Kicks = NO_KICKS,
     *,
     steps: int = 8,
+    tolerance: float = 0.02,
     hopeless: float = -np.inf,
-    slopes: Mapping[Hypothesis, Slope] | None = None,
+    slopes: Slopes = NO_SLOPES,
 ) -> Fit:
-    """The best amounts of these causes, the best free kicks, and the best launches.
+    """The best amounts of these causes, the best free kicks, and the best nuisances.
 
     Args:
         problem: model and data.
         causes: with first guesses of their amounts; discrete ones are taken as they are.
-        launches: first guess, [shot, 5].
-        kicks: free ones by layer, with first guesses.
+        nuisances: first guess.
+        kicks: free ones by place, with first guesses.
         steps: at most.
+        tolerance: of chi-square, at which no further step is made.
         hopeless: give up where the evidence stays far below this after two steps.
         slopes: of an earlier fit of the same problem: those that still hold are not taken again.
     """
-    causes, kicks = tuple(causes), dict(kicks or {})
-    state = _evaluate(problem, causes, kicks, launches)
-    if not np.isfinite(state.chi2):  # a first guess that loses the beam: start small
-        causes = tuple(
+    point = problem.at(causes, nuisances, kicks)
+    if point.lost:  # a first guess that the model cannot follow: start small
+        small = [
             c if find(c.effect).discrete else replace(c, amount=0.1 * c.amount) for c in causes
-        )
-        state = _evaluate(problem, causes, {k: 0.1 * v for k, v in kicks.items()}, launches)
-    if not np.isfinite(state.chi2):
-        return replace(state, covariance=np.zeros((len(causes), len(causes))))
-    converged = False
-    state = replace(state, slopes=dict(slopes or {}))
-    state, rows = _with_slopes(problem, state)
+        ]
+        point = problem.at(small, nuisances, {k: 0.1 * v for k, v in kicks.items()})
+    if point.lost:
+        return Fit(point, np.zeros((len(causes),) * 2), -np.inf, Outcome.LOST)
+    outcome = Outcome.STEPS
+    slopes, rows = _with_slopes(problem, point, slopes)
+    now = _cost(problem, point)
     for step in range(steps):
-        change, moved, promised = _step(problem, state, rows)
-        best = None
-        for shrink in (1.0, 0.5, 0.25, 0.0625):
-            trial = _moved(problem, state, shrink * change, shrink * moved)
-            trial = replace(trial, slopes=state.slopes)
-            if trial.chi2 < state.chi2 or (shrink == 1.0 and trial.chi2 <= state.chi2 + 1e-6):
-                best = trial
-                break
+        change, moved, promised = _step(problem, point, rows)
+        best = _best_move(problem, point, change, moved, now)
         if best is None:
-            converged = promised < 0.1
+            outcome = Outcome.CONVERGED if promised < max(0.1, tolerance) else Outcome.STUCK
             break
-        fell = state.chi2 - best.chi2
-        state = best
-        if fell < 0.02 and promised < 0.02:
-            converged = True
+        fell, point = now - _cost(problem, best), best
+        now -= fell
+        if fell < tolerance and promised < tolerance:
+            outcome = Outcome.CONVERGED
             break
-        state, rows = _with_slopes(problem, state)
-        if step == 1 and -0.5 * state.chi2 < hopeless - 100 - 0.5 * promised:
+        slopes, rows = _with_slopes(problem, point, slopes)
+        if step == 1 and -0.5 * now < hopeless - 100 - 0.5 * promised:
+            outcome = Outcome.GIVEN_UP
             break
-    return _finished(problem, state, rows, converged)
+    return _finished(problem, point, slopes, rows, outcome)
 
 
-def _evaluate(problem: Problem, causes: tuple[Cause, ...], kicks: Kicks, launches: Array) -> Fit:
-    paths = problem.model.paths(launches, (*problem.fixed, *causes), kicks)
-    difference = np.where(problem.data.valid, problem.data.readings - paths.readings, 0.0)
-    residual = problem.whitening.residual(difference, launches)
-    finite = np.isfinite(residual).all()
-    projection = Projection(problem.whitening.launch(paths.launch)) if finite else None
-    return Fit(
-        causes,
-        kicks,
-        launches,
-        paths,
-        residual,
-        projection,  # type: ignore[arg-type]
-        float(residual @ residual) if finite else np.inf,
-        np.zeros((0, 0)),
-        -np.inf,
-        False,
-    )
+def _cost(problem: Problem, point: Point) -> float:
+    """Chi-square, and what the prior adds to it where it pulls."""
+    if point.lost:
+        return np.inf
+    if problem.amounts.tails is None:
+        return point.chi2
+    return point.chi2 - 2 * sum(problem.amounts.log_density(c) for c in point.causes)
 
 
-def _continuous(fit_: Fit) -> list[int]:
-    return [i for i, cause in enumerate(fit_.causes) if not find(cause.effect).discrete]
+def _continuous(point: Point) -> list[int]:
+    return [i for i, cause in enumerate(point.causes) if not find(cause.effect).discrete]
 
 
-def _with_slopes(problem: Problem, state: Fit) -> tuple[Fit, Array]:
-    """The fit with slopes that hold; and d rows / d parameters: amounts, then the kicks of each
-    layer in active shots."""
-    model, whitening = problem.model, problem.whitening
+def _with_slopes(problem: Problem, point: Point, known: Slopes) -> tuple[Slopes, Array]:
+    """Slopes that hold at a point; and d rows / d parameters: amounts, then each place's kicks."""
     rows = []
     slopes: dict[Hypothesis, Slope] = {}
-    for i in _continuous(state):
-        cause = state.causes[i]
+    for i in _continuous(point):
+        cause = point.causes[i]
         place = (cause.effect, cause.element)
-        known = state.slopes.get(place)
-        if known is not None and known.holds(cause.amount, state.paths.beam):
-            slopes[place] = known
-            rows.append(known.row[None])
-            continue
-        effect = find(cause.effect)
-        h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
-        amounts = (cause.amount + h, cause.amount - h)
-        ends = [
-            model.readings(
-                state.launches,
-                [
-                    *problem.fixed,
-                    *state.causes[:i],
-                    replace(cause, amount=a),
-                    *state.causes[i + 1 :],
-                ],
-                state.kicks,
-            )
-            for a in amounts
-        ]
-        row = whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
-        slopes[place] = Slope(row, cause.amount, state.paths.beam)
-        rows.append(row[None])
-    shots = np.flatnonzero(problem.data.active)
-    for layer in state.kicks:
-        kicked = model.kick_signatures(state.paths, np.array([layer]))[0]
-        alone = np.zeros((len(shots), *kicked.shape))
-        for i, shot in enumerate(shots):
-            alone[i, :, shot] = kicked[:, shot]
-        rows.append(whitening.signature(alone).reshape(2 * len(shots), -1))
-    stacked = np.concatenate(rows) if rows else np.zeros((0, whitening.rows))
-    return replace(state, slopes=slopes), stacked
+        slope = known.get(place)
+        if slope is None or not slope.holds(cause.amount, point.orbit, problem.judgement.same):
+            slope = Slope(problem.slope(point, i), cause.amount, point.orbit)
+        slopes[place] = slope
+        rows.append(slope.row[None])
+    rows += [problem.kick_rows(point, place) for place in point.kicks]
+    return slopes, np.concatenate(rows) if rows else np.zeros((0, len(point.residual)))
 
 
-def _step(problem: Problem, state: Fit, rows: Array) -> tuple[Array, Array, float]:
-    """Changes of parameters and launches, and how far chi-square should fall."""
-    clean = state.projection.out(state.residual)
+def _pulls(problem: Problem, point: Point, count: int) -> tuple[Array, Array]:
+    """Precision of the prior of each parameter, and its amount; none of free kicks."""
+    precision, amount = np.zeros((2, count))
+    for row, i in enumerate(_continuous(point)):
+        precision[row] = problem.amounts.precision(point.causes[i])
+        amount[row] = point.causes[i].amount
+    return precision, amount
+
+
+def _step(problem: Problem, point: Point, rows: Array) -> tuple[Array, Array, float]:
+    """Changes of parameters and nuisances, and how far the cost should fall."""
+    assert point.projection is not None
+    clean = point.projection.out(point.residual)
     change = np.zeros(len(rows))
-    promised = state.chi2 - float(clean @ clean)
+    promised = point.chi2 - float(clean @ clean)
     if len(rows):
-        own = state.projection.out(rows)
-        size = np.sqrt(np.einsum("kr,kr->k", own, own))
-        unit = own / np.where(size > 0, size, 1.0)[:, None]
-        gram = unit @ unit.T + 1e-10 * np.eye(len(unit))
-        inner = unit @ clean
+        own = point.projection.out(rows)
+        precision, amount = _pulls(problem, point, len(rows))
+        size = np.sqrt(np.einsum("kr,kr->k", own, own) + precision)
+        scale = np.where(size > 0, size, 1.0)
+        unit = own / scale[:, None]
+        gram = unit @ unit.T + np.diag(precision / scale**2 + 1e-10)
+        inner = unit @ clean - precision * amount / scale
         solved = np.linalg.solve(gram, inner)
         promised += float(inner @ solved)
         change = solved / np.where(size > 0, size, np.inf)
-    left = state.residual - change @ rows
-    moved = state.projection.coordinates(left).reshape(problem.data.shots, -1)
-    return change, moved, promised
+    left = point.residual - change @ rows
+    return change, point.projection.coordinates(left), promised
 
 
-def _moved(problem: Problem, state: Fit, change: Array, moved: Array) -> Fit:
-    launches = state.launches.copy()
-    launches[:, problem.whitening.columns] += moved
-    causes = list(state.causes)
-    amounts = _continuous(state)
+def _best_move(
+    problem: Problem, point: Point, change: Array, moved: Array, now: float
+) -> Point | None:
+    """The point after the largest share of a step that makes things better."""
+    for shrink in SHRINK:
+        trial = _moved(problem, point, shrink * change, shrink * moved)
+        cost = _cost(problem, trial)
+        if cost < now or (shrink == 1.0 and cost <= now + 1e-6):
+            return trial
+    return None
+
+
+def _moved(problem: Problem, point: Point, change: Array, moved: Array) -> Point:
+    causes = list(point.causes)
+    amounts = _continuous(point)
     for i, delta in zip(amounts, change, strict=False):
         causes[i] = replace(causes[i], amount=causes[i].amount + float(delta))
-    kicks = {}
-    shots = np.flatnonzero(problem.data.active)
-    at = len(amounts)
-    for layer, values in state.kicks.items():
-        new = values.copy()
-        new[shots] += change[at : at + 2 * len(shots)].reshape(-1, 2)
-        kicks[layer] = new
-        at += 2 * len(shots)
-    return _evaluate(problem, tuple(causes), kicks, launches)
+    kicks, at = {}, len(amounts)
+    for place, values in point.kicks.items():
+        kicks[place] = values + change[at : at + len(values)]
+        at += len(values)
+    return problem.at(causes, problem.moved(point.nuisances, moved), kicks)
 
 
-def _finished(problem: Problem, state: Fit, rows: Array, converged: bool) -> Fit:
-    named = _continuous(state)
-    covariance = np.zeros((len(state.causes), len(state.causes)))
-    log_evidence = -0.5 * state.chi2
-    own = state.projection.out(rows)
+def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outcome: Outcome) -> Fit:
+    """Errors and evidence at the best amounts."""
+    assert point.projection is not None
+    named = _continuous(point)
+    covariance = np.zeros((len(point.causes), len(point.causes)))
+    log_evidence = -0.5 * point.chi2
+    own = point.projection.out(rows)
     gram = own @ own.T
-    for cause in state.causes:
-        log_evidence += problem.prior((cause.effect, cause.element)) + amount_prior(cause)
+    log_evidence -= max(len(point.causes) - 1, 0) * np.log(problem.judgement.rarer)
+    for cause in point.causes:
+        log_evidence += problem.prior((cause.effect, cause.element))
+        log_evidence += problem.amounts.log_density(cause)
     if named:
-        size = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
-        scaled = gram / size[:, None] / size + 1e-10 * np.eye(len(gram))
+        full = gram + np.diag(_pulls(problem, point, len(rows))[0])
+        size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
+        scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))
         inverse = np.linalg.inv(scaled) / size[:, None] / size
         covariance[np.ix_(named, named)] = inverse[: len(named), : len(named)]
         sign, determinant = np.linalg.slogdet(covariance[np.ix_(named, named)])
-        log_evidence += 0.5 * (determinant + len(named) * np.log(2 * np.pi)) if sign > 0 else -1e9
-    shots = np.flatnonzero(problem.data.active)
+        if sign <= 0:
+            return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
+        log_evidence += 0.5 * (determinant + len(named) * np.log(2 * np.pi))
     at = len(named)
-    for values in state.kicks.values():
-        part = slice(at, at + 2 * len(shots))
-        at += 2 * len(shots)
-        information = gram[part, part]
-        log_evidence += free_evidence(information, values[shots].reshape(-1))
-        log_evidence += problem.unknown_prior(len(problem.model.maps.layers))
-    return replace(
-        state, covariance=covariance, log_evidence=float(log_evidence), converged=converged
-    )
+    for values in point.kicks.values():
+        part = slice(at, at + len(values))
+        at += len(values)
+        log_evidence += free_evidence(gram[part, part], values)
+        log_evidence += problem.unknown_prior(len(problem.kick_places))
+    return Fit(point, covariance, float(log_evidence), outcome, slopes)
 
 
 def free_evidence(information: Array, values: Array) -> float:

@@ -5,12 +5,13 @@ monitor (gain, or the other plane's share), what scales a column (corrector cali
 and what changes the ring. Their normal equations are dense only in the last.
 
 Parameters have priors in groups: each has its own scale, which follows the evidence (EM), and may
-be shared: an error of a family beside the errors of its members. A heavy group has Student's
-distribution (four degrees of freedom), so that one wrong magnet does not widen the prior of all.
+be shared: an error of a family beside the errors of its members. A prior is Student's with some
+degree of freedom: infinite is Gauss', 4 has tails, so that one wrong magnet does not widen the
+prior of all.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,8 @@ from scipy.linalg.lapack import dpotri
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-FREEDOM = 4.0
-"""Of Student's distribution."""
+SMALLEST = 1e-9
+"""A prior's rms does not fall below."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def normal_equations(
     return Normal(np.triu(A) + np.triu(A, 1).T, b)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Group:
     """Parameters with one prior: the base parameters move by `basis` times theirs.
 
@@ -95,7 +96,7 @@ class Group:
         name: for people.
         basis: [base parameter, parameter].
         rms: of the prior; where the search for it starts.
-        heavy: Student's distribution instead of Gauss'.
+        freedom: degree of freedom of Student's distribution; infinite: Gauss'.
         fixed: the scale stays.
         most: largest prior rms that physics allows one parameter.
         each: prior rms of every parameter, as last found; None: `rms`.
@@ -104,26 +105,33 @@ class Group:
     name: str
     basis: Array
     rms: float
-    heavy: bool = False
+    freedom: float = np.inf
     fixed: bool = False
     most: float = np.inf
     each: Array | None = None
 
-    def learn(self, squares: Array) -> None:
+    @property
+    def scale(self) -> Array:
+        """Prior rms of every parameter."""
+        return np.full(self.basis.shape[1], self.rms) if self.each is None else self.each
+
+    def share(self, squares: Array, rms: float) -> Array:
+        """By which a parameter of this expected square counts: 1 for Gauss, less in the tails."""
+        if np.isinf(self.freedom):
+            return np.ones(len(squares))
+        return np.asarray((self.freedom + 1) / (self.freedom + squares / rms**2))
+
+    def learn(self, squares: Array) -> "Group":
         """One step of EM from the expected squares of the parameters."""
         if not len(squares):
-            self.each = squares
-            return
-        if self.heavy:
+            return replace(self, each=squares)
+        rms = self.rms
+        if not self.fixed:
             for _ in range(20):
-                share = (FREEDOM + 1) / (FREEDOM + squares / self.rms**2)
-                self.rms = max(float(np.sqrt(np.mean(share * squares))), 1e-9)
-            self.each = self.rms * np.sqrt((FREEDOM + squares / self.rms**2) / (FREEDOM + 1))
-        else:
-            if not self.fixed:
-                self.rms = max(float(np.sqrt(np.mean(squares))), 1e-9)
-            self.each = np.full(len(squares), self.rms)
-        self.each = np.minimum(self.each, self.most)
+                mean = float(np.mean(self.share(squares, rms) * squares))
+                rms = max(float(np.sqrt(mean)), SMALLEST)
+        each = rms / np.sqrt(self.share(squares, rms))
+        return replace(self, rms=rms, each=np.minimum(each, self.most))
 
 
 @dataclass(frozen=True)
@@ -135,22 +143,24 @@ class Posterior:
         sigma: their posterior errors.
         covariance: of the groups' parameters, in units of their priors, [p, p].
         spread: of the base parameters: basis times prior rms, [parameter, p].
+        groups: with the scales that they have learnt.
     """
 
     values: Array
     sigma: Array
     covariance: Array
     spread: Array
+    groups: tuple[Group, ...]
 
 
 def solve(
     normal: Normal,
-    groups: Iterable[Group],
+    groups: Sequence[Group],
     start: Array | None = None,
     trust: Array | None = None,
     rounds: int = 2,
 ) -> Posterior:
-    """The most probable parameters; the groups learn their scales.
+    """One step of Gauss and Newton: the most probable parameters, and the groups' scales.
 
     Args:
         normal: at `start`.
@@ -160,26 +170,24 @@ def solve(
             not the result: a fixed point does not know it.
         rounds: of EM; 0: the priors stay as they are.
     """
-    groups = list(groups)
     known = np.zeros(len(normal.vector)) if start is None else start
+    groups = tuple(groups)
     basis = np.concatenate([g.basis for g in groups], axis=1)
-    owner = np.repeat(np.arange(len(groups)), [g.basis.shape[1] for g in groups])
+    edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
     base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
     A = basis.T @ base @ basis
     b = basis.T @ (normal.vector + base @ known)
     for turn in range(max(rounds, 1)):
-        prior = np.concatenate(
-            [np.full(g.basis.shape[1], g.rms) if g.each is None else g.each for g in groups]
-        )
+        prior = np.concatenate([g.scale for g in groups])
         # in units of the priors, so that the matrix is well scaled
         factor = cho_factor(A * np.outer(prior, prior) + np.eye(len(A)), lower=True)
         found = prior * cho_solve(factor, prior * b)
         covariance = dpotri(factor[0], lower=1)[0]
         if turn < rounds:
             squares = found**2 + np.diag(covariance) * prior**2
-            for i, group in enumerate(groups):
-                group.learn(squares[owner == i])
+            parts = np.split(squares, edges)
+            groups = tuple(g.learn(own) for g, own in zip(groups, parts, strict=True))
     covariance = np.tril(covariance) + np.tril(covariance, -1).T
     spread = basis * prior
     sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))
-    return Posterior(basis @ found, sigma, covariance, spread)
+    return Posterior(basis @ found, sigma, covariance, spread, groups)

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from tmlattice.beam.model import Hypothesis
 from tmlattice.effects import find
 from tmlattice.inference import chi2
-from tmlattice.inference.metric import Metric
+from tmlattice.inference.metric import Hypothesis, Metric
 
 Array = NDArray[np.float64]
 
@@ -59,7 +58,13 @@ class Scan:
 
 def look_elsewhere(statistic: float, freedom: int, effective: float) -> float:
     """Chance that the largest of `effective` chi-squares of so many degrees reaches this."""
-    return float(-np.expm1(effective * np.log1p(-chi2.sf(statistic, freedom))))
+    return float(-np.expm1(effective * _log_below(statistic, freedom)))
+
+
+def _log_below(statistic: float | Array, freedom: int) -> Array:
+    """Log of the chance that one chi-square stays below; a finite number where it cannot."""
+    tail = np.minimum(chi2.sf(statistic, freedom), 1 - np.finfo(float).epsneg)
+    return np.asarray(np.log1p(-tail))
 
 
 def free_threshold(rate: float, freedom: int, effective: float) -> float:
@@ -72,13 +77,11 @@ def effective_number(largest: Array, freedom: int) -> float:
 
     The exponent N of F(t)^N has the estimate -draws / sum log F(t).
     """
-    tail = chi2.sf(largest, freedom)
-    return float(max(len(largest) / -np.log1p(-tail).sum(), 1.0))
+    return float(max(len(largest) / -_log_below(largest, freedom).sum(), 1.0))
 
 
 def scan(
     metric: Metric,
-    launches: Array,
     hypotheses: Sequence[Hypothesis],
     residual: Array,
     *,
@@ -89,25 +92,27 @@ def scan(
 
     Args:
         metric: of the data about the model's trajectories.
-        launches: those of the trajectories.
         hypotheses: see `Model.hypotheses`.
         residual: whitened rows, launches fitted.
         effective: number of independent hypotheses where it is known already; else simulated.
         seed: of the simulation.
     """
+    if not len(hypotheses):
+        nothing = np.zeros(0)
+        return Scan((), nothing, nothing, nothing, 1.0)
     draws = np.zeros((0, len(residual)))
     if effective is None:
         random = np.random.default_rng([seed, 1])
         draws = metric.projection.out(random.standard_normal((DRAWS, len(residual))))
     data = np.concatenate([metric.projection.out(residual)[None], draws])
-    sums = metric.products(hypotheses, launches, data)
+    sums = metric.products(hypotheses, data)
     norm = sums.whole - sums.inside
     reach = np.array([FAR * find(name).largest ** find(name).power for name, _ in hypotheses])
     seen = (norm > BLIND * sums.whole) & (norm * reach**2 > 1.0)
     safe = np.where(seen, norm, 1.0)
     squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
     if effective is None:
-        effective = effective_number(squares[:, 1:].max(axis=0), 1)
+        effective = effective_number(squares[:, 1:].max(axis=0, initial=0.0), 1)
     return Scan(
         tuple(hypotheses),
         statistic=squares[:, 0],
@@ -134,6 +139,11 @@ class FreeScan:
     statistic: Array
     freedom: NDArray[np.int64]
     amounts: Array
+
+
+_NOTHING = np.zeros(0)
+NO_SCAN = FreeScan(np.zeros(0, np.int64), _NOTHING, _NOTHING, np.zeros(0, np.int64), _NOTHING)
+"""Of no places at all."""
 
 
 _RATIOS = np.logspace(-1, 8, 46)

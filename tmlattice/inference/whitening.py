@@ -7,18 +7,37 @@ launch stands in further rows: rows are [shot, 2 readings + 5 coordinates], flat
 """
 
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky
 from scipy.linalg.lapack import dtrtri
 
-from tmlattice.observe.data import Data
-
 Array = NDArray[np.float64]
 
 EXACT = 1e-12
 """m, rad or relative: stands for a launch coordinate that is known exactly."""
+
+
+class Readings(Protocol):
+    """What whitening needs of data: see `observe.data.Data`, which has it."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which readings there are, [shot, reading, 2]."""
+
+    @property
+    def sigma(self) -> Array:
+        """Noise of each reading, m, [shot, reading, 2]."""
+
+    @property
+    def launches(self) -> Array:
+        """Nominal, [shot, 5]."""
+
+    @property
+    def launch_sigma(self) -> Array:
+        """rms of these; inf where unknown, 0 where exact, [shot, 5]."""
 
 
 class Whitening:
@@ -33,9 +52,9 @@ class Whitening:
         rows: number of rows of a whitened vector.
     """
 
-    def __init__(self, data: Data, background: Array | None = None) -> None:
+    def __init__(self, data: Readings, background: Array | None = None) -> None:
         self.weight = np.where(data.valid, 1.0 / data.sigma, 0.0)
-        self.shots = data.shots
+        self.shots = len(data.valid)
         sigma = np.maximum(data.launch_sigma, EXACT)
         self.columns = np.flatnonzero((data.launch_sigma > 0).any(axis=0))
         self._prior = np.where(np.isfinite(sigma), 1.0 / sigma, 0.0)  # [shot, 5]

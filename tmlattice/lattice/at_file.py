@@ -9,7 +9,7 @@ Each AT element becomes an OCELOT element of the same first- and second-order ph
   fuller one: AT's has no product of curvature and gradient, and edges of first order.
 - Wigglers made of thin bends of alternating sign become one matrix each (`_merge_wigglers`).
 - A corrector's plane is its MADType (HKICKER, VKICKER), else its kick, else its name.
-- A cavity is a drift: the maps carry no acceleration.
+- A cavity is a drift to the maps; over several turns it gives what its voltage says.
 
 Coordinates of a matrix element are turned from AT's (.., delta, ct) into OCELOT's (.., tau, p):
 tau = ct, p = beta0 delta.
@@ -163,8 +163,8 @@ def _convert(element: Any, family: str, energy: float, left_out: Counter[str]) -
     mad = mad or str(getattr(element, "origin", "")).upper()
     roll = _roll(element, left_out)
     if isinstance(element, at.RFCavity):
-        drift = ocelot.Drift(l=length, eid=family) if length else ocelot.Marker(eid=family)
-        return "cavity", drift
+        voltage, frequency = (float(getattr(element, k, 0.0)) for k in ("Voltage", "Frequency"))
+        return "cavity", ocelot.Cavity(l=length, v=1e-9 * voltage, freq=frequency, eid=family)
     if mad == "INSTRUMENT" and isinstance(element, at.Monitor):  # AT's MAD-X reader has it so
         return "marker", ocelot.Marker(eid=family)
     if isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR"):

@@ -16,9 +16,8 @@ import numpy as np
 
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
-from tmlattice.lattice import ring as ring_module
 from tmlattice.lattice.places import place_elements
-from tmlattice.lattice.ring import Element, Ring, number_names
+from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring, number_names
 
 FORMAT, VERSION = "tmlattice-lattice", 1
 
@@ -199,11 +198,9 @@ def described(element: Element) -> dict[str, Any]:
                 f"'{element.name}' has a {key} that is no number; a lattice file holds numbers"
             )
     described: dict[str, Any] = {"kind": element.kind, "class": cls, "parameters": parameters}
-    errors = getattr(element, "errors", None)
-    if errors is not None:
-        nonzero = {k: v for k, v in asdict(errors).items() if v}
-        if nonzero:
-            described["errors"] = nonzero
+    nonzero = {k: v for k, v in asdict(element.errors).items() if v != getattr(NO_ERRORS, k)}
+    if nonzero:
+        described["errors"] = nonzero
     return described
 
 
@@ -254,12 +251,14 @@ def _value(path: Path, key: str, name: str, value: Any, default: Any) -> Any:
     return array
 
 
-def _with_errors(path: Path, element: Element, errors: dict[str, float] | None) -> Element:
+def _with_errors(path: Path, element: Element, errors: dict[str, Any] | None) -> Element:
     if not errors:
         return element
-    cls: Any = getattr(ring_module, "Errors", None)
     try:
-        return replace(element, **{"errors": cls(**errors)})
+        given: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in errors.items()
+        }
+        return replace(element, errors=Errors(**given))
     except TypeError as error:
         raise LatticeError(
             f"'{path}': errors of '{element.name}' are not known here ({error}); "

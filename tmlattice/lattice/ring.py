@@ -31,6 +31,10 @@ PASSIVE: frozenset[str] = frozenset({"drift", "monitor", "marker", "cavity"})
 """Kinds that are no magnets: they belong to the way between two magnets."""
 
 
+Slopes = tuple[float, ...]
+"""Of a thin kick: (d px / dx, d px / dy, d py / dx, d py / dy), 1/m."""
+
+
 @dataclass(frozen=True)
 class Errors:
     """How one magnet differs from its design, beyond its strengths: what OCELOT has no name for.
@@ -46,6 +50,7 @@ class Errors:
             px += k1sl y, py += k1sl x; 1/m.
         entrance_k1l: thin quadrupole at the entrance, 1/m.
         loss: relative energy loss at the middle (six coordinates only).
+        entrance, middle: any other thin kicks there that are linear in the beam's place.
     """
 
     dx: float = 0.0
@@ -57,10 +62,19 @@ class Errors:
     k1sl: float = 0.0
     entrance_k1l: float = 0.0
     loss: float = 0.0
+    entrance: Slopes = (0.0, 0.0, 0.0, 0.0)
+    middle: Slopes = (0.0, 0.0, 0.0, 0.0)
 
-    def plus(self, **amounts: float) -> "Errors":
+    def plus(self, **amounts: float | Slopes) -> "Errors":
         """These errors and more of the named ones."""
-        return replace(self, **{name: getattr(self, name) + a for name, a in amounts.items()})
+        changed: dict[str, Any] = {n: _sum(getattr(self, n), a) for n, a in amounts.items()}
+        return replace(self, **changed)
+
+
+def _sum(old: Any, more: Any) -> Any:
+    if isinstance(old, tuple):
+        return tuple(a + b for a, b in zip(old, more, strict=True))
+    return old + more
 
 
 NO_ERRORS = Errors()
@@ -147,7 +161,7 @@ class Element:
         }
         return replace(self, source=source, **known)
 
-    def with_errors(self, **amounts: float) -> "Element":
+    def with_errors(self, **amounts: float | Slopes) -> "Element":
         """A copy with these amounts added to its `errors`."""
         return replace(self, source=self.data or self.source, errors=self.errors.plus(**amounts))
 

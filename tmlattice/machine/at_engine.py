@@ -14,80 +14,45 @@ particle; AT takes the speed of light for all particles, an error of 1 / gamma^2
 """
 
 import copy
+import functools
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import at
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import c as SPEED_OF_LIGHT
-from scipy.constants import physical_constants
-from scipy.linalg import sqrtm
 
-from tmlattice.effects.cause import Cause
-from tmlattice.errors import LatticeError, UnstableRingError, unknown_name
-from tmlattice.lattice.ring import Element, Ring
+from tmlattice.beam.rf import rf_of
+from tmlattice.effects import Cause, RingEffect, check, find
+from tmlattice.effects.build import Build
+from tmlattice.errors import LatticeError
+from tmlattice.lattice.ring import Ring
+from tmlattice.machine import at_orbit
+from tmlattice.machine.at_elements import ELECTRON, NOTHING, SWAPPED, Builder, expected_loss
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
 """What is set on purpose, by element: {"kick": rad}, {"k1_relative": 1}, {"k2_relative": 1},
 and {"rf": {"frequency_relative": 1}}."""
 
-ELECTRON = physical_constants["electron mass energy equivalent in MeV"][0] * 1e6  # eV
-RADIUS = physical_constants["classical electron radius"][0]  # m
-C_GAMMA = 4 * np.pi / 3 * RADIUS / ELECTRON**3
-"""Energy loss of a circle of radius rho: C_GAMMA E^4 / rho, 1/eV^3 m."""
-
-PETRA_HARMONIC, PETRA_LENGTH = 3840, 2303.952
 TURNS_AT_ONCE = 2**22
 """AT's result is cut into blocks of so many states, so that many turns fit into memory."""
 
-_STRAIGHT = frozenset({"quadrupole", "sextupole", "wiggler", "marker"})
 _CORRECTOR = frozenset({"hcorrector", "vcorrector"})
-SITS_ON: Mapping[str, frozenset[str]] = {
-    "quadrupole_gradient": frozenset({"quadrupole"}),
-    "gradient_absolute": _STRAIGHT,
-    "skew_gradient": _STRAIGHT,
-    "quadrupole_roll": frozenset({"quadrupole"}),
-    "quadrupole_offset_x": frozenset({"quadrupole"}),
-    "quadrupole_offset_y": frozenset({"quadrupole"}),
-    "dipole_field": frozenset({"bend"}),
-    "dipole_roll": frozenset({"bend"}),
-    "corrector_kick_x": _CORRECTOR,
-    "corrector_kick_y": _CORRECTOR,
-    "corrector_calibration": _CORRECTOR,
-    "corrector_roll": _CORRECTOR,
-    "sextupole_strength": frozenset({"sextupole"}),
-    "sextupole_offset_x": frozenset({"sextupole"}),
-    "sextupole_offset_y": frozenset({"sextupole"}),
-    "insertion_device_focusing": frozenset({"wiggler"}),
-}
-"""The effects on one element, and the kinds of element that AT is told to put them on."""
-
-OF_ALL = ("family_gradient", "radiation_loss_bends", "radiation_loss_wigglers")
-OF_THE_BEAM = ("energy_offset", "energy_spread")
-"""The caller puts these into the launches."""
-
 SET_ON: Mapping[str, frozenset[str]] = {
     "kick": _CORRECTOR,
-    "k1_relative": frozenset({"quadrupole"}),
+    "k1_relative": frozenset({"quadrupole", "bend"}),
     "k2_relative": frozenset({"sextupole"}),
 }
-_SWAPPED = [0, 1, 2, 3, 5, 4]
-
-
-_NO_ORBIT = (
-    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
-    "kicks are too large"
-)
 
 
 class AtEngine:
     """A ring with its causes as a line of AT elements.
 
-    Causes of the same effect on the same element add up. A thin gradient sits on the design
-    axis, whatever the offset and roll of its magnet.
+    Causes of the same effect on the same element add up. A thin kick sits on the design axis,
+    whatever the offset and roll of its magnet.
 
     Args:
         ring: the design.
@@ -98,18 +63,20 @@ class AtEngine:
         steps: fourth-order integration steps per magnet. With 30 the first turn of a
             PETRA-III-style ring is converged to 0.002 micrometres rms at 1 mm (0.01 with 20).
         aperture: half width in m of quadrupoles and monitors, in both planes.
-        harmonic: of the RF; else that of the ring's first cavity, else 3840 for every 2303.952 m.
+        harmonic: of the RF; else that of the ring's first cavity, else the one nearest to 500 MHz.
         voltage: of the RF in V, all cavities together; else that of the ring's cavities, else
-            20 MV.
+            four times what the design loses when it radiates as expected.
 
     Attributes:
         ring: the design.
         expected_loss: energy that the design orbit loses in a turn at these scales, eV.
 
     Raises:
-        LatticeError: an element that AT cannot build, an effect that is unknown or cannot sit
-            on its element, a negative radiation loss, or an RF too weak for the loss.
-        UnknownNameError: a cause on an element or family that the ring does not have.
+        LatticeError: an element that AT cannot build, a negative radiation loss, or an RF too
+            weak for the loss.
+        EffectError: an effect that cannot sit on its element.
+        UnknownNameError: an effect that does not exist, or one on an element or family that the
+            ring does not have.
     """
 
     def __init__(
@@ -125,53 +92,47 @@ class AtEngine:
         voltage: float | None = None,
     ) -> None:
         self.ring = ring
-        self._errors, scale = _sorted(ring, causes)
-        self._bends = radiation_bends + scale["radiation_loss_bends"]
-        self._wigglers = radiation_wigglers + scale["radiation_loss_wigglers"]
+        self._wrong = _wrong(ring, causes)
+        self._bends = radiation_bends + self._loss("bend")
+        self._wigglers = radiation_wigglers + self._loss("wiggler")
         if min(self._bends, self._wigglers) < 0:
             raise LatticeError(
                 f"the radiation loss is {self._bends:g} (bends) and {self._wigglers:g} (wigglers) "
                 "of the expected; it cannot be negative"
             )
-        self._builder = _Builder(
-            ring.energy * 1e9, steps, aperture, self._bends > 0, self._wigglers
-        )
+        self._builder = Builder(ring.energy * 1e9, steps, aperture, self._bends > 0, self._wigglers)
         self._line: list[Any] = []
         self._places: list[slice] = []  # of each element of the ring, in the line
         nothing: Mapping[str, float] = {}
         for i, element in enumerate(ring.elements):
-            pieces = self._builder.pieces(element, self._errors.get(i, nothing), nothing)
+            pieces = self._builder.pieces(element, self._wrong.get(i, NOTHING), nothing)
             self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
             self._line += pieces
         self._line.append(at.Marker("rf_at_the_end"))
         self._monitors = np.array(
             [i for i, e in enumerate(self._line) if isinstance(e, at.Monitor)], dtype=np.uint32
         )
-        self.expected_loss = _expected_loss(ring, self._bends, self._wigglers)
+        self.expected_loss = expected_loss(ring, self._bends, self._wigglers)
         self._set_rf(harmonic, voltage)
 
+    def _loss(self, kind: str) -> float:
+        """The scale of the loss in all elements of a kind."""
+        elements = self.ring.elements
+        scales = {w.loss for i, w in self._wrong.items() if elements[i].kind == kind and w.loss}
+        if len(scales) > 1:
+            raise LatticeError(f"AT gives every {kind} the same share of its expected loss")
+        return scales.pop() if scales else 0.0
+
     def _set_rf(self, harmonic: int | None, voltage: float | None) -> None:
-        ring, elements = self.ring, self.ring.elements
-        own = [i for i, e in enumerate(elements) if e.kind == "cavity"]
-        free = ("marker", "drift")
-        named = [i for i, e in enumerate(elements) if e.name.casefold() == "rf" and e.kind in free]
-        self._cavities = [self._places[i].start for i in own or named[:1]]
-        self._cavities = self._cavities or [len(self._line) - 1]
-        self._has_rf = bool(own)
-        if harmonic is None:
-            frequency = float(elements[own[0]].source.freq) if own else 0.0
-            harmonic = round(
-                frequency * ring.length / SPEED_OF_LIGHT
-                if frequency
-                else PETRA_HARMONIC * ring.length / PETRA_LENGTH
-            )
-        self._harmonic = max(harmonic, 1)
-        if voltage is None:
-            voltage = sum(float(elements[i].source.v) for i in own) * 1e9 or 20e6
-        self._voltage = voltage
-        if self.expected_loss >= voltage:
+        rf = rf_of(self.ring, harmonic, voltage)
+        behind = len(self._line) - 1  # the marker at the end
+        self._cavities = [
+            self._places[i].start if i < len(self._places) else behind for i in rf.places
+        ]
+        self._has_rf, self._harmonic, self._voltage = rf.own, rf.harmonic, rf.voltage
+        if self.expected_loss and self.expected_loss >= rf.voltage:
             raise LatticeError(
-                f"an RF of {voltage / 1e6:.3g} MV cannot make good a loss of "
+                f"an RF of {rf.voltage / 1e6:.3g} MV cannot make good a loss of "
                 f"{self.expected_loss / 1e6:.3g} MeV a turn; give voltage="
             )
 
@@ -189,8 +150,8 @@ class AtEngine:
             launches: (x, px, y, py, tau, p) at the start of the sequence, [shot, 6].
             turns: at least 1.
             settings: one mapping a shot, of element name to what is set: `kick` of a corrector
-                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole,
-                `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
+                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole
+                or a bend, `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
 
         Returns:
             (x, y) in m, [shot, turn, monitor, 2]; NaN from where a particle is lost.
@@ -212,9 +173,10 @@ class AtEngine:
         for shots, changed, frequency in self._groups(settings or [{}] * len(start)):
             line = self._line.copy()
             for i, setting in changed.items():
-                errors = self._errors.get(i, {})
-                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], errors, setting)
-            if turns > 1 and (self.expected_loss > 0 or self._has_rf or frequency):
+                wrong = self._wrong.get(i, NOTHING)
+                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], wrong, setting)
+            on = self.expected_loss > 0 or self._has_rf or frequency
+            if turns > 1 and on and self._voltage:
                 for place in self._cavities:
                     line[place] = self._cavity(line[place], frequency)
             readings[shots] = self._track_line(line, state[shots], turns)
@@ -237,58 +199,17 @@ class AtEngine:
             LatticeError, UnknownNameError: see `track`.
             UnstableRingError: no closed orbit within reach.
         """
-        start, solve = self._stored()
+        start, solve = at_orbit.stored(functools.partial(self._pass, self._line))
         readings = np.empty((len(settings), len(self._monitors), 2))
         for orbits, changed, frequency in self._groups(settings):
             line = self._line.copy()
             for i, setting in changed.items():
-                errors = self._errors.get(i, {})
-                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], errors, setting)
+                wrong = self._wrong.get(i, NOTHING)
+                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], wrong, setting)
             late = -self.ring.length * frequency / (1 + frequency)
-            readings[orbits] = self._settle(line, start, solve, late)[1]
+            turn = functools.partial(self._pass, line)
+            readings[orbits] = at_orbit.settle(turn, start, solve, late)[1]
         return readings
-
-    def _stored(self) -> tuple[Array, Array]:
-        """The unset ring's closed orbit [6] and what makes good a miss of the turn, [6, 6]."""
-        steps = np.diag([3e-6, 3e-6, 3e-6, 3e-6, 1e-5, 1.0])[:5]  # bends round x to 3e-14 m
-        start = np.zeros(6)
-        for _ in range(3):
-            beam = np.asfortranarray(np.vstack([start + steps, start - steps]).T)
-            self._pass(self._line, beam)
-            ends = beam.T
-            slopes = (ends[:5] - ends[5:]).T / (2 * steps[range(5), range(5)])
-            rows = [0, 1, 2, 3, 5]
-            solve = np.zeros((6, 6))
-            try:
-                solve[:5, rows] = np.linalg.inv((np.eye(6)[:, :5] - slopes)[rows])
-            except np.linalg.LinAlgError:
-                raise UnstableRingError(_NO_ORBIT) from None
-            start = self._settle(self._line, start, solve, 0.0, 1e-6)[0]
-        return self._settle(self._line, start, solve, 0.0)[0], solve
-
-    def _settle(
-        self, line: list[Any], start: Array, solve: Array, late: float, tolerance: float = 2e-12
-    ) -> tuple[Array, Array]:
-        """Broyden's method from a given Jacobian: the state [6] and its readings [monitor, 2]."""
-        state, change, before = start.copy(), np.zeros(6), np.zeros(6)
-        for step in range(60):
-            beam = np.array(state[:, None], order="F")
-            readings = self._pass(line, beam)
-            miss = beam[:, 0] - state
-            miss[5] -= late
-            if not np.isfinite(readings).all() or not np.isfinite(miss).all():
-                break
-            if step:  # Broyden: the Jacobian's inverse learns from what the last change did
-                learned = solve @ (before - miss)
-                weight = change @ solve
-                below = weight @ (before - miss)
-                if below:
-                    solve = solve + np.outer(change - learned, weight) / below
-            change, before = solve @ miss, miss
-            if np.abs(change).max() < tolerance:
-                return state, readings
-            state += change
-        raise UnstableRingError(_NO_ORBIT)
 
     def _pass(self, line: list[Any], beam: Array) -> Array:
         """Readings of the first of the states [6, shot], which move to the line's end."""
@@ -386,7 +307,7 @@ def to_at(launches: ArrayLike, energy: float) -> Array:
     launches = np.asarray(launches, dtype=float)
     reference = np.sqrt((energy * 1e9) ** 2 - ELECTRON**2)
     total = energy * 1e9 + launches[..., 5] * reference
-    converted = launches[..., _SWAPPED].copy()
+    converted = launches[..., SWAPPED].copy()
     converted[..., 4] = np.sqrt(total**2 - ELECTRON**2) / reference - 1
     return converted
 
@@ -398,310 +319,20 @@ def _check_setting(name: str, what: Iterable[str], known: Iterable[str]) -> None
             raise LatticeError(f"'{key}' of '{name}' cannot be set; {offer} can")
 
 
-def _sorted(
-    ring: Ring, causes: Iterable[Cause]
-) -> tuple[dict[int, dict[str, float]], dict[str, float]]:
-    """Amounts by place in the ring and effect, and the scales of the radiation."""
-    errors: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-    scale = dict.fromkeys(("radiation_loss_bends", "radiation_loss_wigglers"), 0.0)
-    families: dict[str, list[int]] = defaultdict(list)
-    for i, element in enumerate(ring.elements):
-        if element.kind == "quadrupole":
-            families[element.family.casefold()].append(i)
+def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
+    """What is wrong with the elements, by place in the ring."""
+    causes = list(causes)
+    check(ring, causes)
+    amounts: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for cause in causes:
-        effect, amount = cause.effect, float(cause.amount)
-        if effect.startswith("monitor_") or effect in OF_THE_BEAM:
-            continue
-        if effect in scale:
-            if cause.element is not None:
-                raise LatticeError(f"'{effect}' is of all elements; its element should be None")
-            scale[effect] += amount
-            continue
-        if effect != "family_gradient" and effect not in SITS_ON:
-            raise unknown_name("effect", effect, [*SITS_ON, *OF_ALL, *OF_THE_BEAM])
-        if cause.element is None:
-            raise LatticeError(f"'{effect}' sits on an element; name it")
-        if effect == "family_gradient":
-            members = families.get(cause.element.casefold())
-            if members is None:
-                known = dict.fromkeys(ring.elements[m[0]].family for m in families.values())
-                raise unknown_name("family of quadrupoles", cause.element, known)
-            for i in members:
-                errors[i][effect] += amount
-            continue
-        i = ring.index(cause.element)
-        if ring.elements[i].kind not in SITS_ON[effect]:
-            raise LatticeError(
-                f"'{effect}' cannot sit on the {ring.elements[i].kind} '{cause.element}', only on "
-                f"a {' or '.join(sorted(SITS_ON[effect]))}"
-            )
-        errors[i][effect] += amount
-    return {i: dict(amounts) for i, amounts in errors.items()}, scale
-
-
-def _wiggler_curvature(element: Element, energy: float) -> float:
-    """Integral of 1 / rho^2 over a wiggler, 1/m, from the vertical focusing that its poles have.
-
-    A plane wiggler focuses vertically with the mean of 1 / rho^2, so R33 = cos(sqrt(k) L).
-    """
-    cosine = _matrix(element, energy)[2, 2]
-    return float(np.arccos(cosine)) ** 2 / element.length if abs(cosine) < 1 else 0.0
-
-
-def _expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
-    """Energy loss of the design orbit in a turn, eV: C_gamma E^4 / 2 pi, integral of 1/rho^2."""
-    energy = ring.energy * 1e9
-    bent = sum(e.angle**2 / e.length for e in ring.elements if e.kind == "bend")
-    wiggled = sum(_wiggler_curvature(e, energy) for e in ring.elements if e.kind == "wiggler")
-    return float(C_GAMMA * energy**4 / (2 * np.pi) * (bends * bent + wigglers * wiggled))
-
-
-def _matrix(element: Element, energy: float) -> Array:
-    """The design's matrix of a matrix element or undulator in AT's coordinates, [6, 6].
-
-    An undulator focuses by (sqrt(2) pi K / (period gamma))^2 in the plane that its field's
-    direction stands for; its slippage, of the order 1 / gamma^2, is left out.
-    """
-    source, length = element.source, element.length
-    if hasattr(source, "r"):
-        if np.any(source.t) or np.any(source.b) or source.delta_e:
-            raise LatticeError(
-                f"matrix '{element.name}' has a kick, a second order or an energy gain, which AT's "
-                "matrix has not; take them out of the lattice file"
-            )
-        return np.asarray(source.r, dtype=float)[np.ix_(_SWAPPED, _SWAPPED)]
-    matrix = np.eye(6)
-    for plane, strength in ((0, source.Ky), (2, source.Kx)):
-        root = 0.0
-        if strength:
-            root = np.sqrt(2.0) * np.pi * float(strength) / (source.lperiod * energy / ELECTRON)
-        phase = root * length
-        matrix[plane : plane + 2, plane : plane + 2] = [
-            [np.cos(phase), length * np.sinc(phase / np.pi)],
-            [-root * np.sin(phase), np.cos(phase)],
-        ]
-    return matrix
-
-
-def _rotation(angle: float) -> Array:
-    """Coordinates seen by a magnet turned by `angle` from x towards y, [6, 6]."""
-    matrix = np.eye(6)
-    matrix[:4, :4] = np.kron(
-        [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], np.eye(2)
-    )
-    return matrix
-
-
-class _Builder:
-    """AT elements of one element of a ring with its errors and settings."""
-
-    def __init__(
-        self, energy: float, steps: int, aperture: float, bends_radiate: bool, wigglers: float
-    ) -> None:
-        self.energy = energy
-        self.steps = steps
-        self.aperture = aperture
-        self.wigglers = wigglers
-        # The usual BndMPoleSymplectic4Pass leaves out the curvature's h x (px^2 + py^2) / 2, and
-        # its Rad twin takes the loss too late in every step (a third of the orbit is missing at
-        # 20 steps); the E2 pass has no vertical field. The exact pass has all three right.
-        self.bend_pass = f"ExactSectorBend{'Rad' if bends_radiate else ''}Pass"
-        self.walls = {"RApertures": np.array([-aperture, aperture, -aperture, aperture])}
-
-    def pieces(
-        self, element: Element, errors: Mapping[str, float], setting: Mapping[str, float]
-    ) -> list[Any]:
-        """As many for every setting: settings change strengths alone."""
-        build: Callable[..., list[Any]] | None = getattr(self, f"_{element.kind}", None)
-        if build is None:
-            raise LatticeError(f"AT cannot build the {element.kind} '{element.name}'")
-        return build(element, defaultdict(float, errors), defaultdict(float, setting))
-
-    def _thin(self, name: str, normal: float, skew: float) -> Any:
-        """Thin gradients: px -= normal x - skew y, py += normal y + skew x."""
-        return at.ThinMultipole(name, [0.0, skew], [0.0, normal])
-
-    def _with_middle(
-        self, element: Element, errors: Mapping[str, float], body: Callable[[float], list[Any]]
-    ) -> list[Any]:
-        """The body, or its two halves (`body` of a share of the length) and the thin gradients."""
-        if "gradient_absolute" not in errors and "skew_gradient" not in errors:
-            return body(1.0)
-        thin = self._thin(element.name, errors["gradient_absolute"], errors["skew_gradient"])
-        return [*body(0.5), thin, *body(0.5)]
-
-    def _marker(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        return self._with_middle(element, errors, lambda share: [at.Marker(element.name)])
-
-    def _drift(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        return [at.Drift(element.name, element.length)]
-
-    def _cavity(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        if type(element.source).__name__ != "Cavity":
-            raise LatticeError(
-                f"AT cannot build '{element.name}', a {type(element.source).__name__}; only "
-                "standing-wave cavities (Cavity)"
-            )
-        return self._drift(element, errors, setting)
-
-    def _monitor(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        monitor = at.Monitor(element.name, **self.walls)
-        if element.length == 0:
-            return [monitor]
-        half = at.Drift(element.name, element.length / 2)
-        return [half, monitor, half]
-
-    def _straight(
-        self,
-        element: Element,
-        normal: list[float],
-        roll: float,
-        offset: tuple[float, float],
-        walls: bool,
-    ) -> Callable[[float], list[Any]]:
-        """A straight multipole of strengths k_n, rolled about its own centre."""
-        more: dict[str, Any] = dict(self.walls) if walls else {}
-        angle = element.tilt + roll
-        if any(offset):
-            shift = np.array([offset[0], 0, offset[1], 0, 0, 0])
-            more |= {"T1": -shift, "T2": shift}
-        if angle:
-            more |= {"R1": _rotation(angle), "R2": _rotation(-angle)}
-        factorial = [1.0, 1.0, 2.0, 6.0]
-        strengths = [k / n for k, n in zip(normal, factorial, strict=False)]
-
-        def body(share: float) -> list[Any]:
-            return [
-                at.Multipole(
-                    element.name,
-                    share * element.length,
-                    [0.0] * len(strengths),
-                    strengths,
-                    NumIntSteps=self.steps,
-                    **more,
-                )
-            ]
-
-        return body
-
-    def _quadrupole(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        source = element.source
-        if getattr(source, "x_offs", 0) or getattr(source, "y_offs", 0):
-            raise LatticeError(f"AT cannot build '{element.name}', a quadrupole passed off axis")
-        k1 = (
-            element.k1
-            * (1 + setting["k1_relative"])
-            * (1 + errors["family_gradient"])
-            * (1 + errors["quadrupole_gradient"])
-        )
-        offset = errors["quadrupole_offset_x"], errors["quadrupole_offset_y"]
-        strengths = [0.0, k1, element.k2]
-        body = self._straight(element, strengths, errors["quadrupole_roll"], offset, True)
-        return self._with_middle(element, errors, body)
-
-    def _sextupole(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        k2 = element.k2 * (1 + setting["k2_relative"]) * (1 + errors["sextupole_strength"])
-        offset = errors["sextupole_offset_x"], errors["sextupole_offset_y"]
-        body = self._straight(element, [0.0, element.k1, k2], 0.0, offset, False)
-        return self._with_middle(element, errors, body)
-
-    def _octupole(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        k3 = float(element.source.k3)
-        return self._straight(element, [0.0, 0.0, 0.0, k3], 0.0, (0.0, 0.0), False)(1.0)
-
-    def _multipole(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        strengths = np.asarray(element.source.kn, dtype=float)
-        if strengths[0]:
-            raise LatticeError(f"AT cannot build '{element.name}', a thin multipole that bends")
-        factorials = np.cumprod([1, *range(1, len(strengths))])
-        more = {}
-        if element.tilt:
-            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
-        zero = np.zeros(len(strengths))
-        return [at.ThinMultipole(element.name, zero, strengths / factorials, **more)]
-
-    def _solenoid(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        return [  # AT has the pass and no class; its K is B / (B rho), OCELOT's k half of it
-            at.Element(
-                element.name,
-                Length=element.length,
-                K=2 * float(element.source.k),
-                PassMethod="SolenoidLinearPass",
-            )
-        ]
-
-    def _bend(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        source, length, angle = element.source, element.length, element.angle
-        if length <= 0 or source.h_pole1 or source.h_pole2:
-            raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
-        roll = errors["dipole_roll"]
-        horizontal = angle * errors["dipole_field"] - roll**2 * angle / 2  # what px loses
-        # The body is exact in a step; only its errors, losses and gradients are spread.
-        steps = self.steps if element.k1 or element.k2 else 4
-        more: dict[str, Any] = {}
-        if element.tilt:
-            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
-
-        def body(share: float, **edges: float) -> Any:
-            return at.Dipole(
-                element.name,
-                share * length,
-                share * angle,
-                PolynomB=[horizontal / length, element.k1, element.k2 / 2, 0.0],
-                PolynomA=[-roll * angle / length, 0.0, 0.0, 0.0],
-                NumIntSteps=steps,
-                PassMethod=self.bend_pass,
-                **edges,
-                **more,
-            )
-
-        entrance, exit_ = source.fint * source.gap, source.fintx * source.gap
-        if entrance == exit_:
-            return [body(1.0, EntranceAngle=source.e1, ExitAngle=source.e2, gK=entrance)]
-        return [  # AT's exact bend has one fringe integral for both edges
-            body(0.5, EntranceAngle=source.e1, gK=entrance, FringeBendExit=0),
-            body(0.5, ExitAngle=source.e2, gK=exit_, FringeBendEntrance=0),
-        ]
-
-    def _hcorrector(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        kick = setting.get("kick", element.angle) * (1 + errors["corrector_calibration"])
-        x = kick * np.cos(element.tilt) + errors["corrector_kick_x"]
-        y = kick * np.sin(element.tilt) + errors["corrector_kick_y"]
-        cosine, sine = np.cos(errors["corrector_roll"]), np.sin(errors["corrector_roll"])
-        turned = [cosine * x - sine * y, sine * x + cosine * y]
-        return [at.Corrector(element.name, element.length, turned)]
-
-    _vcorrector = _hcorrector  # OCELOT tilts a vertical corrector by a right angle
-
-    def _matrix(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        matrix = np.asfortranarray(_matrix(element, self.energy))
-        return [at.M66(element.name, matrix, Length=element.length)]
-
-    def _wiggler(self, element: Element, errors: Any, setting: Any) -> list[Any]:
-        name, whole = element.name, _matrix(element, self.energy)
-        thin = "gradient_absolute" in errors or "skew_gradient" in errors
-        pieces = []
-        if "insertion_device_focusing" in errors:
-            pieces.append(self._thin(name, errors["insertion_device_focusing"], 0.0))
-        if not thin and not self.wigglers:
-            return [*pieces, *self._matrix(element, errors, setting)]
-        half = at.M66(name, np.asfortranarray(np.real(sqrtm(whole))), Length=element.length / 2)
-        middle = []
-        if thin:
-            middle.append(self._thin(name, errors["gradient_absolute"], errors["skew_gradient"]))
-        if self.wigglers:
-            middle += self._loss(element)
-        return [*pieces, half, *middle, half]
-
-    def _loss(self, element: Element) -> list[Any]:
-        """delta -> delta - u (1 + 2 delta), and px, py in proportion to the momentum.
-
-        AT's change of the reference momentum by 1 / (1 - u) takes the share u from px, py and
-        1 + delta; a matrix before it adds the second u delta.
-        """
-        curvature = _wiggler_curvature(element, self.energy)
-        share = self.wigglers * C_GAMMA * self.energy**3 / (2 * np.pi) * curvature
-        matrix = np.eye(6, order="F")
-        matrix[4, 4] = 1 - share
-        change = at.Element(element.name, PassMethod="ChangePRefPass", FieldScaling=1 / (1 - share))
-        return [at.M66(element.name, matrix), change]
+        effect = find(cause.effect)
+        if isinstance(effect, RingEffect):
+            for i in effect.members(ring, cause.element):
+                amounts[i][effect.name] += cause.amount
+    wrong = {i: Build() for i in amounts}
+    for i, own in amounts.items():
+        for name, amount in own.items():
+            effect = find(name)
+            assert isinstance(effect, RingEffect)
+            effect.build(wrong[i], amount)
+    return wrong

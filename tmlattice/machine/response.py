@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import c as SPEED_OF_LIGHT
 from tqdm.auto import tqdm
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, Settings, apply, background_rms, check, monitors_with
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.lattice import Ring
-from tmlattice.machine.at_engine import PETRA_HARMONIC, PETRA_LENGTH, AtEngine
+from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.machine import ENGINES, true_causes
 from tmlattice.machine.shots import draw_background, stream
 from tmlattice.measurement import OrbitResponse, RfStep
@@ -22,9 +22,10 @@ from tmlattice.observe.calibration import corrector_scales
 Array = NDArray[np.float64]
 
 NOISE = (2e-6, 1.2e-6)
-"""rms of an orbit change, m: stored-beam readings of PETRA III (x, y)."""
-RF_STEP = -3000.0
-"""Hz."""
+"""rms of an orbit change, m: averaged readings of a stored beam (x, y)."""
+RF_ENERGY = 5e-3
+"""Relative change of the energy by the RF's step: millimetres of orbit, half of what rings with a
+small acceptance hold."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def simulate_response(
     *,
     correctors: Sequence[str] | None = None,
     kick: float = 1e-4,
-    rf_step: float = RF_STEP,
+    rf_step: float | None = None,
     one_sided: bool = False,
     background: Mapping[str, float | None] | None = None,
     noise: float | Sequence[float] = NOISE,
@@ -82,7 +83,8 @@ def simulate_response(
         causes: what is wrong with it.
         correctors: names; None: all, in beam order.
         kick: the whole change of each corrector, rad.
-        rf_step: Hz; 0: the RF is not stepped.
+        rf_step: Hz; 0: the RF is not stepped; None: what raises the energy by 5e-3, from the
+            design's own compaction, to two digits.
         one_sided: from the corrector's own kick to `kick` more, else from half below to half above.
         background: small random errors: effect -> rms (None: the catalogue's own), or "all".
         noise: rms of one orbit change, m, one number or (x, y).
@@ -107,9 +109,12 @@ def simulate_response(
     names = tuple(monitor.name for monitor in ring.monitors)
     if not names:
         raise MeasurementError(f"'{ring.name}' has no monitor; nothing reads its orbit")
-    columns = ResponseModel(ring).columns(correctors)
-    harmonic = max(round(PETRA_HARMONIC * ring.length / PETRA_LENGTH), 1)
-    frequency = harmonic * SPEED_OF_LIGHT / ring.length
+    design = ResponseModel(ring)
+    columns = design.columns(correctors)
+    rf = rf_of(ring)
+    harmonic, frequency = rf.harmonic, rf.frequency(ring)
+    if rf_step is None:
+        rf_step = float(f"{RF_ENERGY / design.rf_start[5] * frequency:.1e}")
     low, high = (0.0, kick) if one_sided else (-kick / 2, kick / 2)
     steps: list[tuple[str | None, float, float]] = [(name, low, high) for name in columns.names]
     if rf_step:
@@ -130,7 +135,7 @@ def simulate_response(
     for i, change in enumerate(changes):
         change += sigma * stream(seed, "response", i).standard_normal(change.shape)  # noqa: PLW2901
     count = len(columns.names)
-    rf = RfStep(frequency, harmonic, rf_step, changes[-1]) if rf_step else None
+    stepped = RfStep(frequency, harmonic, rf_step, changes[-1]) if rf_step else None
     measured = OrbitResponse(
         correctors=columns.names,
         planes=columns.planes,
@@ -138,7 +143,7 @@ def simulate_response(
         monitors=names,
         response=changes[:count],
         noise=np.tile(sigma, (len(names), 1)) if (sigma > 0).all() else None,
-        rf=rf,
+        rf=stepped,
         lattice=ring.name,
         energy=ring.energy,
     )

@@ -330,7 +330,7 @@ def ring_matrix(ring: Ring) -> Array:
     total = np.eye(4)
     known: dict[Hashable, list[Array]] = {}
     for element in ring.elements:
-        if element.errors != NO_ERRORS:
+        if element.errors != NO_ERRORS or element.kind == "cavity":
             total = quadratic_map(element, ring.energy, 6).R[:4, :4] @ total
             continue
         physics = physics_of(element)

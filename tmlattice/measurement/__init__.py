@@ -7,16 +7,12 @@
 ...     writer.add(0, launch, None, {}, readings)     # readings [turn, monitor, 2]
 """
 
-from tmlattice.measurement.folder import (
-    MeasurementWriter,
-    measurement_writer,
-    read_measurement,
-    write_measurement,
-)
+from tmlattice.measurement.folder import read_measurement
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.tables import read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import Comparison, Measurement
 from tmlattice.measurement.truth import Truth, read_truth, write_truth
+from tmlattice.measurement.write import MeasurementWriter, measurement_writer, write_measurement
 
 __all__ = [
     "Comparison",

@@ -1,43 +1,17 @@
 """The network: weights stacked over layers, readings of a launch, tracking over many turns."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from tmlattice.beam.chain import Chain, LayerChain
+from tmlattice.beam.chain import Chain
 from tmlattice.maps import RingMaps
 from tmlattice.network.autograd import Sweep
-
-if TYPE_CHECKING:
-    from tmlattice.network.symplectic_network import SymplecticNetwork
+from tmlattice.network.base import NetworkChain
+from tmlattice.network.symplectic_network import SymplecticNetwork
 
 Array = NDArray[np.float64]
-
-
-class NetworkChain(torch.nn.Module, LayerChain):
-    """What every network has: launches as tensors or arrays; states and turns of its chain."""
-
-    def extra_repr(self) -> str:
-        """For print(network)."""
-        return (
-            f"layers={len(self.layers)}, monitors={len(self.monitors)}, dimension={self.dimension}"
-        )
-
-    def _launch(self, launch: ArrayLike | Tensor) -> Tensor:
-        if not isinstance(launch, Tensor):
-            return torch.from_numpy(super()._start(launch))
-        if launch.ndim != 2 or launch.shape[1] != self.dimension:
-            raise ValueError(
-                f"launch has the shape {tuple(launch.shape)}; it should be "
-                f"[batch, {self.dimension}]"
-            )
-        return launch.to(torch.float64).contiguous()
-
-    def _start(self, launch: ArrayLike | Tensor) -> Array:
-        return np.asarray(self._launch(launch).detach().numpy())
 
 
 class TaylorNetwork(NetworkChain, Chain):
@@ -66,13 +40,11 @@ class TaylorNetwork(NetworkChain, Chain):
         self.W1 = torch.nn.Parameter(torch.from_numpy(maps.W1.copy()))
         self.W2 = torch.nn.Parameter(torch.from_numpy(maps.W2.copy()))
 
-    def symplectic(self) -> "SymplecticNetwork":
+    def symplectic(self) -> SymplecticNetwork:
         """The same ring in layers that are symplectic exactly, and stay so whatever is fitted.
 
         See `SymplecticNetwork`.
         """
-        from tmlattice.network.symplectic_network import SymplecticNetwork
-
         return SymplecticNetwork.from_network(self)
 
     def weights(self) -> tuple[Array, Array, Array]:

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from tmlattice.beam import flows, sweeps
 from tmlattice.beam.aperture import check_alive
-from tmlattice.beam.chain import chain
+from tmlattice.beam.chain import Chain, merged, products
 from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
 from tmlattice.maps.taylor import second_derivatives, symplectic_form
+from tmlattice.network.base import NetworkChain
 from tmlattice.network.generators import (
     cubic_generator,
     field,
@@ -21,7 +22,6 @@ from tmlattice.network.generators import (
     nearest_symplectic,
     pull_field,
 )
-from tmlattice.network.network import NetworkChain, TaylorNetwork
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -127,7 +127,7 @@ class SymplecticNetwork(NetworkChain):
         self.register_buffer("design", torch.from_numpy(generator.copy()))
 
     @classmethod
-    def from_network(cls, network: TaylorNetwork) -> "SymplecticNetwork":
+    def from_network(cls, network: Chain) -> "SymplecticNetwork":
         """Layers that agree with a network's to second order.
 
         Args:
@@ -199,14 +199,17 @@ class SymplecticNetwork(NetworkChain):
         # Inside a turn nobody looks: matrices that follow each other are multiplied.
         ends = np.flatnonzero(moves | W0.any(axis=1))
         ends = np.unique([*ends, len(W1) - 1])
-        first = np.concatenate([[0], ends[:-1] + 1])
-        merged = np.stack([chain(W1[a : b + 1]) for a, b in zip(first, ends, strict=True)])
         rest = (w[ends] for w in (*fields, moves, flat))
-        sweeps.run(flows.track, len(history), size, W0[ends], merged, *rest, history)
+        sweeps.run(flows.track, len(history), size, W0[ends], merged(W1, ends), *rest, history)
+
+    def tangents(self, x: Array) -> tuple[Array, Array]:
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
+        from the start to there, d state / d launch, [layer + 2, n, n]."""
+        path, steps = self.jacobians(x)
+        return path, products(steps)
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch, all exits and the ring's end, and the Jacobians of
-        the layers and of the closing way there [layer + 1, n, n]."""
+        """The same states, and the Jacobian of every layer alone and of the closing way."""
         path, _, slopes, W1 = self._slopes(x)
         half, one = 0.5 * slopes, np.eye(self.dimension)
         return path, np.asarray(np.linalg.solve(one - half, (one + half) @ W1), dtype=float)
@@ -236,10 +239,7 @@ class SymplecticNetwork(NetworkChain):
         layers = len(self.layers)
         half, one = 0.5 * slopes[:layers], np.eye(self.dimension)
         steps = np.linalg.solve(one - half, (one + half) @ W1[:layers])
-        M = np.empty((layers + 1, *one.shape))
-        M[0] = one
-        for k in range(layers):
-            M[k + 1] = steps[k] @ M[k]
+        M = products(np.asarray(steps, dtype=float))
         i, j = np.triu_indices(self.dimension)
         middle = middle[:layers]
         monomials = np.concatenate(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import Columns, ResponseModel
-from tmlattice.effects import Cause, apply, check, find, monitors_with
+from tmlattice.effects import CATALOGUE, Cause, apply, check, find, monitors_with
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
@@ -16,10 +16,7 @@ from tmlattice.measurement.documents import located, read_document
 Array = NDArray[np.float64]
 
 FORMAT = "tmlattice-calibration"
-CALIBRATES = (
-    "monitor_gain_x", "monitor_gain_y", "monitor_roll", "monitor_coupling", "monitor_swap",
-    "monitor_dead", "corrector_calibration", "corrector_roll",
-)  # fmt: skip
+CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrates)
 """The effects that a calibration may hold."""
 
 
@@ -103,7 +100,7 @@ def calibrated_response(
 
 def _check(causes: Iterable[Cause]) -> None:
     for cause in causes:
-        if find(cause.effect).name not in CALIBRATES:
+        if not find(cause.effect).calibrates:
             raise EffectError(
                 f"'{cause.effect}' is no calibration; those are {', '.join(CALIBRATES)}"
             )

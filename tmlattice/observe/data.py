@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
@@ -54,20 +54,6 @@ class Data:
         """The same with these readings missing."""
         return replace(self, valid=self.valid & ~dropped)
 
-    def shot(self, chosen: Sequence[int] | Flags) -> "Data":
-        """Some of the shots."""
-        index = np.arange(self.shots)[np.asarray(chosen)]
-        return Data(
-            self.readings[index],
-            self.valid[index],
-            self.sigma[index],
-            self.launches[index],
-            self.launch_sigma[index],
-            tuple(self.settings[i] for i in index),
-            self.turns,
-            self.active[index],
-        )
-
 
 def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False) -> Data:
     """The shots of a measurement.
@@ -115,3 +101,60 @@ def joined(first: Data, second: Data) -> Data:
     names = ("readings", "valid", "sigma", "launches", "launch_sigma", "active")
     arrays = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
     return Data(settings=first.settings + second.settings, turns=first.turns, **arrays)
+
+
+NOISE_FLOOR = 1e-9
+"""m. Readings without noise are trusted to this: where OCELOT's maps are rounded and truncated."""
+
+
+def first_turn(
+    monitors: Sequence[str],
+    measurement: Measurement,
+    noise: float | None,
+    launch_sigma: ArrayLike | None,
+    dimension: int = 4,
+) -> Data:
+    """The first turn alone, with a stated noise and launches as they are said to be.
+
+    Args:
+        monitors: names, in the order of the readings.
+        measurement: at least one shot.
+        noise: rms of one reading, m; None: the measurement's.
+        launch_sigma: standard error of the launch coordinates, one number or [n]; None: known.
+        dimension: n, of the network.
+
+    Raises:
+        MeasurementError: no reading of the first turn, nobody states the noise, or a launch that n
+            coordinates do not know.
+        UnknownNameError: another monitor.
+    """
+    ordered = measurement.in_order_of(monitors)
+    ordered.states(dimension)  # says where four coordinates do not do
+    readings = ordered.readings[:, 0]
+    valid = np.isfinite(readings)
+    if not valid.any():
+        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
+    stated = ordered.noise if noise is None else np.full((len(monitors), 2), noise)
+    if stated is None or np.isnan(stated[valid.any(axis=0)]).any():
+        raise MeasurementError(
+            "the measurement does not state its noise; give noise= in m (one reading's rms)"
+        )
+    sigma = np.empty_like(readings)
+    sigma[:] = np.maximum(np.nan_to_num(stated, nan=1.0), NOISE_FLOOR)
+    width = np.zeros(dimension)
+    if launch_sigma is not None:
+        width[:] = launch_sigma
+    known = np.zeros((len(readings), 5))
+    known[:, :4] = width[:4]
+    if dimension == 6:
+        known[:, 4] = width[5]
+    return Data(
+        np.where(valid, readings, 0.0),
+        valid,
+        sigma,
+        ordered.launches,
+        known,
+        tuple(ordered.settings or ({} for _ in readings)),
+        1,
+        np.ones(len(readings), dtype=bool),
+    )

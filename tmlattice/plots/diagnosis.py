@@ -1,6 +1,6 @@
 """Figures of a diagnosis."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,23 +9,24 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.effects import find
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
-from tmlattice.inference.search import SHARES
+from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import lattice_strip
-from tmlattice.report.text import words
 
 Array = NDArray[np.float64]
 
-GROUPS = {
-    "quadrupoles": ("tab:red", ("quadrupole_", "gradient_", "skew_", "family_")),
-    "bends": ("tab:blue", ("dipole_",)),
-    "correctors": ("tab:orange", ("corrector_",)),
-    "sextupoles": ("tab:green", ("sextupole_",)),
-    "insertion devices": ("tab:purple", ("insertion_",)),
-    "monitors": ("tab:cyan", ("monitor_",)),
-    "beam": ("tab:brown", ()),
+COLOURS: Mapping[str, str] = {
+    "quadrupoles": "tab:red",
+    "bends": "tab:blue",
+    "correctors": "tab:orange",
+    "sextupoles": "tab:green",
+    "insertion devices": "tab:purple",
+    "monitors": "tab:cyan",
+    "beam": "tab:brown",
 }
-"""Name -> colour, and how its effects' names begin; the last takes the rest."""
+"""By the group of an effect."""
 
 BEFORE, AFTER = "C0", "C3"
 
@@ -35,6 +36,21 @@ WIDE = 300.0
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
+    own = _trajectory_figures if diagnosis.kind == "trajectory" else response_figures
+    yield from own(diagnosis)
+    for number, finding in enumerate(diagnosis.findings, 1):
+        if len(finding.credible_set) > 1:
+            height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
+            _, ax = plt.subplots(figsize=(9, height), layout="constrained")
+            plot_credible_set(finding, ax)
+            yield (
+                f"credible-set-{number}",
+                f"Explanations of finding {number} that the data do not exclude.",
+                _figure(ax),
+            )
+
+
+def _trajectory_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     yield (
         "readings",
         "Readings of one shot of the fit, and what each model leaves of them, its launch fitted.",
@@ -63,27 +79,12 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
             "Readings of shots that the fit never saw less the model, as findings are added.",
             _figure(ax),
         )
-    for number, finding in enumerate(diagnosis.findings, 1):
-        if len(finding.credible_set) > 1:
-            height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
-            _, ax = plt.subplots(figsize=(9, height), layout="constrained")
-            plot_credible_set(finding, ax)
-            yield (
-                f"credible-set-{number}",
-                f"Explanations of finding {number} that the data do not exclude.",
-                _figure(ax),
-            )
 
 
 def _figure(ax: Axes) -> Figure:
     figure = ax.figure
     assert isinstance(figure, Figure)
     return figure
-
-
-def group(effect: str) -> str:
-    """The group of `GROUPS` that an effect belongs to."""
-    return next((name for name, (_, starts) in GROUPS.items() if effect.startswith(starts)), "beam")
 
 
 # --- readings -------------------------------------------------------------------------------------
@@ -98,11 +99,11 @@ def plot_readings(
         shot: its place among those of the fit; else the one with the largest residual.
     """
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
-    data, found = diagnosis.data, diagnosis.explanation
+    data, found = diagnosis.trajectories.data, diagnosis.explanation
     explained = diagnosis.verdict != "distributed"
-    models = [found.before.paths.readings]
+    models = [found.before.point.view.readings]
     if explained:
-        models.append(found.fit.paths.readings)
+        models.append(found.fit.point.view.readings)
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
     if shot is None:
@@ -252,8 +253,8 @@ def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
     free = explanation.first_kicks
     freedom = max(int(np.median(free.freedom)), 1)
     return (
-        explanation.first.threshold(rate * SHARES["named"]),
-        free_threshold(rate * SHARES["kick"], freedom, len(free.places)),
+        explanation.first.threshold(rate * DEFAULT.shares["named"]),
+        free_threshold(rate * DEFAULT.shares["kick"], freedom, len(free.places)),
     )
 
 
@@ -261,14 +262,14 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     """Statistics at their places, one colour for each group, and both thresholds."""
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
     s = _middles(diagnosis)
-    groups = np.array([group(effect) for effect, _ in found.hypotheses])
+    groups = np.array([find(effect).group for effect, _ in found.hypotheses])
     layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
     order = np.argsort(layers)
     ax.plot(
         layers[order], np.maximum(free.statistic[order], FLOOR),
         color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
     )  # fmt: skip
-    for name, (colour, _) in GROUPS.items():
+    for name, colour in COLOURS.items():
         own = (groups == name) & np.isfinite(s) & (found.statistic > FLOOR)
         if own.any():
             ax.plot(
@@ -309,9 +310,8 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     side.grid(alpha=0.25)
     side.axhline(_thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
     for i, (effect, value) in enumerate(best.items()):
-        side.plot(i, value, "D", color=GROUPS[group(effect)][0], ms=5, clip_on=False, zorder=4)
-    names = [name.replace("radiation_loss_", "loss in ").replace("_", " ") for name in best]
-    side.set_xticks(range(len(best)), names)
+        side.plot(i, value, "D", color=COLOURS[find(effect).group], ms=5, clip_on=False, zorder=4)
+    side.set_xticks(range(len(best)), [find(effect).label for effect in best])
     side.tick_params(axis="x", labelrotation=90, labelsize="x-small", labelbottom=True)
     for label in side.get_xticklabels():
         label.set_in_layout(False)  # they hang into the empty corner beside the strip
@@ -364,7 +364,8 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
         )
     ax.axhline(noise, color="k", linestyle="--", linewidth=1, label=f"noise {noise:.1f} µm")
     labels = ["design"] + [
-        f"+ {words(cause.effect)}\n{cause.element or ''}".rstrip() for cause in diagnosis.causes
+        f"+ {find(cause.effect).words}\n{cause.element or ''}".rstrip()
+        for cause in diagnosis.causes
     ]
     crowded = len(labels) > 4
     ax.set_xticks(
@@ -404,7 +405,7 @@ def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
         _, ax = plt.subplots()
     members = finding.credible_set[:MOST]
     rows = np.arange(len(members))
-    colours = [GROUPS[group(member.effect)][0] for member in members]
+    colours = [COLOURS[find(member.effect).group] for member in members]
     ax.barh(rows, [100 * member.probability for member in members], color=colours, height=0.6)
     for row, member in zip(rows, members, strict=True):
         ax.annotate(

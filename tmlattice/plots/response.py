@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from tmlattice.beam.chain import Chain
-from tmlattice.diagnosis.response_result import ResponseDiagnosis
+from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.optics import twiss
 from tmlattice.plots.strip import lattice_strip
 
 
-def response_figures(result: ResponseDiagnosis) -> Iterator[tuple[str, str, Figure]]:
+def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure: (name, caption, figure); close each after use."""
     yield (
         "maps",
@@ -38,25 +38,25 @@ def response_figures(result: ResponseDiagnosis) -> Iterator[tuple[str, str, Figu
         )
 
 
-def plot_maps(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure:
+def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Measured response and residuals before and after, columns by plane and place."""
     figure = plt.figure(figsize=(11, 8), layout="constrained") if figure is None else figure
-    m = result.measured
-    ring = result.ring
+    view, ring = result.response, result.ring
+    m = view.measured
     plane = np.array([int(p == "y") for p in m.planes])
     place = np.array([ring[name].s for name in m.correctors])
     order = np.lexsort((place, plane))
     rows = [
-        ("measured", result.data),
-        ("measured - design", result.data - result.design),
-        ("measured - result", result.data - result.model),
+        ("measured", view.data),
+        ("measured - design", view.data - view.design),
+        ("measured - result", view.data - view.model),
     ]
     axes = figure.subplots(3, 1, sharex=True)
     for ax, (title, values) in zip(axes, rows, strict=True):
         image = 1e6 * np.take_along_axis(values[:-1], plane[:, None, None], 2)[order, :, 0]
-        image[:, ~result.good] = np.nan
-        image[result.held[:-1][order]] = np.nan if title.endswith("result") else image[
-            result.held[:-1][order]
+        image[:, ~view.good] = np.nan
+        image[view.held[:-1][order]] = np.nan if title.endswith("result") else image[
+            view.held[:-1][order]
         ]  # fmt: skip
         limit = float(np.nanpercentile(abs(image), 99))
         colours = plt.get_cmap("RdBu_r").with_extremes(bad="0.8")
@@ -72,7 +72,7 @@ def plot_maps(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure
     return figure
 
 
-def plot_steps(result: ResponseDiagnosis, ax: Axes | None = None) -> Axes:
+def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
     """Held-out rms after each step that was kept."""
     if ax is None:
         ax = plt.subplots(figsize=(9, 4))[1]
@@ -85,9 +85,7 @@ def plot_steps(result: ResponseDiagnosis, ax: Axes | None = None) -> Axes:
         ("dispersion_rms", "RF response", "^-C2"),
     ):
         ax.plot(at, [1e6 * getattr(step, name) for step in steps], style, label=label)
-    noise = result.measured.noise
-    assert noise is not None
-    sigma = 1e6 * float(np.sqrt(np.mean(noise[result.good] ** 2)))
+    sigma = 1e6 * result.gap["noise"]
     ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -100,7 +98,7 @@ def plot_steps(result: ResponseDiagnosis, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_gradients(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure:
+def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Relative gradient errors with their errors, above the lattice."""
     figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
@@ -121,7 +119,7 @@ def plot_gradients(result: ResponseDiagnosis, figure: Figure | None = None) -> F
     return figure
 
 
-def plot_beta_beat(result: ResponseDiagnosis, figure: Figure | None = None) -> Figure:
+def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
     figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])

@@ -27,7 +27,7 @@ def plot_weights(
         figure: an empty one; else a new one.
         mark: an element to show, such as the true cause.
     """
-    from tmlattice.fitting.weights import PARTS
+    from tmlattice.fitting.weight_parts import PARTS
 
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
     raw, score, size, share, strip = figure.subplots(

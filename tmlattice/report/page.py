@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tmlattice.diagnosis import Diagnosis
+from tmlattice.report import response_text
 from tmlattice.report import text as report
 
 if TYPE_CHECKING:
@@ -86,5 +87,6 @@ def page(
         diagnosis.provenance if provenance is None else provenance,
         diagnosis=diagnosis,
         report=report,
+        dense=response_text,
         pictures={picture.name: picture for picture in pictures},
     )

@@ -1,33 +1,15 @@
-"""What the diagnosis of an orbit response says, in words.
+"""What only a dense fit has to say: its steps, its errors, what may be missing."""
 
->>> print(response_text(result))
-"""
-
-import textwrap
 from collections.abc import Iterable
 
 import numpy as np
 
-from tmlattice.diagnosis.response_result import ResponseDiagnosis, Step
-from tmlattice.report.text import amount_text, words
+from tmlattice.diagnosis.dense import Step
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.report.text import amount_text, columns, words, wrapped
 
-WIDTH = 100
 SHOWN = 8
 """Largest errors of each effect that are listed."""
-
-
-def verdict_sentence(result: ResponseDiagnosis) -> str:
-    """What was found, in a sentence."""
-    if result.verdict == "nothing":
-        return "No error is seen: the design explains the readings within their noise."
-    first, last = result.steps[0], result.steps[-1]
-    return (
-        "Many small errors all along the ring: with them the gap on held-out correctors falls from "
-        f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
-        f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
-        f"{1e6 * last.heldout_rms_coupling:.1f} µm, and that of the RF's response from "
-        f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
-    )
 
 
 def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
@@ -55,7 +37,7 @@ HYPOTHESIS = (
 )  # fmt: skip
 
 
-def hypothesis_rows(result: ResponseDiagnosis) -> list[tuple[str, ...]]:
+def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
     """Each hypothesis: amount and its error (of several: rms, typical error), held-out figures."""
     return [
         (
@@ -73,7 +55,7 @@ def hypothesis_rows(result: ResponseDiagnosis) -> list[tuple[str, ...]]:
     ]
 
 
-def largest(result: ResponseDiagnosis, effect: str) -> list[str]:
+def largest(result: Diagnosis, effect: str) -> list[str]:
     """The errors of an effect that are furthest from zero, with their posterior rms."""
     rows = [(c, s) for c, s in zip(result.causes, result.errors, strict=True) if c.effect == effect]
     rows.sort(key=lambda row: -abs(row[0].amount))
@@ -82,58 +64,49 @@ def largest(result: ResponseDiagnosis, effect: str) -> list[str]:
     ]
 
 
-def left_sentence(result: ResponseDiagnosis) -> str:
+def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
+    """By effect: how many amounts with their rms, and the largest."""
+    rows = []
+    for effect in dict.fromkeys(cause.effect for cause in result.causes):
+        amounts = [c.amount for c in result.causes if c.effect == effect]
+        rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
+        said = f"{words(effect)}: {len(amounts)}, rms {rms}; largest:"
+        rows.append((said, "; ".join(largest(result, effect))))
+    return rows
+
+
+def left_sentence(result: Diagnosis) -> str:
     """What stays: noise, or patterns."""
-    left = result.left
-    x, y = left.low_rank
+    left = result.unexplained["patterns"]
+    x, y = left["low_rank"]
     return (
-        f"Of the fitted readings {np.sqrt(left.chi2_per_dof):.1f} times the noise is left; eight "
-        f"patterns hold {100 * x:.0f} % of it in x and {100 * y:.0f} % in y."
+        f"Of the fitted readings {np.sqrt(left['chi2_per_dof']):.1f} times the noise is left; "
+        f"eight patterns hold {100 * x:.0f} % of it in x and {100 * y:.0f} % in y."
     )
 
 
-def response_text(result: ResponseDiagnosis, width: int = WIDTH) -> str:
-    """The whole report as plain text."""
-    lines = _wrapped(f"{result.verdict.upper()}. {verdict_sentence(result)}", width)
-    lines += ["", "Held-out correctors, rms in µm (chi2 per reading):", *_columns(
-        [HEAD, *step_rows(result.steps)]
-    )]  # fmt: skip
+def bad_monitors_text(result: Diagnosis) -> str:
+    """Their names."""
+    return f"Bad monitors, left out: {', '.join(result.bad_monitors) or 'none'}"
+
+
+def steps_text(result: Diagnosis, width: int) -> list[str]:
+    """The section of a plain text, in lines."""
+    lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
+    lines += columns([HEAD, *step_rows(result.steps)], right=True)
     if result.refused:
         lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
-        lines += _columns([HEAD, *step_rows(result.refused)])
-    bad = ", ".join(result.bad_monitors) or "none"
-    lines += ["", *_wrapped(f"Bad monitors, left out: {bad}", width)]
-    for effect in dict.fromkeys(c.effect for c in result.causes):
-        amounts = [c.amount for c in result.causes if c.effect == effect]
-        rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
-        lines += ["", *_wrapped(f"{words(effect)}: {len(amounts)}, rms {rms}; largest:", width)]
-        lines += _wrapped("; ".join(largest(result, effect)), width, "   ")
-    lines += ["", *_wrapped(left_sentence(result), width)]
+        lines += columns([HEAD, *step_rows(result.refused)], right=True)
+    lines += ["", *wrapped(bad_monitors_text(result), "", width)]
+    for said, amounts in error_rows(result):
+        lines += ["", *wrapped(said, "", width), *wrapped(amounts, "   ", width)]
+    lines += ["", *wrapped(left_sentence(result), "", width)]
     if result.hypotheses:
         lines += [
             "",
             "What may be missing: held-out rms in µm, each alone, and on top of those that help:",
         ]
-        lines += _columns([HYPOTHESIS, *hypothesis_rows(result)])
+        lines += columns([HYPOTHESIS, *hypothesis_rows(result)], right=True)
     for said in result.degenerate:
-        lines += _wrapped(f"Not settled by the data: {said}.", width)
-    for warning in result.warnings:
-        lines += ["", *_wrapped(f"Note: {warning}", width)]
-    return "\n".join(lines)
-
-
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    sizes = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "   ".join(
-            cell.ljust(size) if i == 0 else cell.rjust(size)
-            for i, (cell, size) in enumerate(zip(row, sizes, strict=True))
-        )
-        for row in rows
-    ]
-
-
-def _wrapped(text: str, width: int, indent: str = "") -> list[str]:
-    return textwrap.wrap(
-        text, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
-    )
+        lines += wrapped(f"Not settled by the data: {said}.", "", width)
+    return lines

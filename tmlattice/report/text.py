@@ -1,8 +1,6 @@
 """What a diagnosis says, in the words of a control room.
 
->>> print(report_text(diagnosis))
-
-The same sentences and rows stand in the terminal and in the HTML page.
+The same sentences and rows stand in the terminal (`plain.report_text`) and in the HTML page.
 """
 
 import textwrap
@@ -11,63 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
-from tmlattice.effects import find
-
-WIDTH = 100
-
-WORDS = {
-    "quadrupole_gradient": "wrong strength of a quadrupole",
-    "gradient_absolute": "focusing error (quadrupole field) in the middle of an element",
-    "skew_gradient": "skew quadrupole field in the middle of an element",
-    "quadrupole_roll": "quadrupole rolled about the beam axis",
-    "quadrupole_offset_x": "quadrupole displaced horizontally",
-    "quadrupole_offset_y": "quadrupole displaced vertically",
-    "family_gradient": "wrong strength of a whole family of quadrupoles",
-    "dipole_field": "wrong field of a bending magnet",
-    "dipole_roll": "bending magnet rolled about the beam axis",
-    "corrector_kick_x": "corrector that kicks horizontally beyond its setting",
-    "corrector_kick_y": "corrector that kicks vertically beyond its setting",
-    "corrector_calibration": "wrong calibration of a corrector",
-    "corrector_roll": "corrector rolled about the beam axis",
-    "sextupole_strength": "wrong strength of a sextupole",
-    "sextupole_offset_x": "sextupole displaced horizontally",
-    "sextupole_offset_y": "sextupole displaced vertically",
-    "insertion_device_focusing": "unmodelled focusing of an insertion device",
-    "monitor_offset_x": "horizontal offset of a monitor",
-    "monitor_offset_y": "vertical offset of a monitor",
-    "monitor_gain_x": "wrong horizontal gain of a monitor",
-    "monitor_gain_y": "wrong vertical gain of a monitor",
-    "monitor_roll": "monitor rolled about the beam axis",
-    "monitor_coupling": "monitor that mixes its planes",
-    "monitor_swap": "monitor with its planes exchanged",
-    "monitor_dead": "dead monitor",
-    "energy_offset": "energy deviation of the beam",
-    "energy_spread": "energy spread of the beam",
-    "radiation_loss_bends": "energy loss by radiation in the bends",
-    "radiation_loss_wigglers": "energy loss by radiation in the wigglers",
-}
-"""Every effect of the catalogue in plain words."""
-
-DEAD = {1.0: "no signal", 2.0: "frozen readings"}
-
-MAIN = (
-    "quadrupole_gradient",
-    "quadrupole_roll",
-    "quadrupole_offset_x",
-    "quadrupole_offset_y",
-    "dipole_field",
-    "dipole_roll",
-    "corrector_kick_x",
-    "corrector_kick_y",
-    "sextupole_strength",
-    "insertion_device_focusing",
-    "monitor_offset_x",
-    "monitor_offset_y",
-    "monitor_gain_x",
-    "monitor_gain_y",
-    "energy_offset",
-)
-"""Effects whose sensitivity a short report states."""
+from tmlattice.effects import CATALOGUE, find
 
 _SCALES = {
     "relative": ((0.0, 100.0, "%"),),
@@ -82,7 +24,7 @@ _SCALES = {
 # --- words for parts ------------------------------------------------------------------------------
 def words(effect: str) -> str:
     """An effect of the catalogue in plain words."""
-    return WORDS.get(effect, effect.replace("_", " "))
+    return CATALOGUE[effect].words if effect in CATALOGUE else effect.replace("_", " ")
 
 
 def _scale(effect: str, amount: float) -> tuple[float, str]:
@@ -100,7 +42,7 @@ def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
         amount, sigma: in the effect's unit.
     """
     if find(effect).discrete:
-        return DEAD.get(amount, "") if effect == "monitor_dead" else ""
+        return find(effect).forms.get(amount, "")
     factor, unit = _scale(effect, amount)
     value = factor * amount
     if sigma is None or not 0 < sigma < np.inf:
@@ -162,13 +104,15 @@ def closed_text(diagnosis: Diagnosis) -> str:
     gap = diagnosis.heldout
     if gap is None:
         return "No shot was held out: nobody but the fit judges the gap"
+    if diagnosis.kind != "trajectory" and len(diagnosis.steps) < 2:
+        return "Nothing was put into the model, so the gap stays"
     if diagnosis.findings and not diagnosis.causes:
         return (
             "What has no name cannot be put into the lattice, so the gap of the held-out shots "
             "stays"
         )
     if gap.closed is None:
-        return "The held-out shots show no gap beyond the noise, so there is none to close"
+        return "Held-out readings show no gap beyond the noise, so there is none to close"
     text = f"{100 * gap.closed:.1f} % of the gap beyond the noise is closed on held-out readings"
     if gap.interval is not None:
         low, high = gap.interval
@@ -202,12 +146,26 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         named = [f for f in found if f.effect is not None]
         also = f" Besides: {'; '.join(_short(f) for f in named)}." if named else ""
         return f"Something acts at s = {where}, and no effect of the catalogue explains it.{also}"
+    if diagnosis.verdict == "distributed" and diagnosis.steps:
+        return steps_sentence(diagnosis)
     if diagnosis.verdict == "distributed":
         return (
             "The data differ from the model all along the ring; no single place, and no few "
             "places, explain it."
         )
     return "No error is seen: the design explains the readings within their noise."
+
+
+def steps_sentence(diagnosis: Diagnosis) -> str:
+    """How far the steps go."""
+    first, last = diagnosis.steps[0], diagnosis.steps[-1]
+    return (
+        "Many small errors all along the ring: with them the gap on held-out correctors falls from "
+        f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
+        f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
+        f"{1e6 * last.heldout_rms_coupling:.1f} µm, and that of the RF's response from "
+        f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+    )
 
 
 def _short(finding: Finding) -> str:
@@ -222,7 +180,7 @@ def _short(finding: Finding) -> str:
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
-    if diagnosis.verdict == "distributed":
+    if diagnosis.verdict == "distributed" and not diagnosis.steps:
         return (
             "Small errors everywhere look like this: state them (--background all), or give a "
             "measurement of this machine from before the fault (--reference)."
@@ -342,15 +300,22 @@ def _others_text(members: Sequence[Member]) -> str:
 
 def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """The gap: (which readings, before, after), rms in µm and chi-square per reading."""
-    rows = [("shots of the fit", diagnosis.fit_before, diagnosis.fit_after)]
+    what = "shots" if diagnosis.kind == "trajectory" else "correctors"
+    rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
     gap = diagnosis.heldout
     if gap is not None:
-        shots = ", ".join(map(str, diagnosis.heldout_shots))
-        rows.append((f"held out (shots {shots})", gap.misfits[0], gap.misfits[-1]))
+        rows.append((f"held out ({heldout_text(diagnosis)})", gap.misfits[0], gap.misfits[-1]))
     return [
         (name, *(f"{1e6 * m.rms:.1f} µm, chi² {_chi2(m.chi2_per_dof)}" for m in (before, after)))  # type: ignore[misc]
         for name, before, after in rows
     ]
+
+
+def heldout_text(diagnosis: Diagnosis) -> str:
+    """Who judges."""
+    if diagnosis.kind == "trajectory":
+        return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
+    return f"{int(diagnosis.response.held.sum())} correctors"
 
 
 def _chi2(value: float) -> str:
@@ -382,59 +347,22 @@ def sensitivity_rows(
     return [(words(name), least_text(name, known[name])) for name in chosen if name in known]
 
 
-# --- the text -------------------------------------------------------------------------------------
-def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
-    """The whole report as plain text.
-
-    Args:
-        diagnosis: of `diagnose`.
-        width: columns.
-    """
-    lines = [*_wrapped(f"{diagnosis.verdict.upper()}. {verdict_sentence(diagnosis)}", "", width)]
-    for number, finding in enumerate(diagnosis.findings, 1):
-        lines += ["", *_wrapped(title(finding), f"{number}. ", width)]
-        for name, text in finding_rows(finding):
-            for i, part in enumerate(text.split("\n")):
-                label = f"   {name if i == 0 else '':<13}"
-                lines += _wrapped(part, label, width)
-    more = next_text(diagnosis) or advice(diagnosis)
-    if more:
-        lines += ["", *_wrapped(more, "Next: ", width)]
-    lines += ["", *_gap_table(diagnosis)]
-    lines += _wrapped(closed_text(diagnosis) + ".", "", width)
-    lines += _wrapped(left_text(diagnosis), "", width)
-    if diagnosis.verdict == "nothing":
-        rows = sensitivity_rows(diagnosis, MAIN)
-        if rows:
-            lines += ["", "Would have been seen, at half of the places where it can sit, from:"]
-            lines += _columns(rows, "   ")
-    for warning in diagnosis.warnings:
-        lines += ["", *_wrapped(warning, "Note: ", width)]
-    return "\n".join(lines)
-
-
-def _gap_table(diagnosis: Diagnosis) -> list[str]:
-    before, after = tune_texts(diagnosis)
-    rows = [
-        ("readings less model, rms", "before", "after"),
-        *gap_rows(diagnosis),
-        ("noise of a reading", noise_text(diagnosis), ""),
-        ("fractional tunes Qx, Qy", before, after),
-    ]
-    return _columns(rows, "")
-
-
-def _columns(rows: Sequence[Sequence[str]], indent: str) -> list[str]:
+# --- lines of text --------------------------------------------------------------------------------
+def columns(rows: Sequence[Sequence[str]], indent: str = "", *, right: bool = False) -> list[str]:
+    """Cells under one another; all but the first to the right, or to the left."""
     sizes = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
-        (
-            indent + "   ".join(cell.ljust(size) for cell, size in zip(row, sizes, strict=True))
+        indent
+        + "   ".join(
+            cell.rjust(size) if right and i else cell.ljust(size)
+            for i, (cell, size) in enumerate(zip(row, sizes, strict=True))
         ).rstrip()
         for row in rows
     ]
 
 
-def _wrapped(text: str, label: str, width: int) -> list[str]:
+def wrapped(text: str, label: str, width: int) -> list[str]:
+    """Lines of at most this width, the label before the first one."""
     return textwrap.wrap(
         text,
         width,

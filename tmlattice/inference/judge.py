@@ -1,8 +1,7 @@
-"""How far the gap between model and machine shrinks, judged on shots that the fit never saw.
+"""How far the gap between model and measurement shrinks, judged on readings that no fit saw.
 
-In each held-out shot only the launch is refitted, on one half of the monitors; the readings of the
-other half are predicted. closed = 1 - (r_after^2 - sigma^2) / (r_before^2 - sigma^2), where sigma^2
-is the variance of a reading and of what the refitted launch predicts for it.
+closed = 1 - (r_after^2 - sigma^2) / (r_before^2 - sigma^2), where sigma^2 is the variance of a
+reading and of what the refitted nuisances predict for it.
 """
 
 from collections.abc import Sequence
@@ -10,12 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from tmlattice.beam.model import Model
-from tmlattice.effects import Cause
-from tmlattice.inference.newton import Fit, Problem, fit
-from tmlattice.inference.whitening import Whitening
-from tmlattice.observe.data import Data
 
 Array = NDArray[np.float64]
 
@@ -48,45 +41,19 @@ class Gap:
     interval: tuple[float, float] | None
 
 
-def held_out_gap(
-    models: Sequence[Model],
-    data: Data,
-    steps: Sequence[Sequence[Cause]],
-    seed: int = 0,
-) -> Gap:
-    """The gap of a series of models on shots that no fit saw.
+def held_out_gap(judged: Sequence[tuple[Array, Array]], seed: int = 0) -> Gap:
+    """The gap of a series of models on readings that no fit saw.
 
     Args:
-        models: of these shots, one for each step: they differ in what is known beside the causes.
-        data: their readings.
-        steps: the causes of each model; the first is the design's, mostly ().
+        judged: by model, the first the design's: what it leaves, NaN where not scored, and the rms
+            to expect of that, both [shot, reading, 2], m.
         seed: of the bootstrap.
     """
-    count = len(models[0].at)
-    odd = np.tile(np.arange(count) % 2 == 1, data.turns)
-    fitted = data.without(np.broadcast_to(odd[None, :, None], data.valid.shape))
-    whitening = Whitening(fitted)
-    scored = data.valid & odd[None, :, None]
-    residuals, sigmas = [], []
-    for model, causes in zip(models, steps, strict=True):
-        launches = fit(Problem(model, fitted, whitening, {}, tuple(causes)), (), data.launches)
-        difference = data.readings - launches.paths.readings
-        residuals.append(np.where(scored, difference, np.nan))
-        sigmas.append(_sigma(data, launches, whitening))
-    left = np.array(residuals)
-    misfits = tuple(misfit(r, s) for r, s in zip(left, sigmas, strict=True))
+    misfits = tuple(misfit(residual, sigma) for residual, sigma in judged)
     closed, interval = None, None
-    if len(left) > 1:
-        closed, interval = _closed(left[0], left[-1], sigmas[0], sigmas[-1], seed)
-    return Gap(misfits, left, closed, interval)
-
-
-def _sigma(data: Data, launches: Fit, whitening: Whitening) -> Array:
-    """rms of a reading less its prediction from a launch that was fitted to other readings."""
-    slopes = launches.paths.launch[..., whitening.columns]
-    covariance = launches.projection.covariance()  # [shot, column, column]
-    predicted = np.einsum("srpi,sij,srpj->srp", slopes, covariance, slopes, optimize=True)
-    return np.asarray(np.sqrt(data.sigma**2 + predicted))
+    if len(judged) > 1:
+        closed, interval = _closed(*judged[0], *judged[-1], seed)
+    return Gap(misfits, np.array([residual for residual, _ in judged]), closed, interval)
 
 
 def misfit(residual: Array, sigma: Array) -> Misfit:
@@ -99,7 +66,7 @@ def misfit(residual: Array, sigma: Array) -> Misfit:
 
 
 def _closed(
-    before: Array, after: Array, sigma_before: Array, sigma_after: Array, seed: int
+    before: Array, sigma_before: Array, after: Array, sigma_after: Array, seed: int
 ) -> tuple[float | None, tuple[float, float] | None]:
     valid = np.isfinite(before) & np.isfinite(after)
     squares = [

@@ -1,8 +1,7 @@
 """Which effect a fitted orbit response still lacks: each hypothesis weighed on held-out readings.
 
->>> run = ResponseRun(ring, measured)
->>> run.run()
->>> for row in weigh(run): print(row.effect, row.amount, row.amount_sigma, row.judgement)
+>>> fit = fit_steps(data, split)
+>>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
 
 A hypothesis is a set of patterns: what the readings would change by for one unit of each of its
 parameters. Patterns are fitted together with everything that the fit already has, linearly about
@@ -12,7 +11,7 @@ kick is.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -21,52 +20,18 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
-from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.response_derivatives import derivatives
-from tmlattice.diagnosis.response import ResponseRun, families, rms_of
-from tmlattice.diagnosis.response_result import pick
-from tmlattice.effects import apply
-from tmlattice.lattice import Ring
+from tmlattice.diagnosis.dense import State, linear, rms_of, weight
+from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
 
 Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array
 
-ENERGY_SPREAD = 1.2e-3
-"""Relative rms energy spread of PETRA III's beam; the scale of the hypothesis."""
-DELTA = 1e-3
-"""Energy deviation of the differences."""
-BEND_GRADIENT = 1e-4
-"""1/m2, of the differences."""
-MILLIMETRE = 1e-3
 FREE = 30.0
 """Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
 FEW = 6
 """So many amounts stand alone."""
-WAVES = 4
-"""Of the leading closed orbits of random kicks in a plane."""
 SPARSE = 0.1
 """Patterns are kept sparse where fewer of their readings are not zero."""
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """An effect that may be missing.
-
-    Attributes:
-        effect: its name.
-        unit: of the amounts.
-        expected: what physics would allow.
-        patterns: d reading / d amount in each column's own plane, m, [parameter, column, monitor].
-        own: each column has its own amount of each pattern.
-        most: the largest physically sensible amount.
-    """
-
-    effect: str
-    unit: str
-    expected: str
-    patterns: Array = field(repr=False)
-    own: bool = False
-    most: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -107,7 +72,7 @@ HELPS = 0.98
 
 
 def weigh(
-    run: ResponseRun,
+    state: State,
     wanted: Iterable[str] | None = None,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> list[Weighed]:
@@ -117,16 +82,16 @@ def weigh(
     held-out rms on top of those before it; then every other is weighed once more beside them.
 
     Args:
-        run: after its fit.
+        state: after the fit.
         wanted: names of `HYPOTHESES`; None: all.
         progress: called with each name.
     """
-    fitted = Fitted(run)
+    fitted = Fitted(state)
     base = fitted.weigh([])
     found: list[Hypothesis] = []
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
-        hypothesis = HYPOTHESES[name](run)
+        hypothesis = HYPOTHESES[name](state)
         # nothing where the ring has no such places, or no reading would move
         if hypothesis is not None and hypothesis.patterns.any():
             found.append(hypothesis)
@@ -206,31 +171,26 @@ class Answer(NamedTuple):
 class Fitted:
     """The linearised fit, to which patterns can be added."""
 
-    def __init__(self, run: ResponseRun) -> None:
-        self.run = run
-        normal, self.start, _ = run.linear(0)
-        groups = run.priors(0)
-        self.slopes = np.asarray(run.slopes).reshape(-1, *run.data.shape[:2])
+    def __init__(self, state: State) -> None:
+        self.state, data = state, state.data
+        there = linear(state, 0)
+        normal, self.start = there.normal, there.start
+        self.slopes = there.by_ring
         # one that does nothing stands there where no family of errors was kept
         basis = np.zeros((len(self.start), 1))
-        basis = np.concatenate([basis, *(g.basis for g in groups)], axis=1)
-        scales = [np.full(g.basis.shape[1], g.rms) if g.each is None else g.each for g in groups]
-        prior = np.concatenate([np.ones(1), *scales])
+        basis = np.concatenate([basis, *(g.basis for g in there.groups)], axis=1)
+        prior = np.concatenate([np.ones(1), *(g.scale for g in there.groups)])
         self.spread = basis * prior
         A = self.spread.T @ normal.matrix @ self.spread
         self.factor = cho_factor(A + np.eye(len(A)), lower=True)
         self.vector = self.spread.T @ (normal.vector + normal.matrix @ self.start)
-        self.weight = run.weight(0)
-        own = run.plane
-        gain = np.diagonal(run.state.monitors, axis1=1, axis2=2)[:, own].T
-        self.by_monitor = pick(run.kicked(), own)
-        self.by_column = gain * pick(run.beam, own)
-        self.by_column[-1] = 0
-        self.read = pick(run.read(), own)
+        self.weight = weight(state, 0)
+        self.by_monitor, self.by_column = there.by_monitor, there.by_column
+        self.read = data.pick(state.at.read)
         # readings by the monitors' and the columns' own parameters, [reading, parameter]
         columns, monitors = self.weight.shape
         reading = np.arange(self.weight.size)
-        by_monitor = 2 * (reading % monitors) + np.repeat(own, monitors)
+        by_monitor = 2 * (reading % monitors) + np.repeat(data.plane, monitors)
         by_column = 2 * monitors + reading // monitors
         self.own = csr_array(
             (
@@ -240,14 +200,14 @@ class Fitted:
             shape=(len(reading), 2 * monitors + columns),
         )
         self._parts: dict[int, _Part] = {}
-        residual = np.where(self.weight > 0, pick(run.data, own) - self.read, 0.0)
+        residual = np.where(self.weight > 0, data.pick(state.at.left), 0.0)
         self.target = residual + self.change(self.start)
 
     def change(self, values: Array) -> Array:
         """Readings [column, monitor] for a change of the base parameters."""
-        run = self.run
-        m, c = 2 * len(run.at), len(run.plane)
-        out = values[:m].reshape(-1, 2)[:, run.plane].T * self.by_monitor
+        data = self.state.data
+        m, c = 2 * len(data.at), len(data.plane)
+        out = values[:m].reshape(-1, 2)[:, data.plane].T * self.by_monitor
         out = out + values[m : m + c, None] * self.by_column
         if len(self.slopes):
             out = out + np.tensordot(values[m + c :], self.slopes, 1)
@@ -319,17 +279,17 @@ class Fitted:
         return self._parts[key]
 
     def _score(self, change: Array, own: Array | None) -> tuple[float, float]:
-        run = self.run
+        state, split = self.state, self.state.split
         read = self.read + change
-        data = pick(run.data, run.plane)
-        jumps = pick(np.einsum("mij,cmj->cmi", run.state.monitors, run.jumps()), run.plane)
+        data = state.data.pick(state.data.orbits)
+        jumps = state.data.pick(state.at.seen(state.at.jumps))
         inside: list[Array] = []
         jumped: list[Array] = []
-        for c in np.flatnonzero(run.held):
+        for c in np.flatnonzero(split.held):
             patterns = [read[c], *([] if own is None else own[:, c])]
             patterns = [p for p in patterns if np.abs(p).max() > 0]
-            seen = np.isfinite(data[c]) & run.good
-            near, far = seen & run.half[c], seen & ~run.half[c]
+            seen = np.isfinite(data[c]) & state.good
+            near, far = seen & split.half[c], seen & ~split.half[c]
             for more, into in (([], inside), ([jumps[c]], jumped)):
                 both = np.stack([*patterns, *more], axis=1)
                 scale = np.abs(both[near]).max(axis=0)
@@ -363,237 +323,3 @@ def _by_column(patterns: Array) -> csr_array:
     at = np.tile(np.arange(columns * monitors), count)
     whole = csr_array((patterns.ravel(), (rows, at)), shape=(count * columns, columns * monitors))
     return whole[np.flatnonzero(abs(patterns).max(axis=2).ravel() > 0)]
-
-
-# --- the hypotheses -------------------------------------------------------------------------------
-def _readings(run: ResponseRun, beam: Array) -> Array:
-    """Own-plane readings [column, monitor] of the beam's orbit changes [column, monitor, 2]."""
-    return pick(np.einsum("mij,cmj->cmi", run.state.monitors, beam), run.plane)
-
-
-def _kicks(run: ResponseRun) -> Array:
-    return np.asarray((run.kicks * (1 + run.state.calibration))[:-1])
-
-
-def _orders(run: ResponseRun) -> tuple[Array, Array]:
-    """Second and third order of the orbit changes for whole steps, [column, monitor, 2]."""
-    model, kicks = run.model, _kicks(run)
-    f = run.kicks[-1]
-    up, down = (
-        np.concatenate([
-            model.closed_orbits(run.m.correctors, side * kicks),
-            model.at_frequency(side * f).readings[None],
-        ])[:, run.at]
-        for side in (1, -1)
-    )  # fmt: skip
-    linear = (run.orbits(model) - run.bent) * np.append(1 + run.state.calibration[:-1], 1)[
-        :, None, None
-    ]
-    return (up + down) / 2 - model.readings[run.at], (up - down) / 2 - linear
-
-
-def _one_sided(run: ResponseRun) -> Hypothesis:
-    second, _ = _orders(run)
-    return Hypothesis(
-        "one-sided steps", "share", "0: two-sided, 1 or -1: one-sided",
-        _readings(run, second)[None], most=1.1,
-    )  # fmt: skip
-
-
-def _third_order(run: ResponseRun) -> Hypothesis:
-    third = _orders(run)[1]
-    third[-1] = 0
-    return Hypothesis(
-        "third order of two-sided steps", "beyond the model's", "0; -1: none",
-        _readings(run, third)[None] / 4, most=2.0,
-    )  # fmt: skip
-
-
-def _corrector_energy(run: ResponseRun) -> Hypothesis:
-    ring = run.model.ring
-    flat = ResponseModel(ring, 4).response(run.m.correctors)[:, run.at]
-    shift = run.orbits(run.model)
-    shift[:-1] -= flat * run.kicks[:-1, None, None]
-    shift[-1] = 0
-    return Hypothesis(
-        "corrector's energy shift", "beyond the model's", "0; -1: the energy stays",
-        _readings(run, shift)[None], most=1.1,
-    )  # fmt: skip
-
-
-def _position(run: ResponseRun, by_family: bool) -> Hypothesis:
-    jumps = _readings(run, run.jumps()) * run.kicks[:, None]
-    name = "corrector's field displaced in s"
-    if not by_family:
-        return Hypothesis(name + ", each", "m", "< 0.05 m", jumps[None], own=True, most=0.05)
-    _, members = families([*run.m.correctors, "\0"])
-    return Hypothesis(
-        name + ", by family", "m", "< 0.05 m", members.T[:, :, None] * jumps[None], most=0.05
-    )
-
-
-def _energy_drift(run: ResponseRun) -> Hypothesis:
-    rf = _readings(run, run.beam)[-1]
-    pattern = np.where((run.plane == 0)[:, None], rf, 0.0)
-    pattern[-1] = 0
-    return Hypothesis(
-        "drift of the energy", "RF step", "< 1e-3", pattern[None], own=True, most=1e-3
-    )
-
-
-def _orbit_drift(run: ResponseRun) -> Hypothesis:
-    """The orbit moves between the readings of a step: whatever kicks it, in each column anew."""
-    orbits = _readings(run, run.orbits(run.model))
-    waves = np.zeros((WAVES, *orbits.shape))
-    for p in (0, 1):
-        mine = run.plane == p
-        mine[-1] = False
-        per_kick = np.nan_to_num(orbits[mine]) / run.kicks[mine, None]
-        found = np.linalg.svd(per_kick, full_matrices=False)[2][:WAVES]
-        waves[: len(found), mine] = found[:, None] * np.sqrt(found.shape[1])
-    return Hypothesis(
-        "drift of the orbit (betatron waves)", "m", "< 1e-5", waves, own=True, most=1e-5
-    )
-
-
-def _tune_drift(run: ResponseRun) -> Hypothesis:
-    total = np.zeros((2, len(run.plane), len(run.at)))
-    focusing = [int(run.ring[name].k1 < 0) for name in run.quadrupoles]
-    np.add.at(total, focusing, run.slopes_of("quadrupole_gradient", run.quadrupoles, run.plane))
-    total[:, -1] = 0
-    return Hypothesis(
-        "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", total, own=True,
-        most=1e-4,
-    )  # fmt: skip
-
-
-def _energy_spread(run: ResponseRun) -> Hypothesis | None:
-    if "energy_spread" in run.allowed:
-        return None  # it is in the fit
-    kicks = run.kicks[:-1, None, None]
-    per_step = run.model.rf_start[5]
-    f = DELTA / per_step
-    up, down = (
-        run.model.at_frequency(side * f).response(run.m.correctors)[:, run.at] * kicks
-        for side in (1, -1)
-    )
-    curved = np.zeros_like(run.beam)
-    curved[:-1] = (up + down - 2 * run.beam[:-1]) / 2 * (ENERGY_SPREAD / DELTA) ** 2
-    return Hypothesis(
-        "energy spread of the beam", "(1.2e-3)^2", "1", _readings(run, curved)[None], most=3.0
-    )
-
-
-def _energy_offset(run: ResponseRun) -> Hypothesis:
-    """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
-    f = DELTA / run.model.rf_start[5]
-    up, down = (run.orbits(run.model.at_frequency(side * f)) for side in (1, -1))
-    scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
-    slope = _readings(run, (up - down) / 2 * scale)
-    return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
-
-
-def _nonlinear(run: ResponseRun) -> Hypothesis:
-    """Two-sided steps: x^3 / 4 of the whole change is left of a cubic reading."""
-    cubes = pick(run.read(), run.plane) ** 3 / 4 / MILLIMETRE**2
-    rows = np.stack([np.where((run.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
-    return Hypothesis("nonlinear monitors (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
-
-
-def _gradients(
-    run: ResponseRun, name: str, effect: str, kind: str, most: float
-) -> Hypothesis | None:
-    places = [e.name for e in run.ring.elements if e.kind == kind]
-    if not places:
-        return None
-    slopes = run.slopes_of(effect, places, run.plane)
-    return Hypothesis(name, "1/m", f"< {most:g}", slopes, most=most)
-
-
-def _radiation(run: ResponseRun) -> Hypothesis | None:
-    pairs = [
-        (f"radiation_loss_{kind}s", None)
-        for kind in ("bend", "wiggler")
-        if any(e.kind == kind for e in run.ring.elements)
-    ]
-    kicks = _kicks(run)
-    rows = []
-    for slope in derivatives(run.model, pairs, run.m.correctors):
-        beam = slope[:, run.at] * np.append(kicks, run.kicks[-1])[:, None, None]
-        rows.append(_readings(run, beam))
-    return Hypothesis("radiation in bends, wigglers", "expected loss", "1", np.array(rows), most=3)
-
-
-def _monitor_position(run: ResponseRun) -> Hypothesis:
-    model = run.model
-    columns = model.columns(run.m.correctors)
-    start = np.vstack([columns.start, model.rf_start])
-    behind = np.vstack([columns.pulled * 1.0, np.zeros(model.dimension)])
-    after = np.vstack([model.downstream(columns), np.zeros((1, len(model.monitors)), bool)])
-    slopes = model.tangents[model.maps.at][:, [1, 3]]
-    angle = np.einsum("mai,ci->cma", slopes, start)
-    angle = angle + after[:, :, None] * np.einsum("mai,ci->cma", slopes, behind)
-    kicks = np.append(_kicks(run), run.kicks[-1])
-    flat = _readings(run, angle[:, run.at] * kicks[:, None, None])
-    rows = np.zeros((len(run.at), *flat.shape))
-    for i in range(len(rows)):
-        rows[i, :, i] = flat[:, i]
-    return Hypothesis("monitors displaced in s", "m", "< 0.01 m", rows, most=0.01)
-
-
-def _bend_gradient(run: ResponseRun) -> Hypothesis:
-    """By length, for magnets of one length are one type."""
-    ring: Ring = run.model.ring
-    bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
-    kinds = sorted({round(ring.elements[i].length, 3) for i in bends})
-    rows = []
-    for kind in kinds:
-        changed = {
-            i: ring.elements[i].changed(k1=ring.elements[i].k1 + BEND_GRADIENT)
-            for i in bends
-            if round(ring.elements[i].length, 3) == kind
-        }
-        model = ResponseModel(ring.with_elements(changed))
-        slope = (run.orbits(model) - run.orbits(run.model)) / BEND_GRADIENT
-        scale = np.append(1 + run.state.calibration[:-1], 1)[:, None, None]
-        rows.append(_readings(run, slope * scale))
-    return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
-
-
-def _second_order_coupling(run: ResponseRun) -> Hypothesis | None:
-    if not run.state.skew.any():
-        return None
-    causes = [c for c in run.ring_causes() if c.effect != "skew_gradient"]
-    change = run.orbits(run.model) - run.orbits(ResponseModel(apply(run.ring, causes)))
-    return Hypothesis(
-        "coupling to second order", "beyond the model's", "0; -1: none",
-        _readings(run, change)[None], most=1.1,
-    )  # fmt: skip
-
-
-HYPOTHESES: dict[str, Callable[[ResponseRun], Hypothesis | None]] = {
-    "one_sided_steps": _one_sided,
-    "third_order": _third_order,
-    "energy_drift": _energy_drift,
-    "orbit_drift": _orbit_drift,
-    "gradient_drift": _tune_drift,
-    "corrector_energy": _corrector_energy,
-    "corrector_position_family": lambda run: _position(run, True),
-    "corrector_position": lambda run: _position(run, False),
-    "energy_spread": _energy_spread,
-    "energy_offset": _energy_offset,
-    "monitor_nonlinearity": _nonlinear,
-    "monitor_position": _monitor_position,
-    "wiggler_gradient": lambda run: _gradients(
-        run, "gradients of damping wigglers", "insertion_device_focusing", "wiggler", 3e-3
-    ),
-    "straight_gradient": lambda run: _gradients(
-        run, "gradients in straights (markers)", "gradient_absolute", "marker", 2e-3
-    ),
-    "sextupole_gradient": lambda run: _gradients(
-        run, "gradients at sextupoles (orbit)", "gradient_absolute", "sextupole", 2e-3
-    ),
-    "bend_gradient": _bend_gradient,
-    "radiation": _radiation,
-    "second_order_coupling": _second_order_coupling,
-}

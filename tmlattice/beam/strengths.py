@@ -110,11 +110,6 @@ class RingStrengths:
         d0, d1, d2 = (np.asarray(chebyshev.chebder(c), np.float64) / LARGEST for c in self.curves)
         return _sums(basis, (d0, d1, d2))
 
-    def only(self, places: Sequence[int]) -> "RingStrengths":
-        """Some of them."""
-        c0, c1, c2 = (c[:, places] for c in self.curves)
-        return RingStrengths([self.strengths[i] for i in places], self.layer[places], (c0, c1, c2))
-
 
 def _series(changes: ArrayLike) -> Array:
     return np.asarray(chebyshev.chebvander(np.asarray(changes, float) / LARGEST, DEGREE).T)

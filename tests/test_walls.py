@@ -1,0 +1,107 @@
+"""The house as it is meant: imports run one way, no file and no function is too long.
+
+The order is that of CONTRIBUTING.md; what is not in the table may be imported by all (errors,
+files, ...) or stands above all (the package's own `__init__`).
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "tmlattice"
+ORDER = (
+    "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
+    "inference", "observe", "diagnosis", "fitting", "machine", "challenge", "systems", "plots",
+    "report", "cli",
+)  # fmt: skip
+BESIDE = {"errors", "files", "batch", "schemas"}  # no room of the flow: everybody may use them
+LINES, FUNCTION = 450, 70
+
+FILES = sorted(
+    path for path in PACKAGE.rglob("*.py") if "lattices" not in path.relative_to(PACKAGE).parts
+)
+
+
+def room(parts):
+    """The place in ORDER of tmlattice.<room>...; None for what is beside or above."""
+    return ORDER.index(parts[0]) if parts and parts[0] in ORDER else None
+
+
+def imported(path):
+    """Modules of the package that a file imports, as parts after `tmlattice`; (parts, line)."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            first, *rest = name.split(".")
+            if first == "tmlattice":
+                yield tuple(rest), node.lineno
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_no_file_imports_upward(path):
+    own = room([path.relative_to(PACKAGE).parts[0].removesuffix(".py")])
+    if own is None:
+        return
+    upward = [
+        f"line {line}: tmlattice.{'.'.join(parts)}"
+        for parts, line in imported(path)
+        if (there := room(parts)) is not None and there > own
+    ]
+    assert not upward
+
+
+def test_no_circle_of_files():
+    """Modules that import one another, at the top of a file or inside a function."""
+    names = {}
+    for path in FILES:
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        names[parts[:-1] if parts[-1] == "__init__" else parts] = path
+    graph = {}
+    for parts, path in names.items():
+        found = set()
+        for target, _ in imported(path):
+            while target and target not in names:
+                target = target[:-1]  # noqa: PLW2901
+            if target and target != parts:
+                found.add(target)
+        graph[parts] = found
+    done, way = set(), []
+
+    def visit(node):
+        if node in way:
+            circle = [".".join(step) for step in (*way[way.index(node) :], node)]
+            raise AssertionError(" -> ".join(circle))
+        if node in done:
+            return
+        way.append(node)
+        for target in sorted(graph.get(node, ())):
+            visit(target)
+        way.pop()
+        done.add(node)
+
+    for node in sorted(graph):
+        visit(node)
+
+
+def test_every_room_is_in_the_order():
+    rooms = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in FILES}
+    assert rooms - set(ORDER) - BESIDE == {"__init__", "__main__"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_and_functions_are_short(path):
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= LINES
+    long = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            body = node.body[1:] if ast.get_docstring(node) else node.body
+            lines = (node.end_lineno - body[0].lineno + 1) if body else 0
+            if lines > FUNCTION:
+                long.append(f"{node.name}: {lines} lines")
+    assert not long

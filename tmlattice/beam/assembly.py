@@ -1,0 +1,247 @@
+"""A ring with known causes, and what a shot's settings and further causes change in its layers.
+
+Settings come first, then what is known, then what is asked: a corrector's calibration error acts on
+the kick that was set, whoever knows of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.layers import LayerParts, Layers
+from tmlattice.beam.rf import Cavities, Rf, cavities, frequency_of, rf_of
+from tmlattice.effects import (
+    Cause,
+    Directions,
+    RingEffect,
+    Settings,
+    apply,
+    directions,
+    find,
+    set_elements,
+)
+from tmlattice.lattice import Element, Ring
+from tmlattice.maps import LayerMaps, RingMaps, ring_maps
+
+Array = NDArray[np.float64]
+Hypothesis = tuple[str, str | None]
+"""An effect and the place where it might sit."""
+
+MADE = 10_000
+"""Changed layers that are remembered: some 20 MB."""
+KEPT = 4
+"""Rings with something known that are kept with a ring."""
+FEW = 10
+"""Known causes of which a ring is worth keeping."""
+
+
+def on_ring(causes: Sequence[Cause]) -> list[Cause]:
+    """Those that act on elements."""
+    return [cause for cause in causes if isinstance(find(cause.effect), RingEffect)]
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A ring with known causes, its layers, and the directions of hypotheses in them.
+
+    Attributes:
+        design, known: what it was made from.
+        ring: with what is known.
+        layers, maps: of that ring.
+        rf: see `rf_of`.
+    """
+
+    design: Ring
+    known: tuple[Cause, ...]
+    ring: Ring
+    layers: LayerMaps
+    maps: RingMaps
+    rf: Rf
+    _directions: dict[tuple[Hypothesis, ...], Directions] = field(repr=False)
+    _touched: dict[Hypothesis, tuple[int, ...]] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def _known_at(self) -> Mapping[int, list[Cause]]:
+        """Known causes by the place that they sit on."""
+        found: dict[int, list[Cause]] = {}
+        for cause in on_ring(self.known):
+            for place in _members(self.design, cause):
+                found.setdefault(place, []).append(cause)
+        return found
+
+    @cached_property
+    def loss(self) -> float:
+        """Relative energy that the design orbit loses in a turn, by what is known."""
+        return sum(element.errors.loss for element in self.ring.elements)
+
+    def set(self, settings: Settings) -> dict[int, Element]:
+        """The elements that settings change, with what is known of them."""
+        changed = set_elements(self.design, settings)
+        for place in changed:
+            changed[place] = self._with(changed[place], self._known_at.get(place, ()))
+        return changed
+
+    def changed(self, settings: Settings, causes: Sequence[Cause]) -> dict[int, Element]:
+        """The elements that settings and further causes change."""
+        changed = self.set(settings)
+        for cause in on_ring(causes):
+            for place in _members(self.design, cause):
+                element = changed.get(place, self.ring.elements[place])
+                changed[place] = self._with(element, (cause,))
+        return changed
+
+    def _with(self, element: Element, causes: Sequence[Cause]) -> Element:
+        for cause in causes:
+            effect = find(cause.effect)
+            assert isinstance(effect, RingEffect)
+            element = effect.changed(element, cause.amount, self.design.energy)
+        return element
+
+    def layers_with(self, replaced: Mapping[int, Element]) -> dict[int, LayerParts]:
+        """The layers that hold these elements."""
+        touched = {int(self.layers.layer_of[place]) for place in replaced}
+        return {k: self.layers.layer(k, replaced) for k in sorted(touched)}
+
+    def layers_of(self, cause: Cause) -> tuple[int, ...]:
+        """The layers that a cause touches."""
+        key = (cause.effect, cause.element)
+        if key not in self._touched:
+            members = _members(self.design, cause)
+            self._touched[key] = tuple(sorted({int(self.layers.layer_of[m]) for m in members}))
+        return self._touched[key]
+
+    def cavities(self, settings: Settings, causes: Sequence[Cause] = ()) -> Cavities:
+        """The RF of a shot: it makes good what the design orbit loses, these causes there."""
+        lost = (self.turn_loss(cause) * cause.amount for cause in causes)
+        return cavities(
+            self.design, self.rf, self.layers.layer_of, self.loss + sum(lost),
+            frequency_of(settings),
+        )  # fmt: skip
+
+    def turn_loss(self, cause: Cause) -> float:
+        """Relative energy that a turn loses for one unit of a cause."""
+        if not cause.effect.startswith("radiation"):
+            return 0.0
+        members = [self.design.elements[m] for m in _members(self.design, cause)]
+        one = (self._with(e, (Cause(cause.effect, cause.element, 1.0),)) for e in members)
+        return sum(b.errors.loss - a.errors.loss for a, b in zip(members, one, strict=True))
+
+    def directions(self, hypotheses: Sequence[Hypothesis]) -> Directions:
+        """Of hypotheses, without settings, about the design: small errors everywhere turn a
+        hypothesis's direction by as little as they are large."""
+        key = tuple(hypotheses)
+        if key not in self._directions:
+            design = assembly(self.design, (), self.layers.dimension).layers
+            self._directions[key] = directions(design, key)
+        return self._directions[key]
+
+
+def _members(ring: Ring, cause: Cause) -> list[int]:
+    effect = find(cause.effect)
+    assert isinstance(effect, RingEffect)
+    return effect.members(ring, cause.element)
+
+
+def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Assembly:
+    """A ring with known causes; where they are few, kept with the ring."""
+    known = tuple(known)
+    key = ("model", known, dimension)
+    few = len(known) < FEW
+    if few and key in ring.memory:
+        kept: Assembly = ring.memory[key]
+        return kept
+    with_known = apply(ring, known) if known else ring
+    layers = LayerMaps(with_known, dimension)
+    maps = ring_maps(with_known, dimension, layers)
+    shared = {} if few else assembly(ring, (), dimension)._directions
+    made = Assembly(ring, known, with_known, layers, maps, rf_of(ring), shared)
+    if few:
+        others = [k for k in ring.memory if k[0] == "model" and k[1]]
+        if len(others) >= KEPT:  # a study that tells each case something would fill the memory
+            del ring.memory[others[0]]
+        ring.memory[key] = made
+    return made
+
+
+class Group:
+    """Shots with equal settings, and the layers of their ring.
+
+    Args:
+        number: of the group.
+        shots: of it.
+        settings: theirs.
+        active: whether causes are there.
+        there: the ring with what is known.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        shots: NDArray[np.intp],
+        settings: Settings,
+        active: bool,
+        there: Assembly,
+    ) -> None:
+        self.number = number
+        self.shots = shots
+        self.settings = settings
+        self.active = active
+        self.there = there
+        self.layers = Layers.of(there.maps)
+        self.replaced = there.set(settings)
+        own = there.layers_with(self.replaced)
+        self.touched = frozenset(own)
+        self.layers.put(own)
+        self._latest: tuple[tuple[Hypothesis, ...], Directions] | None = None
+
+    def parts(
+        self,
+        causes: Sequence[Cause],
+        made: dict[tuple[int, tuple[Cause, ...], int], LayerParts],
+    ) -> dict[int, LayerParts]:
+        """The layers that causes touch, as they are with them.
+
+        Args:
+            causes: that act on elements.
+            made: remembers them: groups share what no setting touches, and what one fit needed the
+                next one finds.
+        """
+        touching: dict[int, list[Cause]] = {}
+        for cause in causes:
+            for layer in self.there.layers_of(cause):
+                touching.setdefault(layer, []).append(cause)
+        replaced: dict[int, Element] | None = None
+        found: dict[int, LayerParts] = {}
+        if len(made) > MADE:
+            made.clear()
+        for layer, own in touching.items():
+            key = (layer, tuple(own), self.number if layer in self.touched else -1)
+            part = made.get(key)
+            if part is None:
+                if replaced is None:
+                    replaced = self.there.changed(self.settings, causes)
+                part = made[key] = self.there.layers.layer(layer, replaced)
+            found[layer] = part
+        return found
+
+    def directions(self, hypotheses: Sequence[Hypothesis]) -> Directions:
+        """Of hypotheses, those anew that sit on what the settings change."""
+        base = self.there.directions(hypotheses)
+        key = tuple(hypotheses)
+        if not self.touched:
+            return base
+        if self._latest is not None and self._latest[0] == key:
+            return self._latest[1]
+        ring = self.there.ring
+        touched = {ring.elements[place].name for place in self.replaced}
+        families = {ring.elements[place].family for place in self.replaced}
+        again = [i for i, (_, place) in enumerate(key) if place in touched or place in families]
+        layers = LayerMaps(ring.with_elements(self.replaced), self.there.layers.dimension)
+        fresh = directions(layers, [key[i] for i in again])
+        found = base.replaced(again, fresh)
+        if len(key) > FEW:
+            self._latest = (key, found)
+        return found

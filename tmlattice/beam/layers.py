@@ -1,0 +1,89 @@
+"""The layers of one turn as stacked weights: one record for whoever needs them."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.sweeps import curved
+from tmlattice.maps import RingMaps
+from tmlattice.maps.magnets import Weights
+
+Array = NDArray[np.float64]
+LayerParts = tuple[Weights, list[Weights]]
+"""The weights of a layer, and the read-outs of the monitors before its magnet."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """A turn: every layer, then the way from the last magnet to the ring's end.
+
+    Step k sends the state x at exit k to W0[k] + W1[k] x + W2[k] x^[2] at exit k + 1, the products
+    in the reduced Kronecker order x1^2, x1 x2, ..., xn^2. A monitor reads R0 + R1 x + R2 x^[2].
+
+    Attributes:
+        W: W0 [step, n], W1 [step, n, n], W2 [step, n, n (n + 1) / 2].
+        R: R0 [monitor, 2], R1 [monitor, 2, n], R2 [monitor, 2, n (n + 1) / 2].
+        at: the exit that each monitor hangs on, rising, [monitor].
+        start: the monitors at exit k are start[k] to start[k + 1] - 1.
+    """
+
+    W: Weights
+    R: Weights
+    at: NDArray[np.int64]
+    start: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, maps: RingMaps, weights: Weights | None = None) -> "Layers":
+        """Arrays of their own, that may be written to; other weights of the layers on request."""
+        weights = (maps.W0, maps.W1, maps.W2) if weights is None else weights
+        closing = maps.closing.coefficients
+        W0, W1, W2 = (np.concatenate([w, c[None]]) for w, c in zip(weights, closing, strict=True))
+        R = maps.R0.copy(), maps.R1.copy(), maps.R2.copy()
+        return cls((W0, W1, W2), R, maps.at, maps.start)
+
+    @property
+    def steps(self) -> int:
+        """Of a turn: the layers and the closing way."""
+        return len(self.W[0])
+
+    @property
+    def curved(self) -> NDArray[np.bool_]:
+        """Which steps have a second order, [step]."""
+        return curved(self.W[2])
+
+    def put(self, parts: Mapping[int, LayerParts]) -> dict[int, LayerParts]:
+        """Write layers, in place; returns what was there."""
+        steps = np.fromiter(parts, dtype=np.intp)
+        reads = [(int(self.start[k]), len(found)) for k, (_, found) in parts.items()]
+        rows = np.array([row for s, m in reads for row in range(s, s + m)], dtype=np.intp)
+        old_W, old_R = [w[steps] for w in self.W], [r[rows] for r in self.R]
+        own = zip(*(w for w, _ in parts.values()), strict=True)
+        for stack, new in zip(self.W, own, strict=False):
+            stack[steps] = new
+        found = [read for _, there in parts.values() for read in there]
+        for stack, new in zip(self.R, zip(*found, strict=True), strict=False):
+            stack[rows] = new
+        before: dict[int, LayerParts] = {}
+        first = 0
+        for i, (k, (_, count)) in enumerate(zip(parts, reads, strict=True)):
+            here = range(first, first + count)
+            first += count
+            before[k] = (_row(old_W, i), [_row(old_R, r) for r in here])
+        return before
+
+    @contextmanager
+    def with_parts(self, parts: Mapping[int, LayerParts]) -> Iterator[None]:
+        """These layers meanwhile."""
+        before = self.put(parts)
+        try:
+            yield
+        finally:
+            self.put(before)
+
+
+def _row(stacks: list[Array], i: int) -> Weights:
+    a, b, c = (stack[i] for stack in stacks)
+    return a, b, c

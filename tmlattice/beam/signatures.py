@@ -1,0 +1,211 @@
+"""What each hypothesis, and each free kick, would change in the readings: d readings / d amount.
+
+A cause changes the state at the exit of its layer; C^-1 of the trajectory's tangent C makes that a
+change of the launch, and d reading / d launch carries it to all readings downstream.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam import tangents as kernels
+from tmlattice.beam.assembly import Group, Hypothesis
+from tmlattice.beam.threads import share
+from tmlattice.effects import Cause, LaunchEffect, Monitors, ReadingEffect, RingEffect, find
+
+if TYPE_CHECKING:
+    from tmlattice.beam.model import Model, Paths
+
+Array = NDArray[np.float64]
+
+SMALL = 1e-4
+"""Of the largest fault: central differences of readings, which are quadratic in none by more."""
+
+
+def signatures(
+    model: "Model", paths: "Paths", hypotheses: Sequence[Hypothesis], launches: Array
+) -> Array:
+    """See `Model.signatures`."""
+    out = np.zeros((len(hypotheses), *paths.readings.shape))
+    kinds = [find(name) for name, _ in hypotheses]
+    ring = [i for i, effect in enumerate(kinds) if isinstance(effect, RingEffect)]
+    if ring:
+        _of_ring(model, paths, [hypotheses[i] for i in ring], np.array(ring), out)
+    count = len(model.at)
+    read: dict[str, Array] = {}
+    for i, ((name, place), effect) in enumerate(zip(hypotheses, kinds, strict=True)):
+        if isinstance(effect, ReadingEffect):
+            assert place is not None
+            m = model.monitor(place)
+            if name not in read:
+                read[name] = of_readings(model, paths, effect)
+            out[i, :, m::count] = read[name][:, m::count]
+        elif isinstance(effect, LaunchEffect):
+            out[i] = seen(model, paths, _of_launch(model, effect, name, launches)[None])[0]
+    return out
+
+
+def of_readings(model: "Model", paths: "Paths", effect: ReadingEffect) -> Array:
+    """d readings / d amount of an effect at every monitor, [shot, reading, 2].
+
+    The effect joins the errors that each monitor has, in the order of `Monitors`.
+    """
+    high = 1.0 if effect.discrete else SMALL * effect.largest
+    low = 0.0 if effect.discrete else -high
+    up, down = (_with_all(paths.monitors_of, effect, amount) for amount in (high, low))
+    by_turn = paths.beam.reshape(model.shots, model.turns, -1, 2)
+    change = (up.read(by_turn) - down.read(by_turn)) / (high - low)
+    return change.reshape(paths.beam.shape)
+
+
+def _with_all(monitors: Monitors, effect: ReadingEffect, amount: float) -> Monitors:
+    changed = monitors.copy()
+    if amount:
+        for m in range(len(changed.roll)):
+            effect.set(changed, m, amount)
+    return changed
+
+
+def _of_launch(model: "Model", effect: LaunchEffect, name: str, launches: Array) -> Array:
+    """d beam / d amount ** power, [shot, reading, 2]."""
+    h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
+    up = model.beam(launches, [Cause(name, None, h)])
+    if effect.power == 1:
+        return np.asarray((up - model.beam(launches, [Cause(name, None, -h)])) / (2 * h))
+    return np.asarray((up - model.beam(launches)) / h**effect.power)
+
+
+def _of_ring(
+    model: "Model",
+    paths: "Paths",
+    hypotheses: list[Hypothesis],
+    index: NDArray[np.int64],
+    out: Array,
+) -> None:
+    steps = model.steps
+    inverse = np.linalg.inv(paths.tangents)  # [shot, step + 1, n, n]
+    where = model.where
+    turns = np.arange(model.turns) * steps
+    for group in model.groups:
+        d = group.directions(hypotheses)
+        shots = group.shots
+        kicks = np.empty((len(shots), model.turns, len(d.owner), model.dimension))
+        states = np.ascontiguousarray(paths.states[shots])
+        kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, steps, kicks)
+        exits = d.layer[:, None] + 1 + turns[None]  # [row, turn]
+        pulled = np.einsum("strij,strj->stri", inverse[shots][:, exits.T], kicks)
+        start = np.searchsorted(where, exits)
+        part = np.zeros((len(hypotheses), len(shots), *out.shape[2:]))
+        slopes = np.ascontiguousarray(paths.beam_launch[shots])
+        share(kernels.carry, len(shots), d.owner, start, pulled, slopes, part)
+        _given_back(model, group, hypotheses, inverse, states, slopes, part)
+        for row, (owner, monitor) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
+            for turn in range(model.turns):
+                x = states[:, turns[turn] + model.at[monitor]]
+                i, j = np.triu_indices(model.dimension)
+                moved = d.E0[row] + x @ d.E1[row].T + (x[:, i] * x[:, j]) @ d.E2[row].T
+                part[owner, :, turn * len(model.at) + monitor] += moved
+        out[index[:, None], shots[None]] = _through(paths.monitors[shots], part)
+
+
+def _given_back(
+    model: "Model",
+    group: Group,
+    hypotheses: list[Hypothesis],
+    inverse: NDArray[np.floating],
+    states: Array,
+    slopes: Array,
+    part: Array,
+) -> None:
+    """More radiation moves the cavities' phase: they make good what the design orbit loses."""
+    if model.turns == 1:
+        return
+    there = model.assembly
+    for h, (name, place) in enumerate(hypotheses):
+        lost = there.turn_loss(Cause(name, place, 1.0))
+        if not lost:
+            continue
+        rf = there.cavities(group.settings, [Cause(name, place, 1e-9)])
+        if not len(rf.exits):
+            continue
+        _, phase, wave, slip = rf.values
+        behind = (rf.exits[:, None] + np.arange(model.turns) * model.steps).ravel()
+        slipped = np.repeat(np.where(rf.exits == model.steps, slip, 0.0), model.turns)
+        late = states[:, behind, 4] - slipped  # at the ring's end the RF slips behind the cavity
+        gain = lost / len(rf.exits) * np.cos(phase - wave * late) / np.cos(phase)
+        pulled = inverse[group.shots[:, None], behind][..., 5] * gain[..., None]
+        pulled = np.ascontiguousarray(pulled[:, None])  # [shot, 1, cavity and turn, n]
+        start = np.searchsorted(model.where, behind)[:, None]
+        owner = np.full(len(behind), h)
+        share(kernels.carry, len(part[h]), owner, start, pulled, slopes, part)
+
+
+def kick_signatures(model: "Model", paths: "Paths", layers: NDArray[np.int64]) -> Array:
+    """See `Model.kick_signatures`."""
+    turns = np.arange(model.turns) * model.steps
+    exits = np.asarray(layers)[:, None] + 1 + turns[None]  # [layer, turn]
+    kick = np.stack([model.kick(k) for k in layers])
+    inverse = np.linalg.inv(paths.tangents[:, exits])  # [shot, layer, turn, n, n]
+    pulled = np.einsum("slTij,lpj->sTlpi", inverse, kick, optimize=True)
+    pulled = np.ascontiguousarray(pulled.reshape(model.shots, model.turns, -1, model.dimension))
+    start = np.repeat(np.searchsorted(model.where, exits), 2, axis=0)
+    out = np.zeros((2 * len(kick), *paths.readings.shape))
+    owner = np.arange(2 * len(kick))
+    share(kernels.carry, model.shots, owner, start, pulled, paths.beam_launch, out)
+    return seen(model, paths, out).reshape(len(kick), 2, *paths.readings.shape)
+
+
+def free_kicks(
+    model: "Model", paths: "Paths", layers: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array]:
+    """See `Model.free_kicks`."""
+    kick = np.stack([model.kick(k) for k in layers])
+    inverse = np.linalg.inv(paths.tangents[:, layers + 1])  # [shot, layer, n, n]
+    pulled = np.einsum("slij,lpj->lpsi", inverse, kick, optimize=True)
+    return np.searchsorted(model.where, layers + 1), pulled
+
+
+def single_kicks(
+    model: "Model", paths: "Paths", hypotheses: Sequence[Hypothesis]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """See `Model.single_kicks`."""
+    empty = np.zeros(0, dtype=np.int64)
+    ring = [i for i, h in enumerate(hypotheses) if isinstance(find(h[0]), RingEffect)]
+    if model.turns > 1 or not ring:
+        return empty, empty, np.zeros((model.shots, 0, model.dimension))
+    some = [hypotheses[i] for i in ring]
+    base = model.groups[0].directions(some)
+    rows = np.bincount(base.owner, minlength=len(some))
+    rows[base.read_owner] = 0
+    one = np.isin(base.owner, np.flatnonzero(rows == 1))
+    order = np.argsort(base.owner[one])
+    owner, exits = base.owner[one][order], base.layer[one][order] + 1
+    pulled = np.zeros((model.shots, len(owner), model.dimension))
+    inverse = np.linalg.inv(paths.tangents)
+    for group in model.groups:
+        if not group.active:
+            continue
+        d = group.directions(some)
+        own = np.isin(d.owner, owner)  # fewer where a setting takes its effect away
+        kicks = np.empty((len(group.shots), 1, len(d.owner), model.dimension))
+        states = np.ascontiguousarray(paths.states[group.shots])
+        kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, 0, kicks)
+        back = inverse[group.shots][:, d.layer[own] + 1]
+        change = np.einsum("skij,skj->ski", back, kicks[:, 0][:, own], optimize=True)
+        pulled[np.ix_(group.shots, np.searchsorted(owner, d.owner[own]))] = change
+    return np.array(ring)[owner], np.searchsorted(model.where, exits), pulled
+
+
+def seen(model: "Model", paths: "Paths", beam: Array) -> Array:
+    """What the monitors make of changes of the beam, [hypothesis, shot, reading, 2]."""
+    return _through(paths.monitors, beam)
+
+
+def _through(monitors: Array, beam: Array) -> Array:
+    """The same for some of the shots: monitors [shot, monitor, 2, 2]."""
+    if np.array_equal(monitors, np.broadcast_to(np.eye(2), monitors.shape)):
+        return beam
+    by_turn = beam.reshape(*beam.shape[:2], -1, monitors.shape[1], 2)
+    return np.asarray(np.einsum("smij,hstmj->hstmi", monitors, by_turn).reshape(beam.shape))

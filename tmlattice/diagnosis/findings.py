@@ -1,0 +1,184 @@
+"""What a search found, as findings: each with what else it could be, where it sits, how sure."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.result import VERDICTS, Finding, Member
+from tmlattice.effects import CATALOGUE, find
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.inference.rivals import Detection, Rival
+from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
+from tmlattice.inference.search import Explanation, Named
+from tmlattice.lattice import Element, Ring
+
+Array = NDArray[np.float64]
+Span = tuple[tuple[float, float], tuple[str, ...]]
+"""From where to where, m, and the names of the monitors there."""
+
+
+def credible(rivals: Sequence[Rival], mass: float) -> tuple[list[Rival], Array]:
+    """The likeliest rivals that hold the mass, and the probabilities of all."""
+    evidence = np.array([rival.fit.log_evidence for rival in rivals])
+    probability = np.exp(evidence - evidence.max())
+    probability /= probability.sum()
+    size = int(np.searchsorted(np.cumsum(probability), mass)) + 1
+    return list(rivals[:size]), probability
+
+
+def findings_of(
+    ring: Ring, explanation: Explanation, dead: Sequence[tuple[int, float]], judgement: Judgement
+) -> tuple[Finding, ...]:
+    """By falling statistic: causes with a name, kicks without, monitors set aside, dead ones."""
+    found = [
+        _named(ring, explanation, k, named, judgement.mass)
+        for k, named in enumerate(explanation.named)
+    ]
+    for layer, detection in explanation.kicks.items():
+        found.append(_located(ring, ring.magnets[layer], detection))
+    for m, detection in explanation.monitors.items():
+        found.append(_located(ring, ring.monitors[m], detection))
+    found += [_dead(ring, ring.monitors[m], amount) for m, amount in dead]
+    return tuple(sorted(found, key=lambda f: -f.detection.statistic))
+
+
+def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: float) -> Finding:
+    cause = explanation.fit.causes[k]
+    members, probability = credible(named.rivals, mass)
+    positions = [s for m in members for s in _positions(ring, m.hypothesis)]
+    where, near = between(ring, positions) if positions else (None, ())
+    return Finding(
+        effect=cause.effect,
+        element=cause.element,
+        s=_middle(ring, cause.element),
+        amount=cause.amount,
+        amount_sigma=float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0))),
+        unit=find(cause.effect).unit,
+        probability=float(probability[0]),
+        detection=named.detection,
+        where=where,
+        near=near,
+        credible_set=tuple(
+            Member(*m.hypothesis, _middle(ring, m.hypothesis[1]), float(p), m.cause.amount)
+            for m, p in zip(members, probability, strict=False)
+        ),
+        mass=float(probability[: len(members)].sum()),
+    )
+
+
+def _located(ring: Ring, element: Element, detection: Detection) -> Finding:
+    """Something without a name."""
+    where, near = between(ring, [element.s])
+    return Finding(
+        effect=None,
+        element=None,
+        s=element.s,
+        amount=None,
+        amount_sigma=None,
+        unit=None,
+        probability=1.0,
+        detection=detection,
+        where=where,
+        near=tuple(dict.fromkeys((*near[:1], element.name, *near[1:]))),
+        credible_set=(),
+        mass=0.0,
+    )
+
+
+def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
+    """A monitor whose readings say so themselves."""
+    where, near = between(ring, [monitor.s])
+    member = Member("monitor_dead", monitor.name, monitor.s, 1.0, amount)
+    return Finding(
+        effect="monitor_dead",
+        element=monitor.name,
+        s=monitor.s,
+        amount=amount,
+        amount_sigma=0.0,
+        unit="discrete",
+        probability=1.0,
+        detection=Detection(float("inf"), float("nan"), 0.0),
+        where=where,
+        near=near,
+        credible_set=(member,),
+        mass=1.0,
+    )
+
+
+def _middle(ring: Ring, name: str | None) -> float | None:
+    return next((e.s for e in ring.elements if e.name == name), None)
+
+
+def _positions(ring: Ring, hypothesis: Hypothesis) -> list[float]:
+    """Of all elements that a hypothesis touches, m."""
+    place = _middle(ring, hypothesis[1])
+    if place is not None:
+        return [place]
+    return [e.s for e in ring.elements if hypothesis[1] is not None and e.family == hypothesis[1]]
+
+
+def between(ring: Ring, positions: Sequence[float]) -> Span:
+    """From the last monitor before to the first one behind."""
+    s = np.array([monitor.s for monitor in ring.monitors])
+    low, high = min(positions), max(positions)
+    before = int(np.searchsorted(s, low, side="left")) - 1
+    behind = int(np.searchsorted(s, high, side="right"))
+    start = float(s[before]) if before >= 0 else 0.0
+    end = float(s[behind]) if behind < len(s) else ring.length
+    near = [ring.monitors[i].name for i in (before, behind) if 0 <= i < len(s)]
+    return (start, end), tuple(near)
+
+
+def verdict_of(
+    explanation: Explanation,
+    findings: tuple[Finding, ...],
+    p_value: float,
+    estimated: bool,
+    judgement: Judgement,
+) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
+    """The least certain of the findings', the findings that stand, and what is to be said."""
+    found = explanation.scan
+    left = found.p_value(float(found.statistic.max(initial=0.0)))
+    more, far_more = judgement.noise
+    if explanation.full and left < judgement.false_alarm:
+        said = (
+            f"as many as {len(findings)} causes do not explain the data: small errors everywhere; "
+            "state their rms as a background, or give a reference from before the fault"
+        )
+        return "distributed", (), (said,)
+    if not findings:
+        return "nothing" if p_value >= far_more or estimated else "distributed", (), ()
+    worst = max(findings, key=lambda f: VERDICTS.index(f.verdict)).verdict
+    if p_value < more and not estimated:
+        return worst, findings, ("what is left is more than the noise: see 'unexplained'",)
+    return worst, findings, ()
+
+
+def unexplained(ring: Ring, left: FreeScan, p_value: float, judgement: Judgement) -> dict[str, Any]:
+    """Whether what is left is noise, and where it sits if not."""
+    places: list[dict[str, float]] = []
+    taken: set[float] = set()
+    for i in np.argsort(-left.gain)[:200]:
+        statistic, freedom = float(left.statistic[i]), max(int(left.freedom[i]), 1)
+        chance = look_elsewhere(statistic, freedom, len(left.places))
+        if len(places) == 3 or chance > judgement.false_alarm:
+            break
+        (start, end), _ = between(ring, [ring.magnets[int(left.places[i])].s])
+        if start not in taken:
+            taken.add(start)
+            places.append({"s_from": start, "s_to": end, "statistic": statistic})
+    return {"p_value": p_value, "places": places}
+
+
+def sensitivity(found: Scan, judgement: Judgement) -> dict[str, float]:
+    """By effect, the amount that reaches the threshold at half of the places where it is seen."""
+    threshold = found.threshold(judgement.false_alarm)
+    amounts: dict[str, list[float]] = {}
+    for (name, _), information in zip(found.hypotheses, found.information, strict=True):
+        if information > 0 and not CATALOGUE[name].discrete:
+            least = np.sqrt(threshold / information) ** (1 / CATALOGUE[name].power)
+            amounts.setdefault(name, []).append(float(least))
+    return {name: float(np.median(values)) for name, values in amounts.items()}

@@ -1,0 +1,193 @@
+"""Before the search: data and model made ready, and what is said of them already.
+
+Nothing here decides what the fault is: monitors without a signal are set aside, the noise is
+estimated where nobody states it, and data of another ring are declined.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.model import Model
+from tmlattice.diagnosis.choice import chosen_effects
+from tmlattice.effects import Cause, expected_radiation, find
+from tmlattice.errors import BeamLostError, MeasurementError
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement
+from tmlattice.observe.data import Data, joined, of_measurement
+from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.observe.noise import estimate, local_misfit
+
+Array = NDArray[np.float64]
+
+ROUGH = 1e-4
+"""m; stands for a noise that is not known yet, while the launches are fitted for the first time."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A measurement ready for the search.
+
+    Attributes:
+        problem: launches and readings, no small errors.
+        before: launches alone.
+        hypotheses: what may be the cause.
+        known: causes that the model holds anyway.
+        dead: monitors without a signal (1) or with a frozen one (2), (index, which).
+        noise: rms of a reading, m, (x, y); NaN for a plane without readings.
+        estimated: whether the noise comes from the data.
+        said: what a reader should know.
+    """
+
+    problem: FirstTurns
+    before: Fit
+    hypotheses: tuple[Hypothesis, ...]
+    known: tuple[Cause, ...]
+    dead: tuple[tuple[int, float], ...]
+    noise: tuple[float, float]
+    estimated: bool
+    said: tuple[str, ...]
+
+
+def prepare(
+    ring: Ring,
+    measurement: Measurement,
+    reference: Measurement | None,
+    radiation: bool,
+    effects: Sequence[str] | None,
+    judgement: Judgement,
+) -> Prepared:
+    """Data, model and launches.
+
+    Raises:
+        MeasurementError: data that cannot be used, or that are of another lattice.
+        BeamLostError: the launches are lost in the design.
+        EffectError: none of the effects can be looked for.
+        UnknownNameError: a monitor that the ring does not have, or an effect that does not exist.
+    """
+    known = tuple(expected_radiation(ring)) if radiation else ()
+    data = of_measurement(ring, measurement)
+    if reference is not None:
+        data = joined(of_measurement(ring, reference, reference=True), data)
+    chosen = chosen_effects(ring, effects, data.launch_sigma)
+    places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
+    model = Model(ring, data.settings, data.turns, known, active=data.active)
+    listed = {name.casefold() for name in measurement.monitors}
+    dead, data, said = _dead_monitors(model, data, listed, judgement)
+    rough = data.with_sigma(np.array([ROUGH, ROUGH]))
+    problem = FirstTurns(model=model, data=rough, places=places, judgement=judgement)
+    start = _on_its_way(fit(problem, (), data.launches), ring)
+    data, noise, estimated = _with_noise(data, start)
+    if estimated:
+        said = (*said, "the noise was estimated from the data: "
+                f"{1e6 * noise[0]:.1f} µm in x, {1e6 * noise[1]:.1f} µm in y")  # fmt: skip
+    _check_lattice(ring, data, start, judgement)
+    problem = replace(problem, data=data, white=None)
+    before = _on_its_way(fit(problem, (), start.nuisances), ring)
+    hypotheses = tuple(model.hypotheses(chosen))
+    return Prepared(problem, before, hypotheses, known, dead, noise, estimated, said)
+
+
+def _on_its_way(start: Fit, ring: Ring) -> Fit:
+    if start.point.lost:
+        raise BeamLostError(
+            f"{start.point.lost} in '{ring.name}' without any fault: check the launches' units (m, "
+            "rad), the settings, and whether this is the machine's lattice"
+        )
+    return start
+
+
+def _dead_monitors(
+    model: Model, data: Data, listed: set[str], judgement: Judgement
+) -> tuple[tuple[tuple[int, float], ...], Data, tuple[str, ...]]:
+    """Monitors without a signal (1) or with a frozen one (2), the data without the latter, and what
+    is to be said."""
+    count = len(model.at)
+    readings = data.readings.reshape(-1, count, 2)
+    valid = data.valid.reshape(-1, count, 2)
+    silent, frozen, half, said = [], [], [], []
+    for m, name in enumerate(model.maps.monitors):
+        there = valid[:, m]
+        if not there.any():
+            if name.casefold() in listed:
+                silent.append(m)
+        elif not there.any(axis=0).all():
+            half.append(name)
+        elif there.sum() >= 4:
+            values = [readings[there[:, plane], m, plane] for plane in (0, 1)]
+            if all(len(v) > 1 and np.ptp(v) == 0 for v in values):
+                frozen.append(m)
+    absent = sum(1 for name in model.maps.monitors if name.casefold() not in listed)
+    if absent:
+        said.append(f"{absent} of the ring's {count} monitors are not in the measurement")
+    if half:
+        some = ", ".join(half[:3]) + (", ..." if len(half) > 3 else "")
+        said.append(f"{len(half)} monitors read one plane only: {some}")
+    if len(silent) > judgement.silent * count:
+        said.append(f"{len(silent)} monitors have no signal; they count as not there")
+        silent = []
+    dropped = np.zeros(data.valid.shape, dtype=bool)
+    for m in frozen:
+        dropped[:, m::count] = True
+    dead = (*((m, 1.0) for m in silent), *((m, 2.0) for m in frozen))
+    return dead, data.without(dropped), tuple(said)
+
+
+def _with_noise(data: Data, start: Fit) -> tuple[Data, tuple[float, float], bool]:
+    """The data with a noise for every reading, its rms by plane, and whether it is estimated."""
+    missing = ~np.isfinite(data.sigma) & data.valid
+    if (data.sigma[data.valid & ~missing] <= 0).any():
+        raise MeasurementError("a monitor's noise is zero or negative; leave it out if unknown")
+    estimated = bool(missing.any())
+    if estimated:
+        found = estimate(data, start.point.view)
+        if not np.isfinite(found).any():
+            raise MeasurementError(
+                "the noise is not given and the readings are too few to estimate it; give the "
+                "noise of a reading"
+            )
+        data = data.with_sigma(np.where(np.isfinite(found), found, np.nanmean(found)))
+    data = data.with_sigma(np.ones(2))  # where nothing was read
+    x, y = (_rms(data.sigma[..., p][data.valid[..., p]]) for p in (0, 1))
+    return data, (x, y), estimated
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def _check_lattice(ring: Ring, data: Data, start: Fit, judgement: Judgement) -> None:
+    """A few errors leave most monitors in agreement with their neighbours."""
+    local = local_misfit(data, start.point.view)
+    if not np.isfinite(local).sum() > 50:
+        return
+    size = float(np.median(np.abs(local[np.isfinite(local)])))
+    orbit = float(np.median(np.abs(data.readings[data.valid])))
+    noise = float(np.median(data.sigma[data.valid]))
+    if size > max(judgement.alien * orbit, 5 * noise):
+        raise MeasurementError(
+            f"the readings do not follow from '{ring.name}': even between neighbouring monitors "
+            f"the model errs by {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} µm; name "
+            "the lattice of this machine, and check units and the names of the monitors"
+        )
+
+
+def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
+    """Held-out readings of the monitors that the fit kept.
+
+    Args:
+        other: of the held-out shots.
+        data: of the fit's.
+        dropped: readings that the search left out, [shot, reading, 2].
+    """
+    lost = dropped[data.active].all(axis=0)
+    never = np.asarray(lost | ~data.valid[data.active].any(axis=0))
+    readings = min(len(never), other.valid.shape[1])
+    left_out = np.zeros(other.valid.shape, dtype=bool)
+    left_out[:, :readings] = never[None, :readings]
+    return other.without(left_out)

@@ -1,0 +1,125 @@
+"""Hypotheses added to what is there, refitted through the full model, by falling evidence."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import Cause, find
+from tmlattice.inference.newton import Fit, Outcome, fit
+from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.scan import Scan
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A hypothesis that was refitted with everything else in place."""
+
+    hypothesis: Hypothesis
+    fit: Fit = field(repr=False)
+
+    @property
+    def cause(self) -> Cause:
+        """With its best amount: the last of the fit's causes."""
+        return self.fit.causes[-1]
+
+
+@dataclass(frozen=True)
+class Detection:
+    """How clearly something was seen when it was found: see the scan."""
+
+    statistic: float
+    threshold: float
+    p_value: float
+
+
+def rivals(
+    problem: Problem,
+    others: Fit,
+    found: Scan,
+    hypotheses: Sequence[Hypothesis],
+    count: int | None = None,
+) -> tuple[Rival, ...]:
+    """The leading hypotheses added to what is there, refitted, by falling evidence.
+
+    Args:
+        problem: model and data.
+        others: the fit without.
+        found: the scan about it.
+        hypotheses: all that may be the cause.
+        count: refitted at most; else as the judgement has it.
+    """
+    judge = problem.judgement
+    linear = _linear_evidence(problem, found)
+    have = {(c.effect, c.element) for c in others.causes}
+    order = np.argsort(-linear)[: judge.rivals if count is None else count]
+    # the linear scan errs by a share of the statistic itself where an effect is strong
+    window = judge.window + judge.drift * float(found.statistic.max(initial=0.0))
+    best = -np.inf
+    chosen: list[Rival] = []
+    for index in order:
+        if not linear[index] >= linear[order[0]] - window:
+            break
+        cause = _first_guess(found, int(index))
+        if cause is None or found.hypotheses[index] in have:
+            continue
+        tried = _with(problem, others, cause, best)
+        if tried.outcome not in (Outcome.LOST, Outcome.SINGULAR):
+            best = max(best, tried.log_evidence)
+            chosen.append(Rival(found.hypotheses[index], tried))
+    if chosen:
+        leader = max(chosen, key=lambda rival: rival.fit.log_evidence).hypothesis
+        have |= {rival.hypothesis for rival in chosen}
+        curved = [h for h in hypotheses if find(h[0]).curved and h not in have]
+        for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
+            cause = _best_start(problem, others, hypothesis)
+            chosen.append(Rival(hypothesis, _with(problem, others, cause, best)))
+    return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
+
+
+def _linear_evidence(problem: Problem, found: Scan) -> Array:
+    """By the scan alone, up to a constant; -inf for what it does not see."""
+    occam = -0.5 * np.log(np.maximum(found.statistic, 1.0))
+    prior = np.array([problem.prior(h) for h in found.hypotheses])
+    power = np.array([find(h[0]).power for h in found.hypotheses])
+    largest = np.array([find(h[0]).largest for h in found.hypotheses]) ** power
+    over = np.maximum(np.abs(found.amount) / largest, 1.0)
+    linear = 0.5 * found.statistic + occam + prior - np.minimum(8 * np.log(over), 1e6)
+    return np.where(found.statistic > 0, linear, -np.inf)
+
+
+def _first_guess(found: Scan, index: int) -> Cause | None:
+    """With the scan's amount; None where that has no root."""
+    name, place = found.hypotheses[index]
+    effect, amount = find(name), float(found.amount[index])
+    if effect.discrete:
+        return Cause(name, place, 1.0)
+    if effect.power == 2:
+        if amount <= 0:
+            return None
+        amount = float(np.sqrt(amount))
+    limit = 1.5 * effect.largest
+    return Cause(name, place, float(np.clip(amount, -limit, limit)))
+
+
+def _with(problem: Problem, others: Fit, cause: Cause, hopeless: float) -> Fit:
+    """What is there, and one cause more."""
+    return fit(
+        problem, (*others.causes, cause), others.nuisances, others.kicks,
+        hopeless=hopeless, slopes=others.slopes,
+    )  # fmt: skip
+
+
+def _best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
+    """The amount, out of a few, that leaves least when the nuisances follow."""
+    largest = find(hypothesis[0]).largest
+    causes = [Cause(*hypothesis, share * largest) for share in problem.judgement.starts]
+    left = []
+    for cause in causes:
+        point = problem.at((*others.causes, cause), others.nuisances, others.kicks)
+        clean = others.projection.out(np.nan_to_num(point.residual, nan=1e3))
+        left.append(float(clean @ clean))
+    return causes[int(np.argmin(left))]

@@ -1,0 +1,318 @@
+"""AT's elements of one element of a ring: thick, symplectic, with what is wrong and what is set."""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import at
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import physical_constants
+from scipy.linalg import sqrtm
+
+from tmlattice.effects.build import Build, Where
+from tmlattice.errors import LatticeError
+from tmlattice.lattice.ring import Element, Ring
+
+Array = NDArray[np.float64]
+
+ELECTRON = physical_constants["electron mass energy equivalent in MeV"][0] * 1e6  # eV
+RADIUS = physical_constants["classical electron radius"][0]  # m
+C_GAMMA = 4 * np.pi / 3 * RADIUS / ELECTRON**3
+"""Energy loss of a circle of radius rho: C_GAMMA E^4 / rho, 1/eV^3 m."""
+
+SWAPPED = [0, 1, 2, 3, 5, 4]
+"""OCELOT's coordinates in AT's order."""
+
+NOTHING = Build()
+
+_STRAIGHT = frozenset({"scale", "dx", "dy", "roll", "entrance", "middle"})
+_CORRECTOR = frozenset({"scale", "roll", "kick_x", "kick_y", "entrance"})
+_EMPTY = frozenset({"entrance", "middle"})
+_TAKES: Mapping[str, frozenset[str]] = {
+    "quadrupole": _STRAIGHT,
+    "sextupole": _STRAIGHT,
+    "bend": frozenset({"scale", "roll", "loss", "entrance"}),
+    "hcorrector": _CORRECTOR,
+    "vcorrector": _CORRECTOR,
+    "wiggler": frozenset({"loss", "entrance", "middle"}),
+    "marker": _EMPTY,
+    "drift": _EMPTY,
+    "cavity": frozenset({"middle"}),  # the RF takes the place of its first piece
+}
+"""What can be wrong with an element of each kind."""
+
+
+def wiggler_curvature(element: Element, energy: float) -> float:
+    """Integral of 1 / rho^2 over a wiggler, 1/m, from the vertical focusing that its poles have.
+
+    A plane wiggler focuses vertically with the mean of 1 / rho^2, so R33 = cos(sqrt(k) L).
+    """
+    cosine = _matrix(element, energy)[2, 2]
+    return float(np.arccos(cosine)) ** 2 / element.length if abs(cosine) < 1 else 0.0
+
+
+def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
+    """Energy loss of the design orbit in a turn, eV: C_gamma E^4 / 2 pi, integral of 1/rho^2."""
+    energy = ring.energy * 1e9
+    bent = sum(e.angle**2 / e.length for e in ring.elements if e.kind == "bend")
+    wiggled = sum(wiggler_curvature(e, energy) for e in ring.elements if e.kind == "wiggler")
+    return float(C_GAMMA * energy**4 / (2 * np.pi) * (bends * bent + wigglers * wiggled))
+
+
+def _matrix(element: Element, energy: float) -> Array:
+    """The design's matrix of a matrix element or undulator in AT's coordinates, [6, 6].
+
+    An undulator focuses by (sqrt(2) pi K / (period gamma))^2 in the plane that its field's
+    direction stands for; its slippage, of the order 1 / gamma^2, is left out.
+    """
+    source, length = element.source, element.length
+    if hasattr(source, "r"):
+        if np.any(source.t) or np.any(source.b) or source.delta_e:
+            raise LatticeError(
+                f"matrix '{element.name}' has a kick, a second order or an energy gain, which AT's "
+                "matrix has not; take them out of the lattice file"
+            )
+        return np.asarray(source.r, dtype=float)[np.ix_(SWAPPED, SWAPPED)]
+    matrix = np.eye(6)
+    for plane, strength in ((0, source.Ky), (2, source.Kx)):
+        root = 0.0
+        if strength:
+            root = np.sqrt(2.0) * np.pi * float(strength) / (source.lperiod * energy / ELECTRON)
+        phase = root * length
+        matrix[plane : plane + 2, plane : plane + 2] = [
+            [np.cos(phase), length * np.sinc(phase / np.pi)],
+            [-root * np.sin(phase), np.cos(phase)],
+        ]
+    return matrix
+
+
+def _rotation(angle: float) -> Array:
+    """Coordinates seen by a magnet turned by `angle` from x towards y, [6, 6]."""
+    matrix = np.eye(6)
+    matrix[:4, :4] = np.kron(
+        [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], np.eye(2)
+    )
+    return matrix
+
+
+def _check(element: Element, wrong: Build) -> None:
+    """Raise for what AT cannot make wrong with an element of this kind."""
+    asked: set[str] = {*wrong.gradients, *wrong.slopes}
+    asked |= {name for name, value in vars(wrong).items() if value != getattr(NOTHING, name)}
+    more = sorted(asked - {"gradients", "slopes"} - _TAKES.get(element.kind, frozenset()))
+    if more:
+        raise LatticeError(
+            f"AT cannot build the {element.kind} '{element.name}' with another {', '.join(more)}"
+        )
+
+
+class Builder:
+    """AT elements of one element of a ring with what is wrong with it and its settings."""
+
+    def __init__(
+        self, energy: float, steps: int, aperture: float, bends_radiate: bool, wigglers: float
+    ) -> None:
+        self.energy = energy
+        self.steps = steps
+        self.aperture = aperture
+        self.wigglers = wigglers
+        # The usual BndMPoleSymplectic4Pass leaves out the curvature's h x (px^2 + py^2) / 2, and
+        # its Rad twin takes the loss too late in every step (a third of the orbit is missing at
+        # 20 steps); the E2 pass has no vertical field. The exact pass has all three right.
+        self.bend_pass = f"ExactSectorBend{'Rad' if bends_radiate else ''}Pass"
+        self.walls = {"RApertures": np.array([-aperture, aperture, -aperture, aperture])}
+
+    def pieces(self, element: Element, wrong: Build, setting: Mapping[str, float]) -> list[Any]:
+        """As many for every setting: settings change strengths alone.
+
+        Raises:
+            LatticeError: an element that AT cannot build, or not with this wrong with it.
+        """
+        build: Callable[..., list[Any]] | None = getattr(self, f"_{element.kind}", None)
+        if build is None:
+            raise LatticeError(f"AT cannot build the {element.kind} '{element.name}'")
+        _check(element, wrong)
+        entrance = self._thin(element, wrong, "entrance")
+        return [*entrance, *build(element, wrong, defaultdict(float, setting))]
+
+    def _thin(self, element: Element, wrong: Build, where: Where) -> list[Any]:
+        """Thin gradients, px -= normal x - skew y, py += normal y + skew x, and other kicks."""
+        made: list[Any] = []
+        if where in wrong.gradients:
+            normal, skew = wrong.gradients[where]
+            made.append(at.ThinMultipole(element.name, [0.0, skew], [0.0, normal]))
+        if where in wrong.slopes:
+            matrix = np.eye(6, order="F")
+            matrix[np.ix_([1, 3], [0, 2])] = np.reshape(wrong.slopes[where], (2, 2))
+            made.append(at.M66(element.name, matrix))
+        return made
+
+    def _with_middle(
+        self, element: Element, wrong: Build, body: Callable[[float], list[Any]]
+    ) -> list[Any]:
+        """The body, or its two halves (`body` of a share of the length) and the thin kicks."""
+        thin = self._thin(element, wrong, "middle")
+        return [*body(0.5), *thin, *body(0.5)] if thin else body(1.0)
+
+    def _marker(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        return self._with_middle(element, wrong, lambda share: [at.Marker(element.name)])
+
+    def _drift(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        return self._with_middle(
+            element, wrong, lambda share: [at.Drift(element.name, share * element.length)]
+        )
+
+    def _cavity(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        if type(element.source).__name__ not in ("Cavity", "Drift", "Marker"):
+            raise LatticeError(
+                f"AT cannot build '{element.name}', a {type(element.source).__name__}; only "
+                "standing-wave cavities (Cavity)"
+            )
+        return self._drift(element, wrong, setting)
+
+    def _monitor(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        monitor = at.Monitor(element.name, **self.walls)
+        if element.length == 0:
+            return [monitor]
+        half = at.Drift(element.name, element.length / 2)
+        return [half, monitor, half]
+
+    def _straight(
+        self, element: Element, normal: list[float], wrong: Build, walls: bool
+    ) -> Callable[[float], list[Any]]:
+        """A straight multipole of strengths k_n, rolled about its own centre."""
+        more: dict[str, Any] = dict(self.walls) if walls else {}
+        angle = element.tilt + wrong.roll
+        if wrong.dx or wrong.dy:
+            shift = np.array([wrong.dx, 0, wrong.dy, 0, 0, 0])
+            more |= {"T1": -shift, "T2": shift}
+        if angle:
+            more |= {"R1": _rotation(angle), "R2": _rotation(-angle)}
+        factorial = [1.0, 1.0, 2.0, 6.0]
+        strengths = [k / n for k, n in zip(normal, factorial, strict=False)]
+
+        def body(share: float) -> list[Any]:
+            return [
+                at.Multipole(
+                    element.name,
+                    share * element.length,
+                    [0.0] * len(strengths),
+                    strengths,
+                    NumIntSteps=self.steps,
+                    **more,
+                )
+            ]
+
+        return body
+
+    def _quadrupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        source = element.source
+        if getattr(source, "x_offs", 0) or getattr(source, "y_offs", 0):
+            raise LatticeError(f"AT cannot build '{element.name}', a quadrupole passed off axis")
+        k1 = element.k1 * (1 + setting["k1_relative"]) * wrong.scale
+        return self._with_middle(
+            element, wrong, self._straight(element, [0.0, k1, element.k2], wrong, True)
+        )
+
+    def _sextupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        k2 = element.k2 * (1 + setting["k2_relative"]) * wrong.scale
+        return self._with_middle(
+            element, wrong, self._straight(element, [0.0, element.k1, k2], wrong, False)
+        )
+
+    def _octupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        k3 = float(element.source.k3)
+        return self._straight(element, [0.0, 0.0, 0.0, k3], wrong, False)(1.0)
+
+    def _multipole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        strengths = np.asarray(element.source.kn, dtype=float)
+        if strengths[0]:
+            raise LatticeError(f"AT cannot build '{element.name}', a thin multipole that bends")
+        factorials = np.cumprod([1, *range(1, len(strengths))])
+        more = {}
+        if element.tilt:
+            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
+        zero = np.zeros(len(strengths))
+        return [at.ThinMultipole(element.name, zero, strengths / factorials, **more)]
+
+    def _solenoid(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        return [  # AT has the pass and no class; its K is B / (B rho), OCELOT's k half of it
+            at.Element(
+                element.name,
+                Length=element.length,
+                K=2 * float(element.source.k),
+                PassMethod="SolenoidLinearPass",
+            )
+        ]
+
+    def _bend(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        source, length, angle = element.source, element.length, element.angle
+        if length <= 0 or source.h_pole1 or source.h_pole2:
+            raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
+        roll = wrong.roll
+        horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2  # what px loses
+        # The body is exact in a step; only its errors, losses and gradients are spread.
+        k1 = element.k1 * (1 + setting["k1_relative"])
+        steps = self.steps if element.k1 or element.k2 else 4
+        more: dict[str, Any] = {}
+        if element.tilt:
+            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
+
+        def body(share: float, **edges: float) -> Any:
+            return at.Dipole(
+                element.name,
+                share * length,
+                share * angle,
+                PolynomB=[horizontal / length, k1, element.k2 / 2, 0.0],
+                PolynomA=[-roll * angle / length, 0.0, 0.0, 0.0],
+                NumIntSteps=steps,
+                PassMethod=self.bend_pass,
+                **edges,
+                **more,
+            )
+
+        entrance, exit_ = source.fint * source.gap, source.fintx * source.gap
+        if entrance == exit_:
+            return [body(1.0, EntranceAngle=source.e1, ExitAngle=source.e2, gK=entrance)]
+        return [  # AT's exact bend has one fringe integral for both edges
+            body(0.5, EntranceAngle=source.e1, gK=entrance, FringeBendExit=0),
+            body(0.5, ExitAngle=source.e2, gK=exit_, FringeBendEntrance=0),
+        ]
+
+    def _hcorrector(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        kick = setting.get("kick", element.angle) * wrong.scale
+        x = kick * np.cos(element.tilt) + wrong.kick_x
+        y = kick * np.sin(element.tilt) + wrong.kick_y
+        cosine, sine = np.cos(wrong.roll), np.sin(wrong.roll)
+        turned = [cosine * x - sine * y, sine * x + cosine * y]
+        return [at.Corrector(element.name, element.length, turned)]
+
+    _vcorrector = _hcorrector  # OCELOT tilts a vertical corrector by a right angle
+
+    def _matrix(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        matrix = np.asfortranarray(_matrix(element, self.energy))
+        return [at.M66(element.name, matrix, Length=element.length)]
+
+    def _wiggler(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        middle = self._thin(element, wrong, "middle")
+        if self.wigglers:
+            middle += self._loss(element)
+        if not middle:
+            return self._matrix(element, wrong, setting)
+        root = np.asfortranarray(np.real(sqrtm(_matrix(element, self.energy))))
+        half = at.M66(element.name, root, Length=element.length / 2)
+        return [half, *middle, half]
+
+    def _loss(self, element: Element) -> list[Any]:
+        """delta -> delta - u (1 + 2 delta), and px, py in proportion to the momentum.
+
+        AT's change of the reference momentum by 1 / (1 - u) takes the share u from px, py and
+        1 + delta; a matrix before it adds the second u delta.
+        """
+        curvature = wiggler_curvature(element, self.energy)
+        share = self.wigglers * C_GAMMA * self.energy**3 / (2 * np.pi) * curvature
+        matrix = np.eye(6, order="F")
+        matrix[4, 4] = 1 - share
+        change = at.Element(element.name, PassMethod="ChangePRefPass", FieldScaling=1 / (1 - share))
+        return [at.M66(element.name, matrix), change]

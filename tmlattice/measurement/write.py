@@ -1,0 +1,286 @@
+"""Writing the measurement folder, format version 1: see `measurement.folder`."""
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.files import output_folder, write_json
+from tmlattice.measurement.folder import FORMAT, READINGS, RESPONSE, RF
+from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.orbit_response import OrbitResponse
+from tmlattice.measurement.rows import LARGEST_READING
+from tmlattice.measurement.trajectory import (
+    COORDINATES,
+    Measurement,
+    Settings,
+    check_settings,
+)
+
+Array = NDArray[np.float64]
+
+
+def write_measurement(folder: str | Path, measurement: Measurement | OrbitResponse) -> None:
+    """Write a measurement folder: whole, or not at all. What it reads back is bit-identical.
+
+    Args:
+        folder: made where it is not there; files of the same names are replaced.
+        measurement: of either kind.
+
+    Raises:
+        OutputError: it cannot be written.
+        MeasurementError: a reading that no reader would take (above 0.2 m).
+    """
+    if isinstance(measurement, OrbitResponse):
+        _write_response(Path(folder), measurement)
+        return
+    m = measurement
+    with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy) as writer:
+        for i, shot in enumerate(m.shots):
+            writer.add(
+                shot,
+                m.launches[i],
+                None if m.launch_sigma is None else m.launch_sigma[i],
+                m.settings[i] if m.settings else {},
+                m.readings[i],
+            )
+
+
+def _write_response(folder: Path, response: OrbitResponse) -> None:
+    orbits = [(name, response.response[i]) for i, name in enumerate(response.correctors)]
+    document = _header("orbit_response", response.monitors, response)
+    document["columns"] = [
+        {"corrector": name, "plane": plane, "kick": float(kick)}
+        for name, plane, kick in zip(
+            response.correctors, response.planes, response.kicks, strict=True
+        )
+    ]
+    if response.rf is not None:
+        document["rf"] = {
+            "frequency_hz": float(response.rf.frequency),
+            "harmonic": int(response.rf.harmonic),
+            "step_hz": float(response.rf.step),
+        }
+        if response.rf.orbit is not None:
+            document["dispersion"] = True
+            orbits.append((RF, response.rf.orbit))
+    with output_folder(folder) as temporary:
+        write_json(temporary / "measurement.json", document)
+        write_response_table(temporary / "response.csv", response.monitors, orbits)
+
+
+def write_response_table(
+    path: Path, monitors: Sequence[str], orbits: Sequence[tuple[str, Array]]
+) -> None:
+    """Write orbit changes as the table of an orbit response's folder.
+
+    Args:
+        path: the file.
+        monitors: names.
+        orbits: a corrector's name, or "rf", and its orbit change, m, [monitor, 2].
+
+    Raises:
+        MeasurementError: an orbit change that no reader would take (above 0.2 m).
+    """
+    with path.open("w", encoding="utf-8", newline="") as file:
+        write = csv.writer(file, lineterminator="\n").writerow
+        write(RESPONSE)
+        for name, orbit in orbits:
+            _check_size(orbit, monitors)
+            for monitor, xy in zip(monitors, orbit.tolist(), strict=True):
+                write((name, monitor, *_fields(xy)))
+
+
+def _header(kind: str, monitors: Sequence[str], source: Any) -> dict[str, Any]:
+    """What both kinds of document begin with; `source` has noise, lattice and energy."""
+    from tmlattice import __version__
+
+    header: dict[str, Any] = {
+        "format": FORMAT,
+        "version": 1,
+        "package": __version__,
+        "kind": kind,
+        "lattice": source.lattice,
+        "energy_gev": None if source.energy is None else float(source.energy),
+        "noise": _write_noise(source.noise, monitors),
+    }
+    return {key: value for key, value in header.items() if value is not None}
+
+
+def _write_noise(noise: Array | None, monitors: Sequence[str]) -> dict[str, Any] | None:
+    if noise is None:
+        return None
+
+    def pair(row: Array) -> dict[str, float | None]:
+        return {plane: _finite(v) for plane, v in zip("xy", row.tolist(), strict=True)}
+
+    if np.array_equal(noise, np.tile(noise[0], (len(noise), 1)), equal_nan=True):
+        return pair(noise[0])
+    return {monitor: pair(row) for monitor, row in zip(monitors, noise, strict=True)}
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _fields(xy: Sequence[float]) -> list[str]:
+    """repr is the shortest text that reads back as the same number; a missing one is empty."""
+    return [repr(v) if v == v else "" for v in xy]  # noqa: PLR0124  (NaN)
+
+
+def _check_size(readings: Array, monitors: Sequence[str]) -> None:
+    large = ~(np.abs(readings) <= LARGEST_READING) & ~np.isnan(readings)
+    if large.any():
+        *_, monitor, plane = np.argwhere(large)[0]
+        raise MeasurementError(
+            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
+            f"{LARGEST_READING} m, which no reader takes; readings are in metres"
+        )
+
+
+class MeasurementWriter:
+    """Writes a trajectory's folder shot by shot; `measurement_writer` makes it.
+
+    Attributes:
+        monitors: names, in the order of the readings.
+        noise, lattice, energy: as in `Measurement`.
+    """
+
+    def __init__(
+        self,
+        monitors: Sequence[str],
+        noise: Any,
+        lattice: str | None,
+        energy: float | None,
+        document: TextIO,
+        table: TextIO,
+    ) -> None:
+        self.monitors = Names("monitor", monitors).names
+        self.noise = noise_table(noise, self.monitors)
+        self.lattice, self.energy = lattice, energy
+        self._shots: set[int] = set()
+        self._some = False
+        self._document, self._table = document, table
+        header = json.dumps(
+            _header("trajectory", self.monitors, self),
+            indent=2, ensure_ascii=False, allow_nan=False,
+        )  # fmt: skip
+        document.write(header.removesuffix("\n}") + ',\n  "shots": [')
+        table.write(",".join(READINGS) + "\n")
+        # a name with a comma or a quote is quoted as CSV has it
+        self._names = [_quoted(name) for name in self.monitors]
+
+    def add(
+        self,
+        shot: int,
+        launch: Array | Sequence[float],
+        launch_sigma: Array | Sequence[float] | None,
+        settings: Settings | None,
+        readings: Array,
+    ) -> None:
+        """Write one shot; nothing of it is kept but its id.
+
+        Args:
+            shot: its id.
+            launch: nominal x, px, y, py, delta, [5] (or [4], delta 0).
+            launch_sigma: their rms, [5] (or [4], delta exact); None: unknown.
+            settings: see `Measurement`; None or {} for the design's.
+            readings: m, [turn, monitor, 2], NaN where missing.
+
+        Raises:
+            MeasurementError: shapes or numbers that no reader would take, or a shot once more.
+        """
+        if shot in self._shots:
+            raise MeasurementError(f"shot {shot} is written already; give each an id of its own")
+        readings = np.asarray(readings, dtype=float)
+        if readings.ndim != 3 or readings.shape[1:] != (len(self.monitors), 2):
+            raise MeasurementError(
+                f"shot {shot} has readings of the shape {readings.shape}; it should be "
+                f"[turns, {len(self.monitors)}, 2]"
+            )
+        _check_size(readings, self.monitors)
+        entry: dict[str, Any] = {"id": int(shot), "launch": _coordinates(launch, "launch")}
+        if None in entry["launch"].values():
+            raise MeasurementError(f"the launch of shot {shot} is not finite")
+        if launch_sigma is not None:
+            if not (np.asarray(launch_sigma, dtype=float) >= 0).all():
+                raise MeasurementError(f"a launch_sigma of shot {shot} is negative or NaN")
+            entry["launch_sigma"] = _coordinates(launch_sigma, "launch_sigma")
+        if settings:
+            check_settings(shot, settings)
+            entry["settings"] = {
+                name: {key: float(amount) for key, amount in changed.items()}
+                for name, changed in settings.items()
+            }
+        separator = ",\n    " if self._shots else "\n    "
+        self._document.write(separator + json.dumps(entry, ensure_ascii=False, allow_nan=False))
+        for turn, row in enumerate(readings.tolist()):
+            start = f"{int(shot)},{turn},"
+            self._table.writelines(
+                f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
+                for name, (x, y) in zip(self._names, row, strict=True)
+            )
+        self._shots.add(shot)
+        self._some |= bool(np.isfinite(readings).any())
+
+    def close(self) -> None:
+        """End the document.
+
+        Raises:
+            MeasurementError: no shot, or no reading, was written.
+        """
+        if not self._some:
+            raise MeasurementError("no reading was written; a measurement has one at least")
+        self._document.write("\n  ]\n}\n")
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"' if set(name) & {",", '"'} else name
+
+
+def _coordinates(values: Any, what: str) -> dict[str, float | None]:
+    array = np.asarray(values, dtype=float)
+    if array.shape not in ((4,), (5,)):
+        raise MeasurementError(f"a {what} is x, px, y, py and delta, not {array.shape} numbers")
+    padded = np.pad(array, (0, 5 - len(array))).tolist()
+    return {name: _finite(v) for name, v in zip(COORDINATES, padded, strict=True)}
+
+
+@contextmanager
+def measurement_writer(
+    folder: str | Path,
+    monitors: Sequence[str],
+    noise: Any = None,
+    lattice: str | None = None,
+    energy: float | None = None,
+) -> Iterator[MeasurementWriter]:
+    """A writer of a trajectory's folder, shot by shot, with memory flat in their number.
+
+    The folder appears, whole, when the block ends; after an exception or Ctrl-C nothing is left.
+
+    Args:
+        folder: made where it is not there; files of the same names are replaced.
+        monitors: names, in the order of the readings.
+        noise: rms of a reading, m: a pair (x, y), [monitor, 2], a mapping by monitor, or None.
+        lattice: name or path, a hint for the reader.
+        energy: GeV.
+
+    Raises:
+        OutputError: it cannot be written.
+        MeasurementError: names or noise that cannot be; no reading written.
+    """
+    with ExitStack() as stack:
+        temporary = stack.enter_context(output_folder(Path(folder)))
+        with (
+            (temporary / "measurement.json").open("w", encoding="utf-8") as document,
+            (temporary / "readings.csv").open("w", encoding="utf-8", newline="") as table,
+        ):
+            writer = MeasurementWriter(monitors, noise, lattice, energy, document, table)
+            yield writer
+            writer.close()

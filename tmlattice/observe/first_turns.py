@@ -1,0 +1,205 @@
+"""First turns: trajectories from launches that are known only so well.
+
+>>> problem = FirstTurns(model=Model(ring, data.settings), data=data, places={})
+>>> fit(problem, [Cause("quadrupole_gradient", "qd::12", -0.1)], data.launches)
+
+Nuisances are the launches (x, px, y, py, delta), [shot, 5]. A free kick is (px, py) in every active
+shot, in the middle of a layer's magnet; its parameters are [active shot * 2].
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.model import Model
+from tmlattice.effects import Cause, find
+from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.newton import fit
+from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
+from tmlattice.inference.search import State
+from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.observe.data import Data
+from tmlattice.observe.metric import TurnMetric, metric
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstTurns(Problem):
+    """The shots of a measurement, a turn or a few each, in a ring with what is known of it.
+
+    Attributes:
+        model: the ring as these shots saw it.
+        data: readings.
+        spread: rms times signature of small errors everywhere, [error, shot, reading, 2], m, or
+            None.
+        white: the whitening where it is known already: a dense one costs a factorisation.
+    """
+
+    model: Model = field(repr=False)
+    data: Data = field(repr=False)
+    spread: Array | None = field(default=None, repr=False)
+    white: Whitening | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.white is None:
+            object.__setattr__(self, "white", Whitening(self.data, self.spread))
+
+    @property
+    def whitening(self) -> Whitening:
+        """By the noise of the readings, and by the small errors."""
+        assert self.white is not None
+        return self.white
+
+    # --- the model ------------------------------------------------------------------------------
+    def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
+        """Trajectories and what they leave; `view` is their `Paths`."""
+        paths = self.model.paths(nuisances, (*self.fixed, *causes), self._of_shots(kicks))
+        residual = self._residual(paths.readings, nuisances)
+        projection, lost = None, ""
+        if np.isfinite(residual).all():
+            projection = Projection(self.whitening.launch(paths.launch))
+        else:
+            lost = "the beam is lost"
+        return Point(
+            tuple(causes), nuisances, dict(kicks), residual, projection, paths.beam, paths, lost
+        )
+
+    def slope(self, point: Point, cause: int) -> Array:
+        """By central differences of the readings: all orders, monitors' errors included."""
+        causes = point.causes
+        effect = find(causes[cause].effect)
+        h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
+        kicks = self._of_shots(point.kicks)
+        ends = []
+        for side in (h, -h):
+            changed = replace(causes[cause], amount=causes[cause].amount + side)
+            there = (*self.fixed, *causes[:cause], changed, *causes[cause + 1 :])
+            ends.append(self.model.readings(point.nuisances, there, kicks))
+        return self.whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
+
+    def moved(self, nuisances: Array, change: Array) -> Array:
+        """Launches with their free coordinates changed."""
+        launches = nuisances.copy()
+        launches[:, self.whitening.columns] += change.reshape(len(launches), -1)
+        return launches
+
+    def metric(self, point: Point) -> TurnMetric:
+        """Products of signatures along these trajectories."""
+        assert point.projection is not None
+        return metric(
+            self.model, point.view, point.nuisances, self.whitening, point.projection,
+            self.data.active,
+        )  # fmt: skip
+
+    def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Those that sit between the same monitors as a magnet."""
+        ring = self.model.ring
+        if hypothesis[1] is None or not any(e.name == hypothesis[1] for e in ring.magnets):
+            return []
+        s = np.array([0.0, *(monitor.s for monitor in ring.monitors), ring.length])
+        gap = int(np.searchsorted(s, ring[hypothesis[1]].s))
+        low, high = s[max(gap - 1, 0)], s[min(gap, len(s) - 1)]
+        elements = {element.name: element.s for element in ring.elements}
+        return [
+            (name, place)
+            for name, place in among
+            if place in elements and low <= elements[place] <= high
+        ]
+
+    # --- what has no name -----------------------------------------------------------------------
+    @property
+    def kick_places(self) -> Sequence[str]:
+        """The magnets."""
+        return self.model.maps.layers
+
+    def kick_rows(self, point: Point, place: int) -> Array:
+        """Of (px, py) in the middle of a magnet, each active shot's own."""
+        kicked = self.model.kick_signatures(point.view, np.array([place]))[0]
+        shots = np.flatnonzero(self.data.active)
+        alone = np.zeros((len(shots), *kicked.shape))
+        for i, shot in enumerate(shots):
+            alone[i, :, shot] = kicked[:, shot]
+        return self.whitening.signature(alone).reshape(2 * len(shots), -1)
+
+    def _of_shots(self, kicks: Kicks) -> dict[int, Array]:
+        whole = {}
+        for place, values in kicks.items():
+            whole[place] = np.zeros((self.data.shots, 2))
+            whole[place][self.data.active] = values.reshape(-1, 2)
+        return whole
+
+    @property
+    def monitors(self) -> Sequence[str]:
+        """In the order of the readings."""
+        return self.model.maps.monitors
+
+    # --- readings -------------------------------------------------------------------------------
+    @property
+    def valid(self) -> Flags:
+        """[shot, reading, 2]."""
+        return self.data.valid
+
+    def owner(self) -> NDArray[np.int64]:
+        """The monitor of each reading."""
+        one = np.tile(np.arange(len(self.monitors)), self.data.turns)
+        return np.broadcast_to(one[None, :, None], self.valid.shape)
+
+    def left(self, point: Point) -> tuple[Array, Array]:
+        """The launch takes some of a reading; among small errors that is not looked at."""
+        assert point.projection is not None
+        shots = self.data.shots
+        clean = point.projection.out(point.residual).reshape(shots, -1)[:, :-5]
+        size = np.ones_like(clean)
+        if not self.whitening.dense:
+            Q = point.projection.Q[:, :-5]
+            size = 1 - np.einsum("bri,bri->br", Q, Q)
+        return clean.reshape(self.valid.shape), size.reshape(self.valid.shape)
+
+    def without(self, dropped: Flags) -> "FirstTurns":
+        """The noise is worked out anew."""
+        if not dropped.any():
+            return self
+        return replace(self, data=self.data.without(dropped), white=None)
+
+    # --- beside the search ----------------------------------------------------------------------
+    def _residual(self, readings: Array, launches: Array) -> Array:
+        difference = np.where(self.data.valid, self.data.readings - readings, 0.0)
+        return self.whitening.residual(difference, launches)
+
+
+def turns_of(found: State) -> FirstTurns:
+    """The problem of a search among first turns, as its last fit was of it."""
+    assert isinstance(found.problem, FirstTurns)
+    return found.problem
+
+
+def judged(problem: FirstTurns, launches: Array) -> tuple[Array, Array]:
+    """What a model leaves of shots that no fit saw.
+
+    In each shot only the launch is fitted, to one half of the monitors; the readings of the other
+    half are predicted.
+
+    Args:
+        problem: of these shots; its `fixed` causes are the model's.
+        launches: first guess.
+
+    Returns:
+        Readings less model, NaN where they gave the launch; and the rms to expect, of the noise
+        and of what the launch predicts, both [shot, reading, 2], m. NaN everywhere where the beam
+        is lost in the model.
+    """
+    data = problem.data
+    odd = problem.owner() % 2 == 1
+    fitted = problem.without(odd)
+    point = fit(fitted, (), launches).point
+    if point.projection is None:
+        return np.full(data.valid.shape, np.nan), data.sigma
+    slopes = point.view.launch[..., fitted.whitening.columns]
+    covariance = point.projection.covariance()  # [shot, column, column]
+    predicted = np.einsum("srpi,sij,srpj->srp", slopes, covariance, slopes, optimize=True)
+    left = np.where(data.valid & odd, data.readings - point.view.readings, np.nan)
+    return left, np.sqrt(data.sigma**2 + predicted)

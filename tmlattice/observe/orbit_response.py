@@ -1,0 +1,406 @@
+"""A measured orbit response as a ring has it: data, who judges, readings with errors, and rows.
+
+>>> data = response_data(ring, measured)
+>>> split = split_columns(data, 0.2, np.random.default_rng(1))
+>>> there = Predicted(data, Errors.none(data))
+>>> data.orbits - there.read                       # what the design leaves, [column, monitor, 2]
+
+A column is a corrector, in the order of the measurement, or the RF, which is the last. Block 0 is
+the plane in which a column kicks, block 1 the other one.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.response_derivatives import derivatives
+from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
+from tmlattice.errors import EffectError, MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import OrbitResponse
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+Hypothesis = tuple[str, str | None]
+
+DELTA = 1e-3
+"""Energy deviation of the differences that tell what an energy spread does; its square is also
+the unit in which the spread's is fitted."""
+TURN = 0.1
+"""Roll that shows a corrector's kick in the other plane, rad."""
+INNER = 0.2
+"""Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
+SMALL = 1e-3
+"""Of a monitor's largest error: the step of the differences."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseData:
+    """A measured response, its monitors in the ring's order.
+
+    Attributes:
+        ring: the design.
+        measured: the response.
+        at: the monitors' places among the ring's, [monitor].
+        orbits: measured orbit changes, the RF's last, m, [column, monitor, 2].
+        kicks: the steps, rad, the RF's relative, [column].
+        plane: in which each column kicks, [column].
+        noise: rms of a reading, m, [monitor, 2].
+    """
+
+    ring: Ring
+    measured: OrbitResponse
+    at: Indices
+    orbits: Array
+    kicks: Array
+    plane: Indices
+    noise: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Columns, monitors."""
+        return self.orbits.shape[0], self.orbits.shape[1]
+
+    def plane_of(self, block: int) -> Indices:
+        """The plane in which each column is read, [column]."""
+        return self.plane if block == 0 else 1 - self.plane
+
+    def pick(self, values: Array, block: int = 0) -> Array:
+        """One plane of [column, monitor, 2] for each column."""
+        plane = self.plane_of(block)[:, None, None]
+        return np.asarray(np.take_along_axis(values, plane, 2)[..., 0])
+
+    def noise_of(self, block: int) -> Array:
+        """rms of each reading, m, [column, monitor]."""
+        return np.asarray(self.noise[:, self.plane_of(block)].T)
+
+
+def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
+    """What was measured, as the ring has it.
+
+    Raises:
+        MeasurementError: no RF step, or no noise.
+        UnknownNameError: a monitor that the ring does not have.
+    """
+    names = [monitor.name for monitor in ring.monitors]
+    known = {ring[name].name: name for name in measured.monitors}
+    measured = measured.select(monitors=[known[name] for name in names if name in known])
+    if measured.rf is None or measured.rf.orbit is None:
+        raise MeasurementError("an orbit response without an RF step: dispersion is not known")
+    if measured.noise is None or np.isnan(measured.noise).any():
+        raise MeasurementError("the noise of the readings is not known; add it")
+    order = {name: i for i, name in enumerate(names)}
+    return ResponseData(
+        ring=ring,
+        measured=measured,
+        at=np.array([order[ring[name].name] for name in measured.monitors]),
+        orbits=np.concatenate([measured.response, measured.rf.orbit[None]]),
+        kicks=np.append(measured.kicks, measured.rf.step / measured.rf.frequency),
+        plane=np.append([int(p == "y") for p in measured.planes], 0),
+        noise=measured.noise,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Who is fitted, who chooses, who judges.
+
+    Attributes:
+        held: correctors that are never fitted, [column].
+        inner: correctors that choose among families of errors, [column].
+        half: monitors that give a corrector its kick, or fit the RF, [column, monitor].
+        inner_rf: of the RF's fitted monitors those that choose, [monitor].
+    """
+
+    held: Flags
+    inner: Flags
+    half: Flags
+    inner_rf: Flags
+
+
+def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) -> Split:
+    """Draw them.
+
+    Raises:
+        MeasurementError: too few correctors.
+    """
+    columns, monitors = data.shape
+    count = round(holdout * (columns - 1))
+    inner = round(INNER * (columns - 1 - count))
+    if not (count > 0 and inner > 0 and count + inner < columns - 2):
+        raise MeasurementError(f"{columns - 1} correctors cannot be split; measure more")
+    held, chooses = np.zeros((2, columns), dtype=bool)
+    drawn = rng.permutation(columns - 1)
+    held[drawn[:count]] = True
+    chooses[drawn[count : count + inner]] = True
+    half = np.zeros((columns, monitors), dtype=bool)
+
+    def draw(c: int) -> None:
+        half[c, rng.choice(monitors, monitors // 2, replace=False)] = True
+
+    for c in [*np.flatnonzero(held | chooses), columns - 1]:
+        draw(int(c))
+    near = np.flatnonzero(half[-1])
+    inner_rf = np.zeros(monitors, dtype=bool)
+    inner_rf[rng.choice(near, max(1, round(INNER * len(near))), replace=False)] = True
+    for c in np.flatnonzero(~(held | chooses))[:-1]:
+        draw(int(c))
+    return Split(held, chooses, half, inner_rf)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """What is wrong with monitors, correctors, ring and beam.
+
+    Attributes:
+        monitors: d reading / d beam, [monitor, 2, 2].
+        calibration, roll: of the columns, 0 for the RF, [column].
+        ring: causes in the ring.
+        spread: mean square energy deviation, in units of `DELTA` squared.
+    """
+
+    monitors: Array
+    calibration: Array
+    roll: Array
+    ring: tuple[Cause, ...] = ()
+    spread: float = 0.0
+
+    @classmethod
+    def none(cls, data: ResponseData) -> "Errors":
+        """The design."""
+        columns, monitors = data.shape
+        eye = np.tile(np.eye(2), (monitors, 1, 1))
+        return cls(eye, np.zeros(columns), np.zeros(columns))
+
+    def with_causes(self, data: ResponseData, causes: Sequence[Cause]) -> "Errors":
+        """These and more; an energy spread adds in square.
+
+        Raises:
+            EffectError: an effect of the launch, which a closed orbit does not have.
+        """
+        ring = list(self.ring)
+        scale, spread = np.ones(len(data.kicks)), self.spread
+        for cause in causes:
+            if cause.effect == "energy_spread":
+                spread += (cause.amount / DELTA) ** 2
+            elif isinstance(find(cause.effect), RingEffect):
+                ring.append(cause)
+                if cause.effect == "corrector_calibration":  # of the steps, beside the setting's
+                    scale[_column(data, cause.element)] *= 1 + cause.amount
+            elif not isinstance(find(cause.effect), ReadingEffect):
+                raise EffectError(f"'{cause.effect}' does not act on a closed orbit")
+        more = monitors_with(data.ring, causes).matrix()[data.at]
+        calibration = (1 + self.calibration) * scale - 1
+        monitors = more @ self.monitors
+        return replace(
+            self, monitors=monitors, calibration=calibration, ring=tuple(ring), spread=spread
+        )
+
+
+def _column(data: ResponseData, name: str | None) -> list[int]:
+    return [i for i, own in enumerate(data.measured.correctors)
+            if data.ring[own].name == data.ring[name or ""].name]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """What monitors read with some errors, and how it changes: linear about them.
+
+    Attributes:
+        data: correctors, kicks and monitors are its.
+        errors: that are there.
+        bent: what the steps' finite size adds to their linear orbit changes, m; see `bend`.
+    """
+
+    data: ResponseData
+    errors: Errors
+    bent: Array | float = 0.0
+
+    @cached_property
+    def model(self) -> ResponseModel:
+        """Of the ring with its errors; UnstableRingError where it has no closed orbit."""
+        return ResponseModel(apply(self.data.ring, self.errors.ring))
+
+    def orbits(self, model: ResponseModel) -> Array:
+        """Orbit changes of the steps, the RF's last, m, [column, monitor, 2].
+
+        The RF's is as large as the dispersion: a step of half a per cent in energy has a third
+        order that is several times the readings' noise.
+        """
+        data = self.data
+        steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
+        whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
+        return np.asarray(whole + self.bent)
+
+    def bend(self) -> "Predicted":
+        """With the third order of the correctors' two-sided steps.
+
+        It is a micrometre where the orbit is a millimetre, and the closed orbits of all correctors
+        take seconds: it is taken once a step.
+        """
+        data, names = self.data, self.data.measured.correctors
+        kicks = data.kicks[:-1] * (1 + self.errors.calibration[:-1])
+        up, down = (self.model.closed_orbits(names, side * kicks / 2) for side in (1, -1))
+        linear = self.model.response(names) * kicks[:, None, None]
+        bent = np.zeros_like(data.orbits)
+        bent[:-1] = (up - down - linear)[:, data.at]
+        bowed = Predicted(data, self.errors, bent)
+        bowed.__dict__["model"] = self.model  # the same ring
+        return bowed
+
+    @cached_property
+    def straight(self) -> Array:
+        """Orbit changes of one particle, correctors as they are told, m, [column, monitor, 2]."""
+        return self.orbits(self.model)
+
+    @cached_property
+    def curved(self) -> Array:
+        """What a mean square energy deviation of `DELTA` squared adds to that.
+
+        A monitor reads the centroid of particles whose orbits answer each as its energy has it:
+        half the second derivative by the energy, times the mean square.
+        """
+        step = DELTA / self.model.rf_start[5]
+        up, down = (self.orbits(self.model.at_frequency(f)) for f in (step, -step))
+        return np.asarray((up + down) / 2 - self.straight)
+
+    @cached_property
+    def across(self) -> Array:
+        """Orbit changes by a corrector's roll, m/rad, [column, monitor, 2]; 0 for the RF."""
+        data, names = self.data, self.data.measured.correctors
+        turned = [Cause("corrector_roll", name, TURN) for name in names]
+        model = ResponseModel(apply(self.model.ring, turned)).response(names)[:, data.at]
+        flat = self.model.response(names)[:, data.at]
+        out = np.zeros_like(data.orbits)
+        slope = (model - flat * np.cos(TURN)) / np.sin(TURN)
+        out[:-1] = slope * data.kicks[:-1, None, None]
+        return out
+
+    @cached_property
+    def beam(self) -> Array:
+        """Orbit changes of the centroid, correctors as told, m, [column, monitor, 2]."""
+        if not self.errors.spread:
+            return self.straight
+        return np.asarray(self.straight + self.errors.spread * self.curved)
+
+    @cached_property
+    def kicked(self) -> Array:
+        """The beam's orbit changes with the correctors as they are, m, [column, monitor, 2]."""
+        errors = self.errors
+        beam = (1 + errors.calibration)[:, None, None] * self.beam
+        if errors.roll.any():
+            beam = beam + errors.roll[:, None, None] * self.across
+        return np.asarray(beam)
+
+    def seen(self, beam: Array) -> Array:
+        """What the monitors make of the beam's orbit changes [..., monitor, 2]."""
+        return np.asarray(np.einsum("mij,...mj->...mi", self.errors.monitors, beam))
+
+    @cached_property
+    def read(self) -> Array:
+        """What monitors read, m, [column, monitor, 2]."""
+        return self.seen(self.kicked)
+
+    @cached_property
+    def left(self) -> Array:
+        """Measured less this, m, [column, monitor, 2]."""
+        return np.asarray(self.data.orbits - self.read)
+
+    def gain(self, block: int) -> Array:
+        """Of each reading's monitor in the plane that is read, [column, monitor]."""
+        own = np.diagonal(self.errors.monitors, axis1=1, axis2=2)
+        return np.asarray(own[:, self.data.plane_of(block)].T)
+
+    def slopes(self, pairs: Sequence[Hypothesis]) -> Iterator[Array]:
+        """d beam's orbit changes / d amount of effects on the ring, m, [column, monitor, 2]."""
+        data = self.data
+        scale = ((1 + self.errors.calibration) * data.kicks)[:, None, None]
+        for slope in derivatives(self.model, pairs, data.measured.correctors):
+            yield slope[:, data.at] * scale
+
+    def rows(self, effect: str, places: Sequence[str], block: int) -> Array:
+        """What the readings of a block do for each error, gains alone, [error, column, monitor]."""
+        out = np.empty((len(places), *self.data.shape))
+        gain = self.gain(block)
+        for i, slope in enumerate(self.slopes([(effect, place) for place in places])):
+            out[i] = self.data.pick(slope, block) * gain
+        return out
+
+    @cached_property
+    def jumps(self) -> Array:
+        """Beam orbit for a position jump of a metre at each corrector, [column, monitor, 2]."""
+        model, data = self.model, self.data
+        columns = model.columns(data.measured.correctors)
+        jump = np.zeros((len(columns.names), model.dimension))
+        jump[np.arange(len(jump)), 2 * data.plane[:-1]] = 1
+        pulled = np.einsum("cij,cj->ci", model.inverse[columns.layer + 1], jump)
+        before = np.einsum("mai,ci->cma", model.reading_slopes, pulled @ model.closing.T)
+        behind = np.einsum("mai,ci->cma", model.reading_slopes, pulled)
+        whole = before + model.downstream(columns)[:, :, None] * behind
+        return np.concatenate([whole[:, data.at], np.zeros((1, len(data.at), 2))])
+
+    # --- one cause more ---------------------------------------------------------------------------
+    def signatures(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Array]:
+        """d reading / d amount of causes that are added, m, [column, monitor, 2], one by one.
+
+        Of an effect that is there or not: the whole change. What a closed orbit does not see (an
+        offset of a monitor) is zero.
+        """
+        on_ring = [h for h in hypotheses if isinstance(find(h[0]), RingEffect)]
+        slopes = self.slopes(on_ring)
+        for effect, place in hypotheses:
+            kind = find(effect)
+            if isinstance(kind, RingEffect):
+                yield self.seen(next(slopes))
+            elif isinstance(kind, ReadingEffect):
+                yield self._monitor_slope(kind, self.data.ring[place or ""].name)
+            elif effect == "energy_spread":  # by the square of the amount
+                scale = (1 + self.errors.calibration)[:, None, None] / DELTA**2
+                yield self.seen(scale * self.curved)
+            else:
+                raise EffectError(f"'{effect}' does not act on a closed orbit")
+
+    def _monitor_slope(self, effect: ReadingEffect, place: str) -> Array:
+        out = np.zeros_like(self.read)
+        (at,) = [i for i, n in enumerate(self.data.measured.monitors)
+                 if self.data.ring[n].name == place] or (None,)  # fmt: skip
+        if at is None:
+            return out
+        read, nothing = self.read[:, at], np.zeros((1, 2))
+        steps = (1.0, 0.0) if effect.discrete else (SMALL * effect.largest, -SMALL * effect.largest)
+        up, down = (effect.change(read, h) - effect.change(nothing, h) for h in steps)
+        out[:, at] = (up - down) / (steps[0] - steps[1])
+        return out
+
+    def with_causes(self, causes: Sequence[Cause]) -> "Predicted":
+        """The same with more causes, not linearised."""
+        return Predicted(self.data, self.errors.with_causes(self.data, causes), self.bent)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Readings that are used, whitened by their noise.
+
+    Attributes:
+        data: whose noise.
+        used: which of [column, monitor, 2].
+    """
+
+    data: ResponseData
+    used: Flags
+
+    @classmethod
+    def fitted(cls, data: ResponseData, split: Split, good: Flags) -> "Rows":
+        """All but those of held-out correctors, bad monitors, and those that judge the RF."""
+        used = np.isfinite(data.orbits) & good[None, :, None] & ~split.held[:, None, None]
+        used[-1] &= split.half[-1][:, None]
+        return cls(data, used)
+
+    def whitened(self, readings: Array) -> Array:
+        """[..., column, monitor, 2] in units of the noise, [..., row]."""
+        return np.asarray((readings / self.data.noise)[..., self.used])

@@ -1,0 +1,68 @@
+"""The whole report as plain text.
+
+>>> print(report_text(diagnosis))
+"""
+
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.effects import CATALOGUE
+from tmlattice.report.response_text import steps_text
+from tmlattice.report.text import (
+    advice,
+    closed_text,
+    columns,
+    finding_rows,
+    gap_rows,
+    left_text,
+    next_text,
+    noise_text,
+    sensitivity_rows,
+    title,
+    tune_texts,
+    verdict_sentence,
+    wrapped,
+)
+
+WIDTH = 100
+
+
+def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
+    """The whole report as plain text.
+
+    Args:
+        diagnosis: of `diagnose`.
+        width: columns.
+    """
+    lines = [*wrapped(f"{diagnosis.verdict.upper()}. {verdict_sentence(diagnosis)}", "", width)]
+    for number, finding in enumerate(diagnosis.findings, 1):
+        lines += ["", *wrapped(title(finding), f"{number}. ", width)]
+        for name, text in finding_rows(finding):
+            for i, part in enumerate(text.split("\n")):
+                label = f"   {name if i == 0 else '':<13}"
+                lines += wrapped(part, label, width)
+    more = next_text(diagnosis) or advice(diagnosis)
+    if more:
+        lines += ["", *wrapped(more, "Next: ", width)]
+    lines += ["", *_gap_table(diagnosis)]
+    lines += wrapped(closed_text(diagnosis) + ".", "", width)
+    lines += wrapped(left_text(diagnosis), "", width)
+    if diagnosis.steps:
+        lines += ["", *steps_text(diagnosis, width)]
+    if diagnosis.verdict == "nothing":
+        rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
+        if rows:
+            lines += ["", "Would have been seen, at half of the places where it can sit, from:"]
+            lines += columns(rows, "   ")
+    for warning in diagnosis.warnings:
+        lines += ["", *wrapped(warning, "Note: ", width)]
+    return "\n".join(lines)
+
+
+def _gap_table(diagnosis: Diagnosis) -> list[str]:
+    before, after = tune_texts(diagnosis)
+    rows = [
+        ("readings less model, rms", "before", "after"),
+        *gap_rows(diagnosis),
+        ("noise of a reading", noise_text(diagnosis), ""),
+        ("fractional tunes Qx, Qy", before, after),
+    ]
+    return columns(rows)
