@@ -4,13 +4,14 @@ Processor time is user + system of the process and its children, s: of the first
 caches (the package's and numba's), and the least of the later calls. The last column names the
 heavy packages that were loaded.
 
-21 November 2026, `python benchmarks/start.py --repeat 3`, on two cores that were NOT quiet (load 7; a quiet machine takes less): first / later, s.
+21 November 2026, `python benchmarks/start.py --repeat 3` on two cores, NOT quiet (a load
+of 7 from other work), first / later, s:
 
     --help              0.09 / 0.09
     info petra3         2.58 / 1.25   none of the heavy packages in the later calls
     simulate            3.58 / 2.56   ocelot, matplotlib, at
     diagnose            5.97 / 3.43   ocelot
-    tune-fit --epochs 1 17.2 / 6.98   torch, ocelot, matplotlib; 1.8 of it draws the three figures
+    tune-fit --epochs 1 17.2 / 6.98   torch, ocelot, matplotlib
 """
 
 import argparse
