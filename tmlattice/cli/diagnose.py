@@ -53,8 +53,8 @@ if TYPE_CHECKING:
 @click.option(
     "--effects",
     type=NameList(),
-    help="Look for these alone, or of an orbit response fit families of these alone; else the whole "
-    "catalogue (`tmlattice effects`).",
+    help="Look for these alone, or of an orbit response fit families of these alone; else the "
+    "whole catalogue (`tmlattice effects`).",
 )
 @click.option(
     "--network",

@@ -37,6 +37,8 @@ TYPICAL = 10.0
 """The median misfit of all columns counts as so many readings of each one's own."""
 ALONE = 0.3
 """A column whose misfit falls to this share by its own number has no other error to speak of."""
+NOISY = 1.5
+"""Chi2 per reading that is noise, or nearly."""
 LATE = 3
 """Rounds of a refused family that the columns want."""
 NEAR = 3.0
@@ -183,11 +185,12 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     """What each column alone says of its own number, from its near monitors.
 
     Returns:
-        The change of the number, and the far readings' squares, m^2, without it and with it,
-        [column]; NaN for columns that are never fitted.
+        The change of the number, and the far readings' mean squares in units of the noise, without
+        it and with it, [column]; NaN for columns that are never fitted.
     """
     rows = family.rows(state.at, np.zeros(0))
     left = state.data.pick(state.at.left, family.block)
+    noise = state.data.noise_of(family.block)
     amounts, without, told = np.full((3, len(left)), np.nan)
     for c in np.flatnonzero(~state.split.held[:-1]):
         seen = np.isfinite(left[c]) & state.good
@@ -195,7 +198,8 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
         if not rows[c, near].any():
             continue
         (amounts[c],), miss = _fitted(rows[c][:, None], left[c], near, far)
-        without[c], told[c] = np.sum(left[c, far] ** 2), np.sum(miss**2)
+        without[c] = np.mean((left[c, far] / noise[c, far]) ** 2)
+        told[c] = np.mean((miss / noise[c, far]) ** 2)
     return amounts, without, told
 
 
@@ -520,9 +524,17 @@ def _tried(state: State, trial: Trial, *, late: bool) -> tuple[State, State]:
 
 
 def _wanted(state: State, family: Family) -> bool:
-    """Whether columns' far monitors want the numbers that their near ones give."""
+    """Whether columns' far monitors want the numbers that their near ones give.
+
+    A wrong focusing wants them too, a little of each: so they have to leave noise alone, or most of
+    what they take away has to be columns' that have nothing else.
+    """
     _, without, told = by_columns(state, family)
-    return bool(np.nansum(told) < HELPS**2 * np.nansum(without))
+    if not np.nansum(told) < HELPS**2 * np.nansum(without):
+        return False
+    fall = np.nan_to_num(np.maximum(without - told, 0))
+    alone = fall[told < ALONE**2 * without].sum() > fall.sum() / 2
+    return bool(alone or np.nanmean(told) < NOISY)
 
 
 # --- what was found -------------------------------------------------------------------------------
