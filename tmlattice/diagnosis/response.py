@@ -87,9 +87,8 @@ def diagnose_response(
     repaired = apply(ring, on_ring)
     good = fit.state.good
     options = {
-        "reference": False, "background": {}, "holdout": holdout,
-        "effects": None if effects is None else list(effects), "max_effects": max_effects,
-        "radiation": False, "false_alarm": false_alarm, "missing": missing,
+        "holdout": holdout, "effects": None if effects is None else list(effects),
+        "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
     }  # fmt: skip
     noise = np.sqrt(np.mean(data.noise[good] ** 2, axis=0))
     return Diagnosis(
@@ -106,10 +105,7 @@ def diagnose_response(
         warnings=_warnings(fit),
         noise=(float(noise[0]), float(noise[1])),
         noise_estimated=False,
-        provenance={
-            "package": _version(), "lattice": ring.name, "measurement": None, "options": options,
-            "seed": seed, "seconds": time.perf_counter() - begun,
-        },
+        provenance=_provenance(ring, options, seed, begun),
         ring=ring,
         repaired=repaired,
         causes=tuple(cause for cause, _ in found),
@@ -124,10 +120,17 @@ def diagnose_response(
     )  # fmt: skip
 
 
-def _version() -> str:
+def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
     from tmlattice import __version__
 
-    return __version__
+    return {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"reference": False, "background": {}, "radiation": False, **used},
+        "seed": seed,
+        "seconds": time.perf_counter() - begun,
+    }
 
 
 def _trials(effects: Sequence[str] | None) -> list[Trial]:
