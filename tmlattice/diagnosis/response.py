@@ -33,7 +33,6 @@ from tmlattice.errors import MeasurementError
 from tmlattice.inference.search import FALSE_ALARM
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.calibration import CALIBRATES
 from tmlattice.observe.orbit_response import response_data, split_columns
 
 Array = NDArray[np.float64]
@@ -82,35 +81,33 @@ def diagnose_response(
     fit = fit_steps(data, split, trials, max_effects, progress)
     found, degenerate = told(fit.state)
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
-    design, model = (state.at.read for state in (fit.design, fit.state))
-    on_ring = [c for c, _ in found if c.effect not in (*CALIBRATES, "energy_spread")]
-    repaired = apply(ring, on_ring)
+    repaired = apply(ring, fit.state.at.errors.ring)
     good = fit.state.good
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
     }  # fmt: skip
-    noise = np.sqrt(np.mean(data.noise[good] ** 2, axis=0))
+    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     return Diagnosis(
         verdict=_verdict(fit, false_alarm),
         findings=(),
-        fit_before=_misfit(fit, design),
-        fit_after=_misfit(fit, model),
-        heldout=_gap(fit, float(np.sqrt(np.mean(data.noise[good] ** 2)))),
+        fit_before=_misfit(fit, fit.design.at.read),
+        fit_after=_misfit(fit, fit.state.at.read),
+        heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
         heldout_shots=(),
         unexplained=_unexplained(fit),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=None,
         sensitivity={},
         warnings=_warnings(fit),
-        noise=(float(noise[0]), float(noise[1])),
+        noise=(noise_x, noise_y),
         noise_estimated=False,
         provenance=_provenance(ring, options, seed, begun),
         ring=ring,
         repaired=repaired,
         causes=tuple(cause for cause, _ in found),
         errors=tuple(sigma for _, sigma in found),
-        view=ResponseView(data.measured, data.orbits, design, model, split.held, good),
+        view=ResponseView(data.measured, data.orbits, fit.design.at.read, fit.state.at.read, split.held, good),
         steps=fit.steps,
         refused=fit.refused,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
