@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.dense import DenseFit, Step, begin, score
+from tmlattice.diagnosis.dense import DenseFit, Step, score
 from tmlattice.diagnosis.families import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
+from tmlattice.diagnosis.state import begin
 from tmlattice.effects import find
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
