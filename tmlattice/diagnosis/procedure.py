@@ -110,7 +110,7 @@ def diagnose(
         gap = _held_out(ring, heldout, ready, told, small, seed)
     repaired = apply(ring, told.causes)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
-    active = ready.problem.data.active
+    shots = int(ready.problem.data.active.sum())
     return Diagnosis(
         verdict=told.verdict,
         findings=told.findings,
@@ -128,7 +128,7 @@ def diagnose(
                     *said,
                     *ready.said,
                     *told.said,
-                    *_about_shots(int(active.sum()), told.findings),
+                    *_about(shots, told.findings),
                     *_about_spikes(left_out),
                 ]
             )
@@ -322,7 +322,7 @@ def _next(
     return None
 
 
-def _about_shots(shots: int, findings: Sequence[Finding]) -> list[str]:
+def _about(shots: int, findings: Sequence[Finding]) -> list[str]:
     if shots != 1 or not findings:
         return []
     return [

@@ -122,15 +122,7 @@ def fit_adam(
     weight = torch.from_numpy(present / len(first_turn))
     target = torch.from_numpy(np.where(present, first_turn, 0.0))
 
-    model = network.copy()
-    if free is None:
-        free = ("generator",) if isinstance(network, SymplecticNetwork) else ("W1", "W2")
-    unknown = set(free) - {name for name, _ in model.named_parameters()}
-    if unknown or not free:
-        known = ", ".join(name for name, _ in model.named_parameters())
-        raise ValueError(f"no weights {sorted(unknown)}; free are some of {known}")
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(name in free)
+    model, free = _freed(network, free)
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
     design = (
@@ -155,15 +147,7 @@ def fit_adam(
         for epoch in bar:
             for parameter in moving:
                 parameter.grad = None
-            try:
-                readings = model(launch)
-            except BeamLostError as error:
-                if epoch == 0:
-                    raise
-                raise BeamLostError(
-                    f"the fit diverged in epoch {epoch}: lower the learning rate "
-                    f"({learning_rate:g}); {error}"
-                ) from error
+            readings = _readings(model, launch, epoch, learning_rate)
             loss = ((readings - target).square() * weight).sum()
             penalty = _penalty(model, start, regularization, design)
             (loss + regularization_rate * penalty).backward()
@@ -204,6 +188,36 @@ def fit_adam(
             "patience": patience,
         },
     )
+
+
+def _freed(
+    network: TaylorNetwork | SymplecticNetwork, free: Sequence[str] | None
+) -> tuple[TaylorNetwork | SymplecticNetwork, Sequence[str]]:
+    """A copy in which these weights move, and their names."""
+    model = network.copy()
+    if free is None:
+        free = ("generator",) if isinstance(network, SymplecticNetwork) else ("W1", "W2")
+    unknown = set(free) - {name for name, _ in model.named_parameters()}
+    if unknown or not free:
+        known = ", ".join(name for name, _ in model.named_parameters())
+        raise ValueError(f"no weights {sorted(unknown)}; free are some of {known}")
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name in free)
+    return model, free
+
+
+def _readings(
+    model: TaylorNetwork | SymplecticNetwork, launch: Tensor, epoch: int, rate: float
+) -> Tensor:
+    """Of an epoch; a beam that is lost later than in the first one was lost by the fit."""
+    try:
+        return model(launch)
+    except BeamLostError as error:
+        if epoch == 0:
+            raise
+        raise BeamLostError(
+            f"the fit diverged in epoch {epoch}: lower the learning rate ({rate:g}); {error}"
+        ) from error
 
 
 def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
