@@ -76,8 +76,7 @@ def diagnose_response(
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
-    trials = _trials(effects)
-    data = response_data(ring, measured)
+    trials, data = _trials(effects), response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
@@ -115,9 +114,7 @@ def diagnose_response(
         repaired=repaired,
         causes=tuple(cause for cause, _ in found),
         errors=tuple(sigma for _, sigma in found),
-        view=ResponseView(
-            data.measured, data.orbits, fit.design.at.read, fit.state.at.read, split.held, good
-        ),
+        view=_view(fit),
         steps=fit.steps,
         refused=fit.refused,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
@@ -125,6 +122,12 @@ def diagnose_response(
         degenerate=degenerate,
         hypotheses=rows,
     )  # fmt: skip
+
+
+def _view(fit: DenseFit) -> ResponseView:
+    state, data = fit.state, fit.state.data
+    design, model = fit.design.at.read, state.at.read
+    return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
 
 
 def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
