@@ -21,7 +21,7 @@ BESIDE = {
     "cache",
     "batch",
     "schemas",
-}  # no room of the flow: everybody may use them
+}  # everybody may use them
 LINES, FUNCTION = 450, 70
 
 FILES = sorted(

@@ -115,13 +115,7 @@ def fit_adam(
     """
     regularization = Regularization(regularization)
     launch = torch.from_numpy(measurement.states(network.dimension))
-    first_turn = measurement.in_order_of(network.monitors).readings[:, 0]
-    present = np.isfinite(first_turn)
-    if not present.any():
-        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
-    weight = torch.from_numpy(present / len(first_turn))
-    target = torch.from_numpy(np.where(present, first_turn, 0.0))
-
+    weight, target = _target(measurement, network.monitors)
     model, free = _freed(network, free)
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
@@ -150,7 +144,8 @@ def fit_adam(
             readings = _readings(model, launch, epoch, learning_rate)
             loss = ((readings - target).square() * weight).sum()
             penalty = _penalty(model, start, regularization, design)
-            (loss + regularization_rate * penalty).backward()
+            total: Tensor = loss + regularization_rate * penalty
+            total.backward()  # type: ignore[no-untyped-call]
             losses.append(loss.item())
             penalties.append(penalty.item())
             if losses[-1] < best:
@@ -190,6 +185,19 @@ def fit_adam(
     )
 
 
+def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Weights (mean over shots; 0 where missing) and readings of the first turn, [shot, monitor,
+    2]."""
+    first_turn = measurement.in_order_of(monitors).readings[:, 0]
+    present = np.isfinite(first_turn)
+    if not present.any():
+        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
+    return (
+        torch.from_numpy(present / len(first_turn)),
+        torch.from_numpy(np.where(present, first_turn, 0.0)),
+    )
+
+
 def _freed(
     network: TaylorNetwork | SymplecticNetwork, free: Sequence[str] | None
 ) -> tuple[TaylorNetwork | SymplecticNetwork, Sequence[str]]:
@@ -211,7 +219,8 @@ def _readings(
 ) -> Tensor:
     """Of an epoch; a beam that is lost later than in the first one was lost by the fit."""
     try:
-        return model(launch)
+        readings: Tensor = model(launch)
+        return readings
     except BeamLostError as error:
         if epoch == 0:
             raise
