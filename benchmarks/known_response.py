@@ -11,13 +11,12 @@ import sys
 import numpy as np
 
 import tmlattice
-from tmlattice.diagnosis.response import diagnose_response
 from tmlattice.effects import apply, background_rms
 from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response
 from tmlattice.network import TaylorNetwork
 from tmlattice.optics import twiss
-from tmlattice.report.response_text import response_text
+from tmlattice.report.plain import report_text
 
 BACKGROUND = {
     "quadrupole_gradient": 2e-3,
@@ -38,11 +37,13 @@ def main(seed=1):
     measured = simulate_response(
         ring, background=BACKGROUND, correctors=some, noise=NOISE, engine="ocelot", seed=seed
     ).measured
-    found = diagnose_response(ring, measured, seed=1)
-    print(response_text(found))
+    found = tmlattice.diagnose(ring, measured, seed=1)
+    print(report_text(found))
     drawn = draw_background(ring, background_rms(BACKGROUND), seed)
     true = {(cause.effect, cause.element): cause.amount for cause in drawn}
-    held = {name for name, out in zip(measured.correctors, found.held, strict=False) if out}
+    held = {
+        name for name, out in zip(measured.correctors, found.response.held, strict=False) if out
+    }
     pulls = {}
     for cause, sigma in zip(found.causes, found.errors, strict=True):
         at = (cause.effect, cause.element)
@@ -62,7 +63,7 @@ def main(seed=1):
             for one, other in ((expected, design), (beta, expected))
         )
         print(f"beta beat in {name}: {beat:.2f} % rms, known to {left:.3f} %")
-    print(f"{found.seconds:.0f} s")
+    print(f"{found.provenance['seconds']:.0f} s")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,15 @@
 Processor time is user + system of the process and its children, s: of the first call, with empty
 caches (the package's and numba's), and the least of the later calls. The last column names the
 heavy packages that were loaded.
+
+21 November 2026, `python benchmarks/start.py --repeat 3` on two cores, NOT quiet (a load
+of 7 from other work), first / later, s:
+
+    --help              0.09 / 0.09
+    info petra3         2.58 / 1.25   none of the heavy packages in the later calls
+    simulate            3.58 / 2.56   ocelot, matplotlib, at
+    diagnose            5.97 / 3.43   ocelot
+    tune-fit --epochs 1 17.2 / 6.98   torch, ocelot, matplotlib
 """
 
 import argparse

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tmlattice import diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.missing import weigh
-from tmlattice.diagnosis.response import diagnose_response
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
@@ -24,7 +24,7 @@ from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
 from tmlattice.optics import twiss
 from tmlattice.report.plain import report_text
 
@@ -53,7 +53,7 @@ def measured(small_ring):
 
 @pytest.fixture(scope="module")
 def result(small_ring, measured):
-    return diagnose_response(small_ring, measured, seed=1)
+    return diagnose(small_ring, measured, seed=1)
 
 
 def test_gradients_close_the_held_out_gap(result):
@@ -77,7 +77,7 @@ def test_gradients_alone_are_found_too(small_ring):
         small_ring, [], background={"quadrupole_gradient": 2e-3}, noise=(2e-6, 1.2e-6),
         progress=False, seed=0,
     )  # fmt: skip
-    found = diagnose_response(small_ring, simulation.measured, seed=0)
+    found = diagnose(small_ring, simulation.measured, seed=0)
     kept = [step.effect for step in found.steps]
     assert "quadrupole_gradient" in kept
     assert not any("family_gradient" in effect for effect in kept)
@@ -96,17 +96,101 @@ def test_a_bad_monitor_is_named_and_left_out(small_ring, measured, rng):
     response = measured.response.copy()
     at = measured.monitors.index("last_a")
     response[:, at] += 1e-5 * rng.standard_normal(response[:, at].shape)
-    found = diagnose_response(small_ring, replace(measured, response=response), seed=1)
+    found = diagnose(small_ring, replace(measured, response=response), seed=1)
     assert found.bad_monitors == ("last_a",)
+
+
+def wrong_corrector(ring, effect, amount, seed=1):
+    return simulate_response(
+        ring, [Cause(effect, "v5", amount)], engine="ocelot", progress=False, seed=seed
+    ).measured
+
+
+@pytest.mark.parametrize(
+    ("effect", "amount"),
+    [("corrector_calibration", -2.0), ("corrector_calibration", 0.5), ("corrector_roll", 0.05)],
+)
+def test_one_wrong_corrector_is_not_nothing(small_ring, effect, amount):
+    """Held-out correctors, each with its kick fitted, see nothing of it: the column itself does."""
+    found = diagnose(small_ring, wrong_corrector(small_ring, effect, amount), seed=1)
+    assert not found.response.held[found.response.measured.correctors.index("v5")]
+    assert found.verdict != "nothing"
+    assert found.fit_after.chi2_per_dof < 1.2  # 490 readings: 1 +- 0.06
+    value, sigma = found.error(effect, "v5")
+    assert sigma < 5e-3
+    assert abs(value - amount) < 4 * sigma
+    assert not found.warnings
+
+
+def test_a_faultless_ring_is_nothing(small_ring):
+    measured = simulate_response(small_ring, [], engine="ocelot", progress=False).measured
+    found = diagnose(small_ring, measured)
+    assert found.verdict == "nothing"
+    assert not found.warnings
+
+
+def test_what_the_fit_may_not_mend_is_warned_about(small_ring):
+    """The held-out correctors are noise; the fitted ones are not."""
+    measured = wrong_corrector(small_ring, "corrector_calibration", -2.0)
+    found = diagnose(small_ring, measured, seed=1, effects=["monitor_gain_x"])
+    assert found.verdict == "distributed"
+    assert {cause.effect for cause in found.causes} <= {"monitor_gain_x", "monitor_gain_y"}
+    assert any("fitted, in-plane" in warning for warning in found.warnings)
+
+
+def test_options_act_and_are_told(small_ring, measured):
+    """They were ignored, and the JSON said false_alarm 0."""
+    found = diagnose(
+        small_ring, measured, seed=1, max_effects=1, false_alarm=0.01,
+        effects=["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"],
+    )  # fmt: skip
+    assert len(found.steps) == 2
+    options = found.as_json()["provenance"]["options"]
+    assert options["effects"] == ["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"]
+    assert options["max_effects"] == 1
+    assert options["false_alarm"] == 0.01
+    with pytest.raises(MeasurementError, match="has no family of monitor_offset_x"):
+        diagnose(small_ring, measured, effects=["monitor_offset_x"])
+    with pytest.raises(MeasurementError, match="'reference' has no meaning for an orbit response"):
+        diagnose(small_ring, measured, reference=measured)
+
+
+SIGNATURES = [
+    (Cause("quadrupole_gradient", "QD::5", 0.0), 1e-4),
+    (Cause("quadrupole_offset_x", "QF::3", 0.0), 1e-5),
+    (Cause("corrector_calibration", "v5", 0.0), 1e-2),
+    (Cause("corrector_roll", "v5", 0.0), 1e-3),
+    (Cause("monitor_gain_y", "end_3", 0.0), 1e-2),
+    (Cause("monitor_roll", "end_3", 0.0), 1e-3),
+    (Cause("monitor_offset_x", "end_3", 0.0), 1e-4),
+]
+
+
+@pytest.mark.parametrize(("cause", "step"), SIGNATURES, ids=lambda v: getattr(v, "effect", ""))
+def test_a_cause_s_rows_are_what_it_does_to_the_readings(small_ring, measured, cause, step):
+    """Beside calibrations, gains and gradients that are there, against whole steps both ways."""
+    there = [
+        Cause("corrector_calibration", "v5", 0.2), Cause("quadrupole_gradient", "QF::9", 0.01),
+        Cause("monitor_gain_x", "end_3", 0.1),
+    ]  # fmt: skip
+    data = response_data(small_ring, measured)
+    at = Predicted(data, Errors.none(data)).with_causes(there)
+    (mine,) = at.signatures([(cause.effect, cause.element)])
+    up, down = (at.with_causes([replace(cause, amount=h)]).read for h in (step, -step))
+    theirs = (up - down) / (2 * step)
+    # of a roll the catalogue's order of gain and roll is another: a tenth of its own gain
+    close = 0.1 if cause.effect == "monitor_roll" else 2e-3
+    assert np.abs(mine - theirs).max() <= close * np.abs(theirs).max() + 1e-12
+    assert (np.abs(theirs).max() > 1e-9) == (cause.effect != "monitor_offset_x")
 
 
 def test_what_is_missing_is_said(small_ring, measured):
     with pytest.raises(MeasurementError, match="RF step"):
-        diagnose_response(small_ring, replace(measured, rf=None))
+        diagnose(small_ring, replace(measured, rf=None))
     with pytest.raises(MeasurementError, match="noise"):
-        diagnose_response(small_ring, replace(measured, noise=None))
+        diagnose(small_ring, replace(measured, noise=None))
     with pytest.raises(MeasurementError, match="cannot be split"):
-        diagnose_response(small_ring, measured.select(correctors=measured.correctors[:2]))
+        diagnose(small_ring, measured.select(correctors=measured.correctors[:2]))
 
 
 def test_a_withheld_energy_spread_is_named(small_ring):
@@ -115,7 +199,7 @@ def test_a_withheld_energy_spread_is_named(small_ring):
     measured = simulate_response(
         small_ring, [spread], kick=2e-5, noise=5e-9, engine="ocelot", progress=False, seed=2
     ).measured
-    found = diagnose_response(small_ring, measured, seed=1)
+    found = diagnose(small_ring, measured, seed=1)
     assert "energy_spread" in [step.effect for step in found.steps]
     amount, sigma = found.error("energy_spread", None)
     assert sigma < 1e-5
@@ -209,9 +293,7 @@ def test_a_wiggler_that_focuses_is_named(small_ring):
         small_ring, [Cause("insertion_device_focusing", wiggler, 2e-4)], kick=STEP, noise=1e-9,
         engine="ocelot", progress=False, seed=4,
     ).measured  # fmt: skip
-    run = ResponseRun(small_ring, measured, seed=1)
-    run.run()
-    rows = weigh(run)
+    rows = weigh(fitted(small_ring, measured))
     best = min(rows, key=lambda row: row.heldout_rms_in_plane)
     assert (best.effect, best.judgement) == ("gradients of damping wigglers", "helps")
     assert best.amount == pytest.approx(2e-4, abs=3 * best.amount_sigma)
@@ -222,9 +304,7 @@ def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
         small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4,
         one_sided=True,
     ).measured  # fmt: skip
-    run = ResponseRun(small_ring, measured, seed=1)
-    run.run()
-    row = weigh(run, ["one_sided_steps"])[1]
+    row = weigh(fitted(small_ring, measured), ["one_sided_steps"])[1]
     assert row.amount_sigma < 0.01
     assert abs(row.amount - 1) < 4 * row.amount_sigma  # two-sided ones: 0
 
@@ -239,7 +319,7 @@ def test_the_errors_of_a_known_machine_are_those_stated(small_ring):
         small_ring, background=background, kick=1e-4, noise=1e-7, engine="ocelot", seed=5,
         progress=False,
     ).measured  # fmt: skip
-    found = diagnose_response(small_ring, measured, seed=1)
+    found = diagnose(small_ring, measured, seed=1)
     drawn = draw_background(small_ring, background, 5)
     true = {(cause.effect, cause.element): cause.amount for cause in drawn}
     held = {n for n, out in zip(measured.correctors, found.response.held, strict=False) if out}
@@ -303,11 +383,28 @@ def test_options_that_have_no_meaning(tmp_path, measured):
     assert "--radiation has no meaning for an orbit response" in str(done.exception)
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("ring.mat", "does not end in .json"), ("nowhere/ring.json", "cannot write")],
+)
+def test_the_lattice_s_place_is_checked_before_the_work(
+    tmp_path, measured, monkeypatch, name, said
+):
+    write_measurement(tmp_path / "m", measured)
+    monkeypatch.setattr("tmlattice.diagnosis.diagnose", None)  # the work would fail
+    done = CliRunner().invoke(
+        tmlattice, ["diagnose", SMALL, str(tmp_path / "m"), "--lattice-out", str(tmp_path / name)],
+        standalone_mode=False,
+    )  # fmt: skip
+    assert said in str(done.exception)
+    assert {path.name for path in tmp_path.iterdir()} == {"m"}
+
+
 @pytest.mark.slow
 @real
 def test_measured_petra3():
     """Held-out figures of the measured response; the design's are 164, 120 and 145 µm."""
-    found = diagnose_response(load_ring(REAL / "p3_low_beta.mat"), read_measurement(REAL))
+    found = diagnose(load_ring(REAL / "p3_low_beta.mat"), read_measurement(REAL))
     last = found.steps[-1]
     assert last.heldout_rms_in_plane < 7e-6
     assert last.heldout_rms_position < 4.5e-6

@@ -292,10 +292,10 @@ def test_the_cache_stays_within_its_bound_and_the_oldest_go(tmp_path, monkeypatc
 )
 def test_tilted_maps_vs_ocelots_own_rotation(make, tilt):
     from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
-    from tmlattice.maps.magnets import _parts_of_ocelot
+    from tmlattice.maps.quadratic import parts_of_ocelot
 
     source = make(elements, tilt)
-    ours = _parts_of_ocelot(source, 3.0, split=False)
+    ours = parts_of_ocelot(source, 3.0, split=False)
     edges = source.element.has_edge
     types = [TMTypes.ENTRANCE, TMTypes.MAIN, TMTypes.EXIT] if edges else [TMTypes.MAIN]
     for (_, R, T), which in zip(ours, types, strict=True):

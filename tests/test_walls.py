@@ -15,7 +15,13 @@ ORDER = (
     "inference", "observe", "diagnosis", "fitting", "machine", "challenge", "systems", "plots",
     "report", "cli",
 )  # fmt: skip
-BESIDE = {"errors", "files", "batch", "schemas"}  # no room of the flow: everybody may use them
+BESIDE = {
+    "errors",
+    "files",
+    "cache",
+    "batch",
+    "schemas",
+}  # everybody may use them
 LINES, FUNCTION = 450, 70
 
 FILES = sorted(

@@ -5,7 +5,6 @@ change of the launch, and d reading / d launch carries it to all readings downst
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.assembly import Group, Hypothesis
 from tmlattice.beam.threads import share
+from tmlattice.beam.tracked import Paths, TrackedShots
 from tmlattice.effects import Cause, LaunchEffect, Monitors, ReadingEffect, RingEffect, find
-
-if TYPE_CHECKING:
-    from tmlattice.beam.model import Model, Paths
 
 Array = NDArray[np.float64]
 
@@ -25,7 +22,7 @@ SMALL = 1e-4
 
 
 def signatures(
-    model: "Model", paths: "Paths", hypotheses: Sequence[Hypothesis], launches: Array
+    model: TrackedShots, paths: Paths, hypotheses: Sequence[Hypothesis], launches: Array
 ) -> Array:
     """See `Model.signatures`."""
     out = np.zeros((len(hypotheses), *paths.readings.shape))
@@ -47,7 +44,7 @@ def signatures(
     return out
 
 
-def of_readings(model: "Model", paths: "Paths", effect: ReadingEffect) -> Array:
+def of_readings(model: TrackedShots, paths: Paths, effect: ReadingEffect) -> Array:
     """d readings / d amount of an effect at every monitor, [shot, reading, 2].
 
     The effect joins the errors that each monitor has, in the order of `Monitors`.
@@ -63,12 +60,11 @@ def of_readings(model: "Model", paths: "Paths", effect: ReadingEffect) -> Array:
 def _with_all(monitors: Monitors, effect: ReadingEffect, amount: float) -> Monitors:
     changed = monitors.copy()
     if amount:
-        for m in range(len(changed.roll)):
-            effect.set(changed, m, amount)
+        effect.set(changed, slice(None), amount)
     return changed
 
 
-def _of_launch(model: "Model", effect: LaunchEffect, name: str, launches: Array) -> Array:
+def _of_launch(model: TrackedShots, effect: LaunchEffect, name: str, launches: Array) -> Array:
     """d beam / d amount ** power, [shot, reading, 2]."""
     h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
     up = model.beam(launches, [Cause(name, None, h)])
@@ -78,8 +74,8 @@ def _of_launch(model: "Model", effect: LaunchEffect, name: str, launches: Array)
 
 
 def _of_ring(
-    model: "Model",
-    paths: "Paths",
+    model: TrackedShots,
+    paths: Paths,
     hypotheses: list[Hypothesis],
     index: NDArray[np.int64],
     out: Array,
@@ -111,7 +107,7 @@ def _of_ring(
 
 
 def _given_back(
-    model: "Model",
+    model: TrackedShots,
     group: Group,
     hypotheses: list[Hypothesis],
     inverse: NDArray[np.floating],
@@ -142,7 +138,7 @@ def _given_back(
         share(kernels.carry, len(part[h]), owner, start, pulled, slopes, part)
 
 
-def kick_signatures(model: "Model", paths: "Paths", layers: NDArray[np.int64]) -> Array:
+def kick_signatures(model: TrackedShots, paths: Paths, layers: NDArray[np.int64]) -> Array:
     """See `Model.kick_signatures`."""
     turns = np.arange(model.turns) * model.steps
     exits = np.asarray(layers)[:, None] + 1 + turns[None]  # [layer, turn]
@@ -158,7 +154,7 @@ def kick_signatures(model: "Model", paths: "Paths", layers: NDArray[np.int64]) -
 
 
 def free_kicks(
-    model: "Model", paths: "Paths", layers: NDArray[np.int64]
+    model: TrackedShots, paths: Paths, layers: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Array]:
     """See `Model.free_kicks`."""
     kick = np.stack([model.kick(k) for k in layers])
@@ -168,7 +164,7 @@ def free_kicks(
 
 
 def single_kicks(
-    model: "Model", paths: "Paths", hypotheses: Sequence[Hypothesis]
+    model: TrackedShots, paths: Paths, hypotheses: Sequence[Hypothesis]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """See `Model.single_kicks`."""
     empty = np.zeros(0, dtype=np.int64)
@@ -198,7 +194,7 @@ def single_kicks(
     return np.array(ring)[owner], np.searchsorted(model.where, exits), pulled
 
 
-def seen(model: "Model", paths: "Paths", beam: Array) -> Array:
+def seen(model: TrackedShots, paths: Paths, beam: Array) -> Array:
     """What the monitors make of changes of the beam, [hypothesis, shot, reading, 2]."""
     return _through(paths.monitors, beam)
 

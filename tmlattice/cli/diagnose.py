@@ -115,14 +115,13 @@ def diagnose(
     exit code is 0 for each of them. An orbit response ends in a step for each family of errors, and
     options that speak of launches have no meaning for it.
     """
-    from tmlattice.files import output_file, output_folder, write_json
+    from tmlattice.files import output_file, output_folder
 
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
         from tmlattice.effects import background_rms, names
-        from tmlattice.lattice import load_ring, save_ring
-        from tmlattice.observe.calibration import write_calibration
+        from tmlattice.lattice import load_ring
 
         if effects is not None:
             names(effects)  # a wrong name is known before the work
@@ -153,24 +152,39 @@ def diagnose(
                 assert isinstance(data, Measurement)
                 progress("network")
                 reading = _weights(ring, network, data)
-            document = result.as_json()
-            provenance = {**document["provenance"], "measurement": str(measurement)}
-            document["provenance"] = provenance
-            if lattice_out:
-                save_ring(result.repaired, lattice_out)
-                write_calibration(calibration_beside(lattice_out), result.calibration)
-            if folder:
-                progress("figures")
-                _write_folder(result, folder, provenance)
-                write_json(folder / "diagnosis.json", document)
-                if reading:
-                    _write_weights(reading, folder)
-            if extra:
-                write_json(extra, document)
+            _write(result, str(measurement), folder, extra, lattice_out, progress)
+            if folder and reading:
+                _write_weights(reading, folder)
     if not quiet:
         _print(result, out, json_file, lattice_out)
         if reading:
             _print_weights(ring, reading)
+
+
+def _write(
+    result: "Diagnosis",
+    measurement: str,
+    folder: Path | None,
+    extra: Path | None,
+    lattice_out: Path | None,
+    progress: Callable[[str], None],
+) -> None:
+    """What was asked for."""
+    from tmlattice.files import write_json
+    from tmlattice.lattice import save_ring
+    from tmlattice.observe.calibration import write_calibration
+
+    document = result.as_json()
+    document["provenance"] = {**document["provenance"], "measurement": measurement}
+    if lattice_out:
+        save_ring(result.repaired, lattice_out)
+        write_calibration(calibration_beside(lattice_out), result.calibration)
+    if folder:
+        progress("figures")
+        _write_folder(result, folder, document["provenance"])
+        write_json(folder / "diagnosis.json", document)
+    if extra:
+        write_json(extra, document)
 
 
 def _refuse(kind: str, **given: Any) -> None:

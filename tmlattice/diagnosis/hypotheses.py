@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.dense import State
 from tmlattice.diagnosis.families import QuadrupoleGradient, families
+from tmlattice.diagnosis.state import State
 from tmlattice.effects import apply
 from tmlattice.observe.orbit_response import DELTA
 

@@ -20,8 +20,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
-from tmlattice.diagnosis.dense import State, linear, rms_of, weight
 from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
+from tmlattice.diagnosis.state import State, linear, rms_of, weight
 
 Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array
@@ -130,12 +130,8 @@ def weigh(
             judgement = "helps"
         elif i in helpers:
             judgement = "helps, not on top"
-        elif min(
-            alone[i].in_plane / base.in_plane, beside.in_plane / before.in_plane
-        ) < HELPS and not _sensible(hypothesis, beside):
-            judgement = "unphysical"
         else:
-            judgement = "excluded"
+            judgement = _refusal(hypothesis, alone[i], beside, base, before)
         amounts, sigma, in_plane, position = alone[i]
         out.append(
             Weighed(
@@ -145,6 +141,14 @@ def weigh(
             )
         )  # fmt: skip
     return out
+
+
+def _refusal(
+    hypothesis: Hypothesis, alone: "Answer", beside: "Answer", base: "Answer", before: "Answer"
+) -> str:
+    best = min(alone.in_plane / base.in_plane, beside.in_plane / before.in_plane)
+    unphysical = best < HELPS and not _sensible(hypothesis, beside)
+    return "unphysical" if unphysical else "excluded"
 
 
 def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:

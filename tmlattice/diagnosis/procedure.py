@@ -105,12 +105,9 @@ def diagnose(
         small, explanation = None, explain(search, ready.before)
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None
-    if heldout is not None:
-        gap = _held_out(ring, heldout, ready, told, small, seed)
+    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, seed)
     repaired = apply(ring, told.causes)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
-    active = ready.problem.data.active
     return Diagnosis(
         verdict=told.verdict,
         findings=told.findings,
@@ -122,17 +119,7 @@ def diagnose(
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=_next(ring, ready, explanation, seed),
         sensitivity=sensitivity(explanation.first, judgement),
-        warnings=tuple(
-            dict.fromkeys(
-                [
-                    *said,
-                    *ready.said,
-                    *told.said,
-                    *_about_shots(int(active.sum()), told.findings),
-                    *_about_spikes(left_out),
-                ]
-            )
-        ),
+        warnings=_said(said, ready, told, left_out),
         left_out=left_out,
         noise=ready.noise,
         noise_estimated=ready.estimated,
@@ -322,13 +309,17 @@ def _next(
     return None
 
 
-def _about_shots(shots: int, findings: Sequence[Finding]) -> list[str]:
-    if shots != 1 or not findings:
-        return []
-    return [
-        "one trajectory gives one kick at each place: it locates, but any single multipole "
-        "explains it; two or more launches name the effect"
-    ]
+def _said(
+    said: Sequence[str], ready: Prepared, told: _Told, left_out: Sequence[Mapping[str, Any]]
+) -> tuple[str, ...]:
+    """What a reader should know, each once."""
+    found = [*said, *ready.said, *told.said]
+    if ready.problem.data.active.sum() == 1 and told.findings:
+        found.append(
+            "one trajectory gives one kick at each place: it locates, but any single multipole "
+            "explains it; two or more launches name the effect"
+        )
+    return tuple(dict.fromkeys([*found, *_about_spikes(left_out)]))
 
 
 SHOWN = 4

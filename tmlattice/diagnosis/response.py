@@ -24,16 +24,16 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
-from tmlattice.effects import apply, names
+from tmlattice.effects import apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, Misfit
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.calibration import CALIBRATES
 from tmlattice.observe.orbit_response import response_data, split_columns
 
 Array = NDArray[np.float64]
@@ -76,45 +76,45 @@ def diagnose_response(
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
-    trials = _trials(effects)
-    data = response_data(ring, measured)
+    trials, data = _trials(effects), response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
-    fit = fit_steps(data, split, trials, max_effects, progress)
-    found, degenerate = told(fit.state)
+    judgement = Judgement(false_alarm=false_alarm)
+    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    if few is None:
+        fit = fit_steps(data, split, trials, max_effects, progress)
+        found, degenerate = told(fit.state)
+        verdict = _verdict(fit, false_alarm)
+    else:
+        fit, found, degenerate = few.fit, few.told, ()
+        verdict = few.verdict
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
-    design, model = (state.at.read for state in (fit.design, fit.state))
-    on_ring = [c for c, _ in found if c.effect not in (*CALIBRATES, "energy_spread")]
-    repaired = apply(ring, on_ring)
+    repaired = apply(ring, fit.state.at.errors.ring)
     good = fit.state.good
     options = {
-        "reference": False, "background": {}, "holdout": holdout,
-        "effects": None if effects is None else list(effects), "max_effects": max_effects,
-        "radiation": False, "false_alarm": false_alarm, "missing": missing,
+        "holdout": holdout, "effects": None if effects is None else list(effects),
+        "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
     }  # fmt: skip
-    noise = np.sqrt(np.mean(data.noise[good] ** 2, axis=0))
+    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     return Diagnosis(
-        verdict=_verdict(fit, false_alarm),
-        findings=(),
-        fit_before=_misfit(fit, design),
-        fit_after=_misfit(fit, model),
-        heldout=_gap(fit, float(np.sqrt(np.mean(data.noise[good] ** 2)))),
+        verdict=verdict,
+        findings=() if few is None else few.findings,
+        fit_before=_misfit(fit, fit.design.at.read),
+        fit_after=_misfit(fit, fit.state.at.read),
+        heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
         heldout_shots=(),
         unexplained=_unexplained(fit),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=None,
         sensitivity={},
-        warnings=_warnings(fit),
-        noise=(float(noise[0]), float(noise[1])),
+        warnings=(*(() if few is None else few.said), *_warnings(fit)),
+        noise=(noise_x, noise_y),
         noise_estimated=False,
-        provenance={
-            "package": _version(), "lattice": ring.name, "measurement": None, "options": options,
-            "seed": seed, "seconds": time.perf_counter() - begun,
-        },
+        provenance=_provenance(ring, options, seed, begun),
         ring=ring,
         repaired=repaired,
         causes=tuple(cause for cause, _ in found),
         errors=tuple(sigma for _, sigma in found),
-        view=ResponseView(data.measured, data.orbits, design, model, split.held, good),
+        view=_view(fit),
         steps=fit.steps,
         refused=fit.refused,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
@@ -124,10 +124,23 @@ def diagnose_response(
     )  # fmt: skip
 
 
-def _version() -> str:
+def _view(fit: DenseFit) -> ResponseView:
+    state, data = fit.state, fit.state.data
+    design, model = fit.design.at.read, state.at.read
+    return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
+
+
+def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
     from tmlattice import __version__
 
-    return __version__
+    return {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"reference": False, "background": {}, "radiation": False, **used},
+        "seed": seed,
+        "seconds": time.perf_counter() - begun,
+    }
 
 
 def _trials(effects: Sequence[str] | None) -> list[Trial]:
@@ -140,10 +153,11 @@ def _trials(effects: Sequence[str] | None) -> list[Trial]:
         for trial in STEPS
     ]
     known = {effect for trial in STEPS for family in trial.families for effect in family.effects}
-    if not any(trial.families for trial in kept):
+    known |= {name for name in names() if find(name).responds}
+    if not known & wanted:
         raise MeasurementError(
-            f"the fit of an orbit response has no family of {', '.join(sorted(wanted)) or 'none'}; "
-            f"it has {', '.join(sorted(known))}"
+            f"an orbit response does not see {', '.join(sorted(wanted)) or 'no effect'}; it sees "
+            f"{', '.join(sorted(known))}"
         )
     return [trial for trial in kept if trial.families]
 

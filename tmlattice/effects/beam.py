@@ -37,6 +37,7 @@ class EnergySpread(LaunchEffect):
     """Particles of a shot differ in energy; a monitor reads their centroid."""
 
     name = "energy_spread"
+    responds = True
     words = "energy spread of the beam"
     energy = True
     one_sign = True

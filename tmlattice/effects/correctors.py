@@ -44,6 +44,7 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     """A corrector kicks more or less than it is told to."""
 
     name = "corrector_calibration"
+    responds = True
     words = "wrong calibration of a corrector"
     acts_on_settings = True
     calibrates = True
@@ -59,6 +60,7 @@ class CorrectorRoll(_OnCorrector, ErrorEffect):
     """A corrector turned about the beam axis."""
 
     name = "corrector_roll"
+    responds = True
     words = "corrector rolled about the beam axis"
     acts_on_settings = True
     calibrates = True

@@ -52,6 +52,8 @@ class Effect(ABC):
         calibrates: a file of calibrations may hold it.
         headline: a short report states how little of it would be seen.
         usual: looked for, and drawn by the challenge, where nobody says which effects to take.
+        responds: a closed orbit's response to a corrector sees it alone, to first order.
+        multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
     """
 
     name: ClassVar[str]
@@ -73,6 +75,8 @@ class Effect(ABC):
     calibrates: ClassVar[bool] = False
     headline: ClassVar[bool] = False
     usual: ClassVar[bool] = True
+    responds: ClassVar[bool] = False
+    multiplies: ClassVar[bool] = False
 
     @property
     def label(self) -> str:
@@ -177,6 +181,7 @@ class ThinKickEffect(RingEffect):
         where: "entrance" or "middle" of the element.
     """
 
+    responds = True
     slopes: ClassVar[Slopes]
     where: ClassVar[Where] = "middle"
 
@@ -196,6 +201,7 @@ class StrengthEffect(RingEffect):
         strength: k1, k2, or the angle that a corrector is set to.
     """
 
+    multiplies = True
     strength: ClassVar[str]
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
@@ -225,8 +231,8 @@ class ReadingEffect(Effect):
         """What a monitor with this amount alone reads of the beam [..., 2] (x, y), m, less beam."""
 
     @abstractmethod
-    def set(self, monitors: "Monitors", at: int, amount: float) -> None:
-        """Put this much more of it into monitor `at` of `monitors`, in place."""
+    def set(self, monitors: "Monitors", at: int | slice, amount: float) -> None:
+        """Put this much more of it into monitor `at` of `monitors`, or into some, in place."""
 
 
 class LaunchEffect(Effect):

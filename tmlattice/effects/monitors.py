@@ -24,7 +24,7 @@ class _Offset(ReadingEffect):
         change[..., self.plane] = amount
         return change
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the offset."""
         monitors.offset[at, self.plane] += amount
 
@@ -48,6 +48,7 @@ class MonitorOffsetY(_Offset):
 
 
 class _Gain(ReadingEffect):
+    multiplies = True
     headline = True
     calibrates = True
     unit = "relative"
@@ -62,7 +63,7 @@ class _Gain(ReadingEffect):
         change[..., self.plane] = amount * beam[..., self.plane]
         return change
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Multiply the gain."""
         monitors.gain[at, self.plane] = (1 + monitors.gain[at, self.plane]) * (1 + amount) - 1
 
@@ -72,6 +73,7 @@ class MonitorGainX(_Gain):
     """A monitor that reads x too large or too small."""
 
     name = "monitor_gain_x"
+    responds = True
     words = "wrong horizontal gain of a monitor"
     plane = 0
 
@@ -81,6 +83,7 @@ class MonitorGainY(_Gain):
     """A monitor that reads y too large or too small."""
 
     name = "monitor_gain_y"
+    responds = True
     words = "wrong vertical gain of a monitor"
     plane = 1
 
@@ -90,6 +93,7 @@ class MonitorRoll(ReadingEffect):
     """A monitor turned about the beam axis."""
 
     name = "monitor_roll"
+    responds = True
     words = "monitor rolled about the beam axis"
     calibrates = True
     unit = "rad"
@@ -102,7 +106,7 @@ class MonitorRoll(ReadingEffect):
         cos, sin = np.cos(amount), np.sin(amount)
         return np.asarray(beam @ np.array([[cos - 1, -sin], [sin, cos - 1]]))
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the angle."""
         monitors.roll[at] += amount
 
@@ -112,6 +116,7 @@ class MonitorCoupling(ReadingEffect):
     """A monitor whose electronics mix the planes."""
 
     name = "monitor_coupling"
+    responds = True
     words = "monitor that mixes its planes"
     calibrates = True
     unit = "relative"
@@ -123,7 +128,7 @@ class MonitorCoupling(ReadingEffect):
         """The other plane's share."""
         return np.asarray(amount * beam[..., ::-1])
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the coupling."""
         monitors.coupling[at] += amount
 
@@ -133,6 +138,7 @@ class MonitorSwap(ReadingEffect):
     """A monitor whose two planes are exchanged."""
 
     name = "monitor_swap"
+    responds = True
     words = "monitor with its planes exchanged"
     calibrates = True
     unit = "discrete"
@@ -144,7 +150,7 @@ class MonitorSwap(ReadingEffect):
         """The other plane instead of the own."""
         return np.asarray(amount * (beam[..., ::-1] - beam))
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Exchange the planes (0 does not)."""
         monitors.swapped[at] ^= amount != 0
 
@@ -170,6 +176,6 @@ class MonitorDead(ReadingEffect):
         first = beam[(0,) * (beam.ndim - 1)] if amount == 2 else beam
         return np.asarray(first - beam)
 
-    def set(self, monitors: Monitors, at: int, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Silence it, or freeze it."""
         (monitors.frozen if amount == 2 else monitors.silent)[at] = amount != 0

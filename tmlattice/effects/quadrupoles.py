@@ -21,6 +21,7 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
     """A quadrupole's strength is not what its setting says."""
 
     name = "quadrupole_gradient"
+    responds = True
     words = "wrong strength of a quadrupole"
     headline = True
     strength = "k1"
@@ -74,6 +75,7 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
     """A quadrupole turned about the beam axis."""
 
     name = "quadrupole_roll"
+    responds = True
     words = "quadrupole rolled about the beam axis"
     headline = True
     error = "roll"
@@ -116,6 +118,7 @@ class FamilyGradient(_OnQuadrupole, StrengthEffect):
     """The power supply of a family of quadrupoles is off: all of them have the same error."""
 
     name = "family_gradient"
+    responds = True
     words = "wrong strength of a whole family of quadrupoles"
     strength = "k1"
     unit = "relative"

@@ -32,6 +32,7 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     """A sextupole that stands beside its axis."""
 
     name = "sextupole_offset_x"
+    responds = True
     words = "sextupole displaced horizontally"
     curved = True  # the field at the offset is quadratic
     error = "dx"
@@ -46,6 +47,7 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     """A sextupole that stands above or below its axis."""
 
     name = "sextupole_offset_y"
+    responds = True
     words = "sextupole displaced vertically"
     curved = True  # the field at the offset is quadratic
     error = "dy"

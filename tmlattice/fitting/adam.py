@@ -115,22 +115,8 @@ def fit_adam(
     """
     regularization = Regularization(regularization)
     launch = torch.from_numpy(measurement.states(network.dimension))
-    first_turn = measurement.in_order_of(network.monitors).readings[:, 0]
-    present = np.isfinite(first_turn)
-    if not present.any():
-        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
-    weight = torch.from_numpy(present / len(first_turn))
-    target = torch.from_numpy(np.where(present, first_turn, 0.0))
-
-    model = network.copy()
-    if free is None:
-        free = ("generator",) if isinstance(network, SymplecticNetwork) else ("W1", "W2")
-    unknown = set(free) - {name for name, _ in model.named_parameters()}
-    if unknown or not free:
-        known = ", ".join(name for name, _ in model.named_parameters())
-        raise ValueError(f"no weights {sorted(unknown)}; free are some of {known}")
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(name in free)
+    weight, target = _target(measurement, network.monitors)
+    model, free = _freed(network, free)
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
     design = (
@@ -155,18 +141,11 @@ def fit_adam(
         for epoch in bar:
             for parameter in moving:
                 parameter.grad = None
-            try:
-                readings = model(launch)
-            except BeamLostError as error:
-                if epoch == 0:
-                    raise
-                raise BeamLostError(
-                    f"the fit diverged in epoch {epoch}: lower the learning rate "
-                    f"({learning_rate:g}); {error}"
-                ) from error
+            readings = _readings(model, launch, epoch, learning_rate)
             loss = ((readings - target).square() * weight).sum()
             penalty = _penalty(model, start, regularization, design)
-            (loss + regularization_rate * penalty).backward()
+            total: Tensor = loss + regularization_rate * penalty
+            total.backward()  # type: ignore[no-untyped-call]
             losses.append(loss.item())
             penalties.append(penalty.item())
             if losses[-1] < best:
@@ -204,6 +183,50 @@ def fit_adam(
             "patience": patience,
         },
     )
+
+
+def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Weights (mean over shots; 0 where missing) and readings of the first turn, [shot, monitor,
+    2]."""
+    first_turn = measurement.in_order_of(monitors).readings[:, 0]
+    present = np.isfinite(first_turn)
+    if not present.any():
+        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
+    return (
+        torch.from_numpy(present / len(first_turn)),
+        torch.from_numpy(np.where(present, first_turn, 0.0)),
+    )
+
+
+def _freed(
+    network: TaylorNetwork | SymplecticNetwork, free: Sequence[str] | None
+) -> tuple[TaylorNetwork | SymplecticNetwork, Sequence[str]]:
+    """A copy in which these weights move, and their names."""
+    model = network.copy()
+    if free is None:
+        free = ("generator",) if isinstance(network, SymplecticNetwork) else ("W1", "W2")
+    unknown = set(free) - {name for name, _ in model.named_parameters()}
+    if unknown or not free:
+        known = ", ".join(name for name, _ in model.named_parameters())
+        raise ValueError(f"no weights {sorted(unknown)}; free are some of {known}")
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name in free)
+    return model, free
+
+
+def _readings(
+    model: TaylorNetwork | SymplecticNetwork, launch: Tensor, epoch: int, rate: float
+) -> Tensor:
+    """Of an epoch; a beam that is lost later than in the first one was lost by the fit."""
+    try:
+        readings: Tensor = model(launch)
+        return readings
+    except BeamLostError as error:
+        if epoch == 0:
+            raise
+        raise BeamLostError(
+            f"the fit diverged in epoch {epoch}: lower the learning rate ({rate:g}); {error}"
+        ) from error
 
 
 def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:

@@ -17,9 +17,6 @@ Indices = NDArray[np.intp]
 Hypothesis = tuple[str, str | None]
 """An effect and the place where it might sit."""
 
-CHUNK = 512
-"""Hypotheses at a time: the memory of a scan does not grow with their number."""
-
 
 @dataclass(frozen=True)
 class Products:
@@ -50,7 +47,12 @@ class Metric:
 
     Args:
         projection: of the nuisances.
+
+    Attributes:
+        chunk: hypotheses at a time: the memory of a scan does not grow with their number.
     """
+
+    chunk = 512
 
     def __init__(self, projection: Projection) -> None:
         self.projection = projection
@@ -70,8 +72,8 @@ class Metric:
         rest = np.ones(len(hypotheses), dtype=bool)
         rest[self.quick(hypotheses, data, found)] = False
         left = np.flatnonzero(rest)
-        for start in range(0, len(left), CHUNK):
-            part = left[start : start + CHUNK]
+        for start in range(0, len(left), self.chunk):
+            part = left[start : start + self.chunk]
             rows = self.rows([hypotheses[i] for i in part])
             whole = np.einsum("hr,hr->h", rows, rows)
             found.put(part, whole, self.projection.inside(rows), rows @ data.T)

@@ -49,6 +49,7 @@ class Search:
             alarms: for a caller that asks for the likeliest explanation, whatever it is.
         names_first: what has a name goes before a free kick. Else that is tried where a free kick
             took what a name nearly explains, and the evidence decides.
+        enough: chi-square at which nothing is left to be explained, and no further look is taken.
         seed: of the threshold's simulation.
         progress: told what was found.
     """
@@ -59,6 +60,7 @@ class Search:
     unnamed: bool = True
     by_evidence: bool = False
     names_first: bool = False
+    enough: float = -np.inf
     seed: int = 0
     progress: Callable[[str], None] = lambda _: None
 
@@ -191,6 +193,8 @@ def _run(search: Search, before: Fit) -> Explanation:
         state = _taken(search, state, best, look)
         if len(state.fit.causes) + len(state.fit.kicks) > 1:
             state = _revised(search, state)
+        if state.fit.chi2 <= search.enough:
+            break
         if best.kind in ("named", "kick") and state.names in seen:
             break  # what was added went again
     return Explanation(

@@ -18,6 +18,7 @@ from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice.places import place_elements
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring, number_names
+from tmlattice.lattice.source import blank, made
 
 FORMAT, VERSION = "tmlattice-lattice", 1
 
@@ -27,8 +28,6 @@ CLASSES = (
     "Undulator", "UnknownElement", "Vcor", "XYQuadrupole",
 )  # fmt: skip
 """OCELOT's element classes that a file may name."""
-
-NOT_PHYSICS = ("id", "has_edge", "color", "width", "height", "params", "n")
 
 
 def save_ring(ring: Ring, path: str | Path) -> None:
@@ -119,7 +118,7 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
         )
     _validate(path, content)
     definitions = content["definitions"]
-    sources = {key: _source(path, key, value) for key, value in definitions.items()}
+    sources = {key: made(path, key, value) for key, value in definitions.items()}
     for place, key in enumerate(content["sequence"]):
         if key not in definitions:
             raise LatticeError(
@@ -164,15 +163,6 @@ def _validate(path: Path, content: Any) -> None:
         raise LatticeError(f"'{path}', at {where}: {said}; mend it there or save the ring again")
 
 
-@cache
-def _blank(cls: str) -> dict[str, Any]:
-    """The numbers of a fresh element of an OCELOT class: what may be stored, and its defaults."""
-    from tmlattice.lattice.ocelot import elements
-
-    values = vars(getattr(elements, cls)(eid="blank").element)
-    return {k: v for k, v in values.items() if k not in NOT_PHYSICS}
-
-
 def described(element: Element) -> dict[str, Any]:
     """An element as a definition of the file.
 
@@ -185,7 +175,7 @@ def described(element: Element) -> dict[str, Any]:
         raise LatticeError(f"'{element.name}' is of the class {cls}, which a file cannot hold")
     parameters: dict[str, Any] = {}
     values = vars(source.element)
-    for key, default in _blank(cls).items():
+    for key, default in blank(cls).items():
         value = values.get(key, default)
         if isinstance(value, np.ndarray):
             if not np.array_equal(value, default):
@@ -210,45 +200,6 @@ def _entries(array: Any) -> dict[str, float]:
         "".join(str(i + 1) for i in index): float(squeezed[tuple(index)])
         for index in np.argwhere(squeezed)
     }
-
-
-def source_of(cls: str, parameters: dict[str, Any]) -> Any:
-    """The OCELOT element of a class and of those of its numbers that are not its defaults."""
-    return _source(Path("cache"), "", {"class": cls, "parameters": parameters})
-
-
-def _source(path: Path, key: str, definition: dict[str, Any]) -> Any:
-    from tmlattice.lattice.ocelot import elements
-
-    blank = _blank(definition["class"])
-    source = getattr(elements, definition["class"])(eid=definition.get("family", key))
-    for name, value in definition["parameters"].items():
-        if name not in blank:
-            raise LatticeError(
-                f"'{path}': '{key}' has the parameter '{name}', which OCELOT's "
-                f"{definition['class']} lacks; known are {', '.join(blank)}"
-            )
-        setattr(source, name, _value(path, key, name, value, blank[name]))
-    return source
-
-
-def _value(path: Path, key: str, name: str, value: Any, default: Any) -> Any:
-    if isinstance(value, list):
-        return np.array(value, dtype=float)
-    if not isinstance(value, dict):
-        if isinstance(default, np.ndarray):
-            raise LatticeError(f"'{path}': '{name}' of '{key}' should be a list or a table")
-        return value
-    array = np.zeros_like(default)
-    flat = array[:, 0] if array.shape == (6, 1) else array  # a view: filled in place
-    for index, entry in value.items():
-        if len(index) != flat.ndim:
-            raise LatticeError(
-                f"'{path}': '{name}' of '{key}' has the entry '{index}'; "
-                f"an entry has {flat.ndim} digits"
-            )
-        flat[tuple(int(digit) - 1 for digit in index)] = entry
-    return array
 
 
 def _with_errors(path: Path, element: Element, errors: dict[str, Any] | None) -> Element:

@@ -93,7 +93,7 @@ class Source:
     @cached_property
     def element(self) -> Any:
         """The OCELOT element; one object, as long as this lives."""
-        from tmlattice.lattice.json_file import source_of
+        from tmlattice.lattice.source import source_of
 
         return source_of(*json.loads(self.text))
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from tmlattice import cache
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.json_file import NOT_PHYSICS, described, source_of
+from tmlattice.lattice.json_file import described
 from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Ring, Source, number_names
+from tmlattice.lattice.source import NOT_PHYSICS, source_of
 
 _MODULES = {"ocelot", "numpy", "math", "cmath"}
 _REACHES_OUT = {

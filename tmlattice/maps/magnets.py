@@ -1,15 +1,13 @@
 """One second-order map per magnet, from OCELOT's own matrices.
 
-OCELOT gives an element as a sequence of parts (three for a bend: entrance edge, body, exit edge),
-each x -> B + R x + x^T T x. The parts are composed to second order; what lies between two magnets
-(drifts, monitors, markers, cavities) is composed with the magnet that follows. So layer k is the
-way from the exit of magnet k - 1 to the exit of magnet k, and the chain of layers is the ring.
+What lies between two magnets (drifts, monitors, markers, cavities) is composed with the magnet that
+follows. So layer k is the way from the exit of magnet k - 1 to the exit of magnet k, and the chain
+of layers is the ring.
 """
 
-import functools
 import io
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,264 +16,34 @@ from numpy.typing import NDArray
 
 from tmlattice import cache
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Ring, Slopes
+from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Ring
+from tmlattice.maps.quadratic import (
+    Quadratic,
+    Weights,
+    composed,
+    drift,
+    identity,
+    of_ocelot,
+    parts_of,
+    physics_of,
+    quadratic_map,
+)
 from tmlattice.maps.taylor import TaylorMap
 
+__all__ = [
+    "LayerMaps",
+    "Quadratic",
+    "RingMaps",
+    "Weights",
+    "element_map",
+    "layer_elements",
+    "part_maps",
+    "ring_maps",
+    "ring_matrix",
+    "way_map",
+]
+
 Array = NDArray[np.float64]
-
-
-@functools.cache
-def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Rows and columns of the pairs i <= j of n coordinates, and how often each stands in T."""
-    i, j = np.triu_indices(n)
-    return i, j, np.where(i == j, 1.0, 2.0)
-
-
-@dataclass(frozen=True)
-class Quadratic:
-    """x -> B + R x + x^T T x with T [out, n, n] symmetric in its last two indices, or None if 0."""
-
-    B: Array
-    R: Array
-    T: Array | None
-
-    def after(self, first: "Quadratic") -> "Quadratic":
-        """This after `first`, to second order in x."""
-        if self.T is None:
-            bent = None if first.T is None else _on_rows(self.R, first.T)
-            return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
-        fed = self.T @ first.B  # [out, n]: what the constant part feeds down, half of it
-        slope = self.R + 2.0 * fed
-        bent = first.R.T @ self.T @ first.R
-        if first.T is not None:
-            bent = bent + _on_rows(slope, first.T)
-        return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
-
-    def reduced(self) -> tuple[Array, Array, Array]:
-        """W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
-        i, j, _ = _pairs(self.R.shape[1])
-        if self.T is None:
-            return self.B, self.R, np.zeros((len(self.B), len(i)))
-        return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
-
-
-FAINT = 3e-4
-"""rad; below, OCELOT's map of a bend with k2 has lost a hundredth of its second order to rounding
-(k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large)."""
-
-
-def _on_rows(matrix: Array, T: Array) -> Array:
-    """`np.tensordot(matrix, T, 1)`, whose checks cost more than the product."""
-    rows, n = len(T), T.shape[-1]
-    return (matrix @ T.reshape(rows, n * n)).reshape(-1, n, n)
-
-
-def _identity(n: int) -> Quadratic:
-    return Quadratic(np.zeros(n), np.eye(n), None)
-
-
-Part = tuple[Array, Array, Array]
-
-ASKED = 5_000
-"""Elements' parts that are remembered, some 20 MB: a scan asks for each in many hypotheses."""
-
-_asked: dict[Hashable, list[Part]] = {}
-
-
-def _parts(element: Element, energy: float, split: bool) -> list[Part]:
-    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element: do not change them.
-
-    With `split` the body comes as two halves, in the middle of the list.
-    """
-    physics = _physics(element)
-    if isinstance(physics, int):
-        return _parts_of_ocelot(element.source, energy, split)
-    known = _asked.get((physics, energy, split))
-    if known is None:
-        if len(_asked) > ASKED:
-            _asked.clear()
-        known = _asked[physics, energy, split] = _parts_of_ocelot(element.source, energy, split)
-    return known
-
-
-def _parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
-    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
-
-    atom = source.element
-    supported = source.supported_tms  # None: the family declares nothing, and takes any
-    bare = isinstance(source, elements.Matrix)  # OCELOT does not know its inside
-    body = [(TMTypes.MAIN, atom.l / 2)] * 2 if split and not bare else [(TMTypes.MAIN, None)]
-    edges = [(TMTypes.ENTRANCE, None)], [(TMTypes.EXIT, None)]
-    parts = [*edges[0], *body, *edges[1]] if atom.has_edge else body
-    if supported is None or SecondTM in supported:
-        try:
-            second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
-            return [(p.B.ravel(), *_tilted(p.R, p.T, p.tilt)) for p in second]
-        except (AttributeError, NotImplementedError):
-            pass  # it has no second order: a linear element
-    zero = np.zeros((6, 6, 6))
-    linear = zip(source.B(energy), source.R(energy), strict=True)
-    return [(B.ravel(), R, zero) for B, R in linear]
-
-
-def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
-    """R and T in axes that are turned by the tilt: what OCELOT's `get_rotated_R` and `_T` say.
-
-    The latter is compiled when first called, which takes longer than all maps of a ring.
-    """
-    if tilt == 0:
-        return R, T
-    from tmlattice.lattice.ocelot import rot_mtx
-
-    there, back = rot_mtx(tilt), rot_mtx(-tilt)
-    return back @ R @ there, np.tensordot(back, there.T @ T @ there, 1)
-
-
-def _physics(element: Element) -> Hashable:
-    """Equal for elements with equal maps, but for their errors: the class and every attribute of
-    the source but those for people."""
-    if element.data is not None:
-        return element.data
-    source = element.source
-    values = vars(source.element)
-    physics = tuple(values[k] for k in values if k not in ("id", "color", "params"))
-    if not values.get("params") and all(isinstance(v, _NUMBERS) for v in physics):
-        return (type(source), physics)
-    return id(source)  # it holds more than numbers: a matrix, a field map
-
-
-_NUMBERS = (int, float, type(None))
-
-
-def _of_ocelot(part: Part, n: int) -> Quadratic:
-    B, R, T = part
-    bent = T[:n, :n, :n]
-    bent = 0.5 * (bent + bent.swapaxes(1, 2))
-    return Quadratic(B[:n], R[:n, :n], bent if bent.any() else None)
-
-
-def _quadratic(element: Element, energy: float, n: int) -> Quadratic:
-    errors = element.errors
-    if element.kind == "bend" and element.k2 and abs(element.angle) < FAINT:
-        raise LatticeError(
-            f"bend '{element.name}' bends by {element.angle:g} rad and has k2: OCELOT's map of it "
-            f"is wrong below {FAINT:g} rad; make it a sextupole and a corrector"
-        )
-    if element.kind == "cavity":  # what it gives depends on the turn: that is the beam's
-        element = _empty(element)
-    if errors == NO_ERRORS:
-        total = _chain(_of_ocelot(part, n) for part in _parts(element, energy, False))
-    else:
-        first, second = _halves(element, energy, n)
-        total = _chain(
-            [
-                _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
-                _shift(n, -errors.dx, -errors.dy),
-                _turn(n, errors.roll),
-                first,
-                _thin(n, errors.kick_x, errors.kick_y, errors.k1l, errors.k1sl, errors.middle),
-                _loss(n, errors.loss, element),
-                second,
-                _turn(n, -errors.roll),
-                _shift(n, errors.dx, errors.dy),
-            ]
-        )
-    finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
-    if not finite or (total.T is not None and not np.isfinite(total.T).all()):
-        raise LatticeError(
-            f"OCELOT's map of {element.kind} '{element.name}' is not finite; check its strengths"
-        )
-    return total
-
-
-def _empty(element: Element) -> Element:
-    """The same element as a drift."""
-    from tmlattice.lattice.ocelot import elements
-
-    return replace(element, source=elements.Drift(l=element.length))
-
-
-def _chain(parts: Iterable[Quadratic | None]) -> Quadratic:
-    """The parts in beam order, composed; None moves nothing."""
-    given = [part for part in parts if part is not None]
-    total = given[0]
-    for part in given[1:]:
-        total = part.after(total)
-    return total
-
-
-def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
-    """The maps to and from the middle of an element's body."""
-    if element.length == 0:  # as thin as what is put into it
-        parts = [_of_ocelot(part, n) for part in _parts(element, energy, False)]
-        return _identity(n), _chain(parts)
-    parts = [_of_ocelot(part, n) for part in _parts(element, energy, True)]
-    middle = len(parts) // 2
-    if len(parts) % 2 == 0:
-        return _chain(parts[:middle]), _chain(parts[middle:])
-    from scipy.linalg import sqrtm
-
-    body = parts[middle]  # of a bare matrix, or of a cavity: it comes in one piece
-    root = np.array(np.real(sqrtm(body.R)), dtype=np.float64)
-    back: Array = np.linalg.inv(root).astype(np.float64)
-    first = Quadratic(np.zeros(n), root, None)
-    second = body.after(Quadratic(np.zeros(n), back, None))
-    return _chain([*parts[:middle], first]), _chain([second, *parts[middle + 1 :]])
-
-
-def _thin(
-    n: int,
-    kick_x: float = 0.0,
-    kick_y: float = 0.0,
-    k1l: float = 0.0,
-    k1sl: float = 0.0,
-    slopes: Slopes = NO_ERRORS.middle,
-) -> Quadratic | None:
-    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and what the slopes say."""
-    if kick_x == kick_y == k1l == k1sl == 0 and not any(slopes):
-        return None
-    B, R = np.zeros(n), np.eye(n)
-    B[1], B[3] = kick_x, kick_y
-    R[1, 0], R[3, 2] = -k1l, k1l
-    R[1, 2] = R[3, 0] = k1sl
-    R[np.ix_([1, 3], [0, 2])] += np.reshape(slopes, (2, 2))
-    return Quadratic(B, R, None)
-
-
-def _shift(n: int, dx: float, dy: float) -> Quadratic | None:
-    if dx == dy == 0:
-        return None
-    B = np.zeros(n)
-    B[0], B[2] = dx, dy
-    return Quadratic(B, np.eye(n), None)
-
-
-def _turn(n: int, roll: float) -> Quadratic | None:
-    """Coordinates in axes that are turned by `roll` from x towards y."""
-    if roll == 0:
-        return None
-    R = np.eye(n)
-    cos, sin = np.cos(roll), np.sin(roll)
-    R[0, 0] = R[1, 1] = R[2, 2] = R[3, 3] = cos
-    R[0, 2] = R[1, 3] = sin
-    R[2, 0] = R[3, 1] = -sin
-    return Quadratic(np.zeros(n), R, None)
-
-
-def _loss(n: int, loss: float, element: Element) -> Quadratic | None:
-    """The energy falls by loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
-    if loss == 0:
-        return None
-    if n != 6:
-        raise LatticeError(
-            f"{element.kind} '{element.name}' loses energy, which four coordinates cannot hold; "
-            "take six (dimension=6)"
-        )
-    B, R = np.zeros(n), np.eye(n)
-    B[5] = -loss
-    R[5, 5] = 1 - 2 * loss
-    R[1, 1] = R[3, 3] = 1 - loss
-    return Quadratic(B, R, None)
 
 
 def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMap:
@@ -286,7 +54,7 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
         energy: GeV.
         dimension: 4 for (x, px, y, py), 6 for OCELOT's (x, px, y, py, tau, p).
     """
-    return TaylorMap(_quadratic(element, energy, dimension).reduced())
+    return TaylorMap(quadratic_map(element, energy, dimension).reduced())
 
 
 def part_maps(element: Element, energy: float, dimension: int = 4) -> list[TaylorMap]:
@@ -295,8 +63,8 @@ def part_maps(element: Element, energy: float, dimension: int = 4) -> list[Taylo
     Args:
         element, energy, dimension: see `element_map`.
     """
-    parts = _parts(element, energy, False)
-    return [TaylorMap(_of_ocelot(part, dimension).reduced()) for part in parts]
+    parts = parts_of(element, energy, False)
+    return [TaylorMap(of_ocelot(part, dimension).reduced()) for part in parts]
 
 
 def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
@@ -307,9 +75,9 @@ def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> T
         energy: GeV.
         dimension: 4 or 6.
     """
-    way = _identity(dimension)
+    way = identity(dimension)
     for element in elements:
-        way = _quadratic(element, energy, dimension).after(way)
+        way = quadratic_map(element, energy, dimension).after(way)
     return TaylorMap(way.reduced())
 
 
@@ -366,9 +134,6 @@ class RingMaps:
         return np.searchsorted(self.at, np.arange(len(self.layers) + 2)).astype(np.int64)
 
 
-Weights = tuple[Array, Array, Array]
-
-
 KNOWN = 20_000
 """Maps that are remembered, some 40 MB: more than a large ring has different elements."""
 
@@ -411,7 +176,7 @@ class LayerMaps:
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
         """Equal for elements with equal maps."""
-        return (_physics(element), element.errors)
+        return (physics_of(element), element.errors)
 
     def map(self, element: Element) -> Quadratic:
         """The map of one element, of this ring or not."""
@@ -421,7 +186,7 @@ class LayerMaps:
             if len(self._known) > KNOWN:  # a fit asks for ever new amounts
                 self._known.clear()
                 self._kept.clear()
-            known = self._known[key] = _quadratic(element, self.ring.energy, self.dimension)
+            known = self._known[key] = quadratic_map(element, self.ring.energy, self.dimension)
             if isinstance(key[0], int):  # an id: its source must not be freed
                 self._kept.append(element.source)
         return known
@@ -438,7 +203,7 @@ class LayerMaps:
             physics = tuple(self.physics(e) for e in moving)
             if physics not in self._equal:
                 parts = [self.map(e) for e in moving]
-                self._equal[physics] = _chain([_identity(self.dimension), *parts])
+                self._equal[physics] = composed([identity(self.dimension), *parts])
             self._ways[k] = self._equal[physics]
         return self._ways[k]
 
@@ -462,12 +227,12 @@ class LayerMaps:
         return self._layers[physics]
 
     def _composed(self, elements: Iterable[Element]) -> tuple[Weights, list[Weights]]:
-        way = _identity(self.dimension)
+        way = identity(self.dimension)
         readouts = []
         for element in elements:
             if element.kind == "monitor":  # read in its middle; nearly all have no length
                 half = element.length / 2
-                here = _drift(half, self.dimension).after(way) if half else way
+                here = drift(half, self.dimension).after(way) if half else way
                 W0, W1, W2 = here.reduced()
                 readouts.append((W0[:3:2], W1[:3:2], W2[:3:2]))
             if _moves(element):
@@ -556,12 +321,6 @@ def _made(ring: Ring, dimension: int, layers: LayerMaps) -> RingMaps:
     )
 
 
-def _drift(length: float, n: int) -> Quadratic:
-    matrix = np.eye(n)
-    matrix[0, 1] = matrix[2, 3] = length
-    return Quadratic(np.zeros(n), matrix, None)
-
-
 def ring_matrix(ring: Ring) -> Array:
     """OCELOT's one-turn matrix, the product of its first-order R of every element, [4, 4].
 
@@ -572,9 +331,9 @@ def ring_matrix(ring: Ring) -> Array:
     known: dict[Hashable, list[Array]] = {}
     for element in ring.elements:
         if element.errors != NO_ERRORS or element.kind == "cavity":
-            total = _quadratic(element, ring.energy, 6).R[:4, :4] @ total
+            total = quadratic_map(element, ring.energy, 6).R[:4, :4] @ total
             continue
-        physics = _physics(element)
+        physics = physics_of(element)
         if physics not in known:
             known[physics] = [matrix[:4, :4] for matrix in element.source.R(ring.energy)]
         for matrix in known[physics]:

@@ -160,7 +160,9 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
     """How far the steps go."""
     first, last = diagnosis.steps[0], diagnosis.steps[-1]
     return (
-        "Many small errors all along the ring: with them the gap on held-out correctors falls from "
+        "Small errors all along the ring, or of correctors: with them the gap of fitted correctors "
+        f"falls from {1e6 * diagnosis.fit_before.rms:.1f} to {1e6 * diagnosis.fit_after.rms:.1f} "
+        "µm, that of held-out ones from "
         f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
         f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
         f"{1e6 * last.heldout_rms_coupling:.1f} µm, and that of the RF's response from "

@@ -1,0 +1,133 @@
+"""Few causes of an orbit response's gap: the search of trajectories, on the response's rows.
+
+A magnet, a corrector or a monitor that is wrong alone is named before families of small errors are
+fitted. Where a few causes do not explain the readings to their noise, this says nothing: errors are
+everywhere, and the dense fit is asked.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.dense import DenseFit, Step, score
+from tmlattice.diagnosis.families import Told
+from tmlattice.diagnosis.findings import findings_of, verdict_of
+from tmlattice.diagnosis.result import Finding
+from tmlattice.diagnosis.state import begin
+from tmlattice.effects import find
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.newton import fit
+from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.observe.orbit_response import ResponseData, Split
+from tmlattice.observe.response_problem import NOTHING, Response, single_causes
+
+Flags = NDArray[np.bool_]
+
+MOST = 3
+"""More causes are not few: each costs a search of its own."""
+
+NOISE = 1.5
+"""Chi-square per reading below which a few causes explain a response: second-order maps, a step's
+rounding and a noise stated a little low leave as much."""
+
+
+@dataclass(frozen=True)
+class Few:
+    """What few causes explain.
+
+    Attributes:
+        fit: the design, the same with the causes, and each of them as a step.
+        findings: by falling statistic.
+        verdict: the least certain of theirs.
+        told: the causes with their errors.
+        said: what a reader should know.
+    """
+
+    fit: DenseFit
+    findings: tuple[Finding, ...]
+    verdict: str
+    told: list[Told]
+    said: tuple[str, ...]
+
+
+def few_causes(
+    data: ResponseData,
+    split: Split,
+    effects: Sequence[str] | None,
+    most: int,
+    judgement: Judgement,
+    seed: int = 0,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> Few | None:
+    """The few causes of a response, or None where few do not explain it.
+
+    Args:
+        data: what was measured.
+        split: held-out correctors give half of their monitors to the fit: nothing else tells what
+            they do of what they are told.
+        effects: names of those that may be the cause; None: all usual ones.
+        most: findings at most.
+        judgement: thresholds.
+        seed: of the threshold's simulation.
+        progress: told what is being done.
+    """
+    hypotheses = single_causes(data, effects)
+    if not hypotheses:
+        return None
+    progress("single causes")
+    design = begin(data, split)
+    places = {name: sum(h[0] == name for h in hypotheses) for name in {h[0] for h in hypotheses}}
+    problem = Response(
+        base=design.at.bend(), used=_used(data, split), places=places, judgement=judgement
+    )
+    before = fit(problem, (), NOTHING)
+    count = int(problem.used.sum())
+    if not before.chi2 / count > NOISE and chi2.sf(before.chi2, count) > judgement.false_alarm:
+        return None
+    number = min(most, MOST)
+    search = Search(
+        problem, hypotheses, 1, unnamed=False, enough=NOISE * count, seed=seed, progress=progress
+    )
+    found = explain(search, before)
+    explained = (before.chi2 - found.fit.chi2) / max(before.chi2 - count, 1.0)
+    if not found.fit.causes or explained < 1 / (2 * number):
+        return None  # the strongest of a few would explain its share
+    if found.fit.chi2 > search.enough and number > 1:
+        found = explain(replace(search, most=number), before)
+    if found.fit.chi2 > search.enough:
+        return None
+    return _told(data, split, found, count, judgement)
+
+
+def _used(data: ResponseData, split: Split) -> Flags:
+    """Readings that the search fits, [column, monitor, 2]."""
+    half = split.held.copy()
+    half[-1] = True  # the RF
+    return np.isfinite(data.orbits) & (~half[:, None] | split.half)[:, :, None]
+
+
+def _told(
+    data: ResponseData, split: Split, found: Explanation, count: int, judgement: Judgement
+) -> Few:
+    causes = found.fit.causes
+    p_value = float(chi2.sf(found.fit.chi2, count - len(causes)))
+    findings = findings_of(data.ring, found, (), judgement)
+    verdict, findings, said = verdict_of(
+        replace(found, full=False), findings, p_value, False, judgement
+    )
+    design = begin(data, split)
+    base = found.before.point.view
+    steps = [Step.scored("design", 0, score(design, split.held))]
+    state = design
+    for i, cause in enumerate(causes, 1):
+        state = replace(design, at=base.with_causes(causes[:i]))
+        name = f"{find(cause.effect).words}: {cause.element}"
+        steps.append(Step.scored(name, 1, score(state, split.held)))
+    heldout = (score(design, split.held), score(state, split.held))
+    errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
+    dense = DenseFit(design, state, tuple(steps), (), heldout)
+    return Few(dense, findings, verdict, list(zip(causes, errors, strict=True)), said)

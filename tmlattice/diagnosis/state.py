@@ -1,0 +1,281 @@
+"""The state of a dense fit of an orbit response, and what may happen to it.
+
+Everything that is fitted is one frozen `State`; what happens to it is a function that gives another
+one: `bend`, `allow`, `jump`, `one_round`, `look`.
+"""
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families import Family
+from tmlattice.inference.priors import Group, Normal, normal_equations, solve
+from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
+
+BAD = 5.0
+"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+FEW = 4
+"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+TYPICAL = 10.0
+"""The median misfit of all columns counts as so many readings of each one's own."""
+ALONE = 0.3
+"""A column whose misfit falls to this share by its own number has no other error to speak of."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything that is fitted.
+
+    Attributes:
+        data, split: what was measured, and who judges.
+        at: what the model reads with the values.
+        lacking: what the model lacks in-plane and across in each column, m: it lessens weights as
+            noise does, so that one corrector whose field is not where the model has it spoils no
+            magnet; [block, column].
+        good: monitors that are not bad, [monitor].
+        families: that are allowed.
+        values: by variable.
+        groups: the families' priors with what they have learnt, by name.
+        exploring: the inner correctors choose, and are not fitted.
+    """
+
+    data: ResponseData
+    split: Split
+    at: Predicted
+    lacking: Array
+    good: Flags
+    families: tuple[Family, ...] = ()
+    values: Mapping[str, Array] = field(default_factory=dict)
+    groups: Mapping[str, Group] = field(default_factory=dict)
+    exploring: bool = True
+
+    def of_block(self, block: int) -> tuple[Family, ...]:
+        """Families of a block."""
+        return tuple(family for family in self.families if family.block == block)
+
+    def allows(self, name: str) -> bool:
+        """Whether a family is in the fit."""
+        return any(family.name == name for family in self.families)
+
+    @property
+    def fitted(self) -> Flags:
+        """Correctors that are, [column]; the RF's monitors are split instead."""
+        out = self.split.held | (self.split.inner & self.exploring)
+        return np.asarray(~out & (np.arange(len(out)) < len(out) - 1))
+
+    def moved(self, values: Mapping[str, Array]) -> "State":
+        """With other values, and what the model reads with them."""
+        errors = Errors.none(self.data)
+        for family in {f.variable: f for f in self.families}.values():
+            errors = family.put(errors, values[family.variable], self.data)
+        return replace(self, values=values, at=Predicted(self.data, errors, self.at.bent))
+
+
+def begin(data: ResponseData, split: Split) -> State:
+    """The design."""
+    at = Predicted(data, Errors.none(data))
+    gap = data.pick(at.left)[~split.held]
+    size = float(np.nanmedian(np.abs(gap))) / 0.6745
+    return State(
+        data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
+    )
+
+
+def bend(state: State) -> State:
+    """With the third order of the steps where the fit stands."""
+    return replace(state, at=state.at.bend())
+
+
+def allow(state: State, families: Sequence[Family]) -> State:
+    """With more families, at zero."""
+    new = {f.variable: np.zeros(f.size(state.data)) for f in families}
+    return replace(
+        state, families=(*state.families, *families), values={**new, **state.values}
+    )  # fmt: skip
+
+
+def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
+    """What each column alone says of its own number, from its near monitors.
+
+    Returns:
+        The change of the number, and the far readings' mean squares in units of the noise, without
+        it and with it, [column]; NaN for columns that are never fitted.
+    """
+    rows = family.rows(state.at, np.zeros(0))
+    left = state.data.pick(state.at.left, family.block)
+    noise = state.data.noise_of(family.block)
+    amounts, without, told = np.full((3, len(left)), np.nan)
+    for c in np.flatnonzero(~state.split.held[:-1]):
+        seen = np.isfinite(left[c]) & state.good
+        near, far = seen & state.split.half[c], seen & ~state.split.half[c]
+        if not rows[c, near].any():
+            continue
+        (amounts[c],), miss = amplitudes(rows[c][:, None], left[c], near, far)
+        without[c] = np.mean((left[c, far] / noise[c, far]) ** 2)
+        told[c] = np.mean((miss / noise[c, far]) ** 2)
+    return amounts, without, told
+
+
+def jump(state: State, beyond: float | None = None) -> State:
+    """Start large numbers of single columns at what the column alone says.
+
+    Args:
+        state: whose column families are looked at.
+        beyond: trusted changes; None: what is gross.
+    """
+    values = dict(state.values)
+    for family in state.families:
+        limit = family.gross if beyond is None else beyond * family.trust
+        if family.per != "column" or np.isinf(limit):
+            continue
+        amounts, without, told = by_columns(state, family)
+        far = state.fitted & (np.abs(amounts) > limit) & (told < ALONE**2 * without)
+        values[family.variable] = values[family.variable] + np.where(far, amounts, 0.0)
+    changed = any((values[name] != state.values[name]).any() for name in values)
+    return state.moved(values) if changed else state
+
+
+# --- a round of Gauss and Newton ------------------------------------------------------------------
+class Linear(NamedTuple):
+    """The readings of one block where the fit stands.
+
+    Parameters are those of the monitors, x and y of each; of the columns; and of the ring.
+    """
+
+    normal: Normal
+    start: Array
+    trust: Array
+    by_monitor: Array
+    by_column: Array
+    by_ring: Array
+    where: Mapping[str, slice]
+    groups: tuple[Group, ...]
+
+
+def weight(state: State, block: int) -> Array:
+    """1 / variance of the readings that are fitted, [column, monitor]."""
+    data, split = state.data, state.split
+    use = np.isfinite(data.pick(data.orbits, block)) & state.good
+    use[:-1] &= state.fitted[:-1, None]
+    use[-1] &= split.half[-1]
+    if state.exploring:
+        use[-1] &= ~split.inner_rf
+    variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
+    return np.where(use, 1 / variance, 0.0)
+
+
+def linear(state: State, block: int) -> Linear:
+    """Normal equations where the fit stands, the parameters there, priors, trusted changes."""
+    data, at = state.data, state.at
+    columns, monitors = data.shape
+    families = state.of_block(block)
+    where: dict[str, slice] = {}
+    rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
+    ring: list[Array] = []
+    end = 2 * monitors + columns
+    start, trust = [np.zeros(end)], [np.ones(end)]
+    for family in {f.variable: f for f in families}.values():
+        values = state.values[family.variable]
+        slopes = family.rows(at, values)
+        if family.per == "ring":
+            where[family.variable] = slice(end, end + len(values))
+            end += len(values)
+            start.append(values)
+            trust.append(np.full(len(values), family.trust))
+            ring.append(slopes)
+        else:
+            low = 0 if family.per == "monitor" else 2 * monitors
+            mine = where[family.variable] = slice(low, low + len(values))
+            start[0][mine], trust[0][mine] = values, family.trust
+            rows[family.per] = slopes
+    by_ring = np.concatenate(ring) if ring else np.zeros((0, *data.shape))
+    normal = normal_equations(
+        data.pick(at.left, block), weight(state, block), data.plane_of(block), rows["monitor"],
+        rows["column"], by_ring,
+    )  # fmt: skip
+    groups = []
+    for family in families:
+        for own in family.groups(data):
+            basis = np.zeros((end, own.basis.shape[1]))
+            basis[where[family.variable]] = own.basis
+            known = state.groups.get(own.name, own)
+            groups.append(replace(own, basis=basis, rms=known.rms, each=known.each))
+    return Linear(
+        normal, np.concatenate(start), np.concatenate(trust), rows["monitor"], rows["column"],
+        by_ring, where, tuple(groups),
+    )  # fmt: skip
+
+
+def one_round(state: State, block: int) -> State:
+    """Linearise the readings of one block, solve, move, and look at what is left."""
+    if not state.of_block(block):
+        return state
+    there = linear(state, block)
+    found = solve(there.normal, there.groups, there.start, there.trust)
+    family = {f.variable: f for f in state.families}
+    values = {name: family[name].bounded(found.values[at]) for name, at in there.where.items()}
+    groups = {group.name: group for group in found.groups}
+    state = replace(state, groups={**state.groups, **groups}).moved({**state.values, **values})
+    for seen in (0, 1):
+        if state.of_block(seen):
+            state = look(state, seen)
+    log.info("lacking %s m", np.median(state.lacking, axis=1))
+    return state
+
+
+def look(state: State, block: int) -> State:
+    """What the model lacks now; and the monitors that are bad, their own gains apart."""
+    data = state.data
+    use = weight(state, block) > 0
+    left = np.where(use, data.pick(state.at.left, block), np.nan)[:-1]
+    typical = float(np.nanmedian(np.abs(left[:, state.good]))) / 0.6745
+    noise = float(np.median(data.noise))
+    squares = np.full(data.shape[0], typical**2)  # the RF's readings are few
+    shared = TYPICAL * typical**2 + np.nansum(left**2, axis=1)
+    squares[:-1] = shared / (TYPICAL + use[:-1].sum(axis=1))
+    lacking = state.lacking.copy()
+    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
+    good = state.good if block else _good_monitors(state)
+    return replace(state, lacking=lacking, good=good)
+
+
+def _good_monitors(state: State) -> Flags:
+    data = state.data
+    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
+    ratio = np.zeros(data.shape[1])
+    for p in (0, 1):
+        rows = state.fitted & (data.plane == p)
+        if rows.sum() < FEW:
+            continue
+        u, d = read[rows], orbits[rows]
+        seen = np.isfinite(d)
+        d = np.where(seen, d, 0)
+        u = np.where(seen, u, 0)
+        gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
+        count = np.maximum(seen.sum(axis=0), 1)
+        rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
+        rms[(seen.sum(axis=0) == 0) | (abs(gain) < 0.2)] = np.inf
+        ratio = np.maximum(ratio, rms / np.median(rms))
+    return np.asarray(ratio <= BAD)
+
+
+def rms_of(parts: Iterable[Array]) -> float:
+    """Over all of them."""
+    return float(np.sqrt(np.mean(np.square(np.concatenate(list(parts))))))
+
+
+def amplitudes(patterns: Array, data: Array, near: Flags, far: Flags) -> tuple[Array, Array]:
+    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss."""
+    size = np.abs(patterns[near]).max(axis=0)
+    size[size == 0] = 1
+    amounts = np.linalg.lstsq(patterns[near] / size, data[near], rcond=None)[0] / size
+    return amounts, data[far] - patterns[far] @ amounts

@@ -1,0 +1,289 @@
+"""The second-order map of one element, from OCELOT's own matrices and the element's errors.
+
+OCELOT gives an element as a sequence of parts (three for a bend: entrance edge, body, exit edge),
+each x -> B + R x + x^T T x. The parts are composed to second order.
+"""
+
+import functools
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import LatticeError
+from tmlattice.lattice.ring import NO_ERRORS, Element, Slopes
+
+Array = NDArray[np.float64]
+Weights = tuple[Array, Array, Array]
+
+
+@functools.cache
+def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Rows and columns of the pairs i <= j of n coordinates, and how often each stands in T."""
+    i, j = np.triu_indices(n)
+    return i, j, np.where(i == j, 1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """x -> B + R x + x^T T x with T [out, n, n] symmetric in its last two indices, or None if 0."""
+
+    B: Array
+    R: Array
+    T: Array | None
+
+    def after(self, first: "Quadratic") -> "Quadratic":
+        """This after `first`, to second order in x."""
+        if self.T is None:
+            bent = None if first.T is None else _on_rows(self.R, first.T)
+            return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
+        fed = self.T @ first.B  # [out, n]: what the constant part feeds down, half of it
+        slope = self.R + 2.0 * fed
+        bent = first.R.T @ self.T @ first.R
+        if first.T is not None:
+            bent = bent + _on_rows(slope, first.T)
+        return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
+
+    def reduced(self) -> tuple[Array, Array, Array]:
+        """W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
+        i, j, _ = _pairs(self.R.shape[1])
+        if self.T is None:
+            return self.B, self.R, np.zeros((len(self.B), len(i)))
+        return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
+
+
+FAINT = 3e-4
+"""rad; below, OCELOT's map of a bend with k2 has lost a hundredth of its second order to rounding
+(k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large)."""
+
+
+def _on_rows(matrix: Array, T: Array) -> Array:
+    """`np.tensordot(matrix, T, 1)`, whose checks cost more than the product."""
+    rows, n = len(T), T.shape[-1]
+    return (matrix @ T.reshape(rows, n * n)).reshape(-1, n, n)
+
+
+def identity(n: int) -> Quadratic:
+    """What moves nothing."""
+    return Quadratic(np.zeros(n), np.eye(n), None)
+
+
+Part = tuple[Array, Array, Array]
+
+ASKED = 5_000
+"""Elements' parts that are remembered, some 20 MB: a scan asks for each in many hypotheses."""
+
+_asked: dict[Hashable, list[Part]] = {}
+
+
+def parts_of(element: Element, energy: float, split: bool) -> list[Part]:
+    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element: do not change them.
+
+    With `split` the body comes as two halves, in the middle of the list.
+    """
+    physics = physics_of(element)
+    if isinstance(physics, int):
+        return parts_of_ocelot(element.source, energy, split)
+    known = _asked.get((physics, energy, split))
+    if known is None:
+        if len(_asked) > ASKED:
+            _asked.clear()
+        known = _asked[physics, energy, split] = parts_of_ocelot(element.source, energy, split)
+    return known
+
+
+def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
+    """`parts_of` an OCELOT element, asked anew."""
+    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
+
+    atom = source.element
+    supported = source.supported_tms  # None: the family declares nothing, and takes any
+    bare = isinstance(source, elements.Matrix)  # OCELOT does not know its inside
+    body = [(TMTypes.MAIN, atom.l / 2)] * 2 if split and not bare else [(TMTypes.MAIN, None)]
+    edges = [(TMTypes.ENTRANCE, None)], [(TMTypes.EXIT, None)]
+    parts = [*edges[0], *body, *edges[1]] if atom.has_edge else body
+    if supported is None or SecondTM in supported:
+        try:
+            second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
+            return [(p.B.ravel(), *_tilted(p.R, p.T, p.tilt)) for p in second]
+        except (AttributeError, NotImplementedError):
+            pass  # it has no second order: a linear element
+    zero = np.zeros((6, 6, 6))
+    linear = zip(source.B(energy), source.R(energy), strict=True)
+    return [(B.ravel(), R, zero) for B, R in linear]
+
+
+def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
+    """R and T in axes that are turned by the tilt: what OCELOT's `get_rotated_R` and `_T` say.
+
+    The latter is compiled when first called, which takes longer than all maps of a ring.
+    """
+    if tilt == 0:
+        return R, T
+    from tmlattice.lattice.ocelot import rot_mtx
+
+    there, back = rot_mtx(tilt), rot_mtx(-tilt)
+    return back @ R @ there, np.tensordot(back, there.T @ T @ there, 1)
+
+
+def physics_of(element: Element) -> Hashable:
+    """Equal for elements with equal maps, but for their errors: the class and every attribute of
+    the source but those for people."""
+    if element.data is not None:
+        return element.data
+    source = element.source
+    values = vars(source.element)
+    physics = tuple(values[k] for k in values if k not in ("id", "color", "params"))
+    if not values.get("params") and all(isinstance(v, _NUMBERS) for v in physics):
+        return (type(source), physics)
+    return id(source)  # it holds more than numbers: a matrix, a field map
+
+
+_NUMBERS = (int, float, type(None))
+
+
+def of_ocelot(part: Part, n: int) -> Quadratic:
+    """OCELOT's part in the first n coordinates, its T made symmetric."""
+    B, R, T = part
+    bent = T[:n, :n, :n]
+    bent = 0.5 * (bent + bent.swapaxes(1, 2))
+    return Quadratic(B[:n], R[:n, :n], bent if bent.any() else None)
+
+
+def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
+    """The map of one element, its errors included.
+
+    Raises:
+        LatticeError: it is not finite, it loses energy, which four coordinates cannot hold, or
+            OCELOT's map of such a bend is wrong.
+    """
+    errors = element.errors
+    if element.kind == "bend" and element.k2 and abs(element.angle) < FAINT:
+        raise LatticeError(
+            f"bend '{element.name}' bends by {element.angle:g} rad and has k2: OCELOT's map of it "
+            f"is wrong below {FAINT:g} rad; make it a sextupole and a corrector"
+        )
+    if element.kind == "cavity":  # what it gives depends on the turn: that is the beam's
+        element = _empty(element)
+    if errors == NO_ERRORS:
+        total = composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
+    else:
+        first, second = _halves(element, energy, n)
+        total = composed(
+            [
+                _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
+                _shift(n, -errors.dx, -errors.dy),
+                _turn(n, errors.roll),
+                first,
+                _thin(n, errors.kick_x, errors.kick_y, errors.k1l, errors.k1sl, errors.middle),
+                _loss(n, errors.loss, element),
+                second,
+                _turn(n, -errors.roll),
+                _shift(n, errors.dx, errors.dy),
+            ]
+        )
+    finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
+    if not finite or (total.T is not None and not np.isfinite(total.T).all()):
+        raise LatticeError(
+            f"OCELOT's map of {element.kind} '{element.name}' is not finite; check its strengths"
+        )
+    return total
+
+
+def _empty(element: Element) -> Element:
+    """The same element as a drift."""
+    from tmlattice.lattice.ocelot import elements
+
+    return replace(element, source=elements.Drift(l=element.length))
+
+
+def composed(parts: Iterable[Quadratic | None]) -> Quadratic:
+    """The parts in beam order, composed; None moves nothing."""
+    given = [part for part in parts if part is not None]
+    total = given[0]
+    for part in given[1:]:
+        total = part.after(total)
+    return total
+
+
+def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
+    """The maps to and from the middle of an element's body."""
+    if element.length == 0:  # as thin as what is put into it
+        parts = [of_ocelot(part, n) for part in parts_of(element, energy, False)]
+        return identity(n), composed(parts)
+    parts = [of_ocelot(part, n) for part in parts_of(element, energy, True)]
+    middle = len(parts) // 2
+    if len(parts) % 2 == 0:
+        return composed(parts[:middle]), composed(parts[middle:])
+    from scipy.linalg import sqrtm
+
+    body = parts[middle]  # of a bare matrix, or of a cavity: it comes in one piece
+    root = np.array(np.real(sqrtm(body.R)), dtype=np.float64)
+    back: Array = np.linalg.inv(root).astype(np.float64)
+    first = Quadratic(np.zeros(n), root, None)
+    second = body.after(Quadratic(np.zeros(n), back, None))
+    return composed([*parts[:middle], first]), composed([second, *parts[middle + 1 :]])
+
+
+def _thin(
+    n: int,
+    kick_x: float = 0.0,
+    kick_y: float = 0.0,
+    k1l: float = 0.0,
+    k1sl: float = 0.0,
+    slopes: Slopes = NO_ERRORS.middle,
+) -> Quadratic | None:
+    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and what the slopes say."""
+    if kick_x == kick_y == k1l == k1sl == 0 and not any(slopes):
+        return None
+    B, R = np.zeros(n), np.eye(n)
+    B[1], B[3] = kick_x, kick_y
+    R[1, 0], R[3, 2] = -k1l, k1l
+    R[1, 2] = R[3, 0] = k1sl
+    R[np.ix_([1, 3], [0, 2])] += np.reshape(slopes, (2, 2))
+    return Quadratic(B, R, None)
+
+
+def _shift(n: int, dx: float, dy: float) -> Quadratic | None:
+    if dx == dy == 0:
+        return None
+    B = np.zeros(n)
+    B[0], B[2] = dx, dy
+    return Quadratic(B, np.eye(n), None)
+
+
+def _turn(n: int, roll: float) -> Quadratic | None:
+    """Coordinates in axes that are turned by `roll` from x towards y."""
+    if roll == 0:
+        return None
+    R = np.eye(n)
+    cos, sin = np.cos(roll), np.sin(roll)
+    R[0, 0] = R[1, 1] = R[2, 2] = R[3, 3] = cos
+    R[0, 2] = R[1, 3] = sin
+    R[2, 0] = R[3, 1] = -sin
+    return Quadratic(np.zeros(n), R, None)
+
+
+def _loss(n: int, loss: float, element: Element) -> Quadratic | None:
+    """The energy falls by loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
+    if loss == 0:
+        return None
+    if n != 6:
+        raise LatticeError(
+            f"{element.kind} '{element.name}' loses energy, which four coordinates cannot hold; "
+            "take six (dimension=6)"
+        )
+    B, R = np.zeros(n), np.eye(n)
+    B[5] = -loss
+    R[5, 5] = 1 - 2 * loss
+    R[1, 1] = R[3, 3] = 1 - loss
+    return Quadratic(B, R, None)
+
+
+def drift(length: float, n: int) -> Quadratic:
+    """A way without field at the nominal energy, length in m."""
+    matrix = np.eye(n)
+    matrix[0, 1] = matrix[2, 3] = length
+    return Quadratic(np.zeros(n), matrix, None)
