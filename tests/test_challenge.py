@@ -300,37 +300,40 @@ def test_several_causes_need_a_finding_each():
     assert not exact(result_of(fa, fb, fb), (a, b))
 
 
-def scored(folder, tier, cases, **options):
-    """A small challenge on petra3, made, run and scored; no case may fail."""
-    make(tier, cases, 20, folder / tier, progress=False, **options)
+def scored(folder, tier, cases, lattice=LATTICE, **options):
+    """A challenge made, run and scored; no case may fail."""
+    make(tier, cases, 20, folder / tier, lattice=lattice, progress=False, **options)
     run(folder / tier, jobs=1, progress=False)
-    found = score(folder / tier, oracle=False, progress=False)
+    found = score(folder / tier, jobs=1, oracle=False, progress=False)
     assert not found["failed"]
     return found
 
 
 def test_a_fixed_set_of_single_faults_keeps_its_rates(tmp_path):
-    """Bounds leave room for one case of chance: a loss of a tenth of the rates breaks them."""
-    found = scored(tmp_path, "A", 12, signal=(20.0, 100.0))
+    """Bounds leave room for one case of chance: a loss of a tenth of the rates breaks them.
+    (The same on petra3, fault by fault: test_diagnosis.py.)"""
+    found = scored(tmp_path, "A", 24, signal=(20.0, 100.0))
     tool = {key: value["share"] for key, value in found["bands"]["above 20"]["tool"].items()}
     assert tool["detected"] == 1.0
-    assert tool["place"] >= 11 / 12
-    assert tool["element_in_set"] >= 11 / 12
-    assert tool["effect_in_set"] >= 11 / 12
-    assert found["coverage"]["median_elements"] <= 3
-    assert found["false_refusals"]["share"] <= 1 / 12
-    assert abs(found["pulls"]["mean"]) < 1.0  # three standard errors
+    assert tool["place"] >= 23 / 24
+    assert tool["element_in_set"] >= 23 / 24
+    assert tool["effect_in_set"] >= 23 / 24
+    assert found["coverage"]["median_elements"] <= 2
+    assert found["false_refusals"]["share"] <= 1 / 24
+    assert abs(found["pulls"]["mean"]) < 0.67  # three standard errors of twenty
 
 
 def test_a_fixed_set_without_a_fault_stays_silent(tmp_path):
-    assert scored(tmp_path, "E", 12)["false_alarms"]["share"] <= 1 / 12
+    # 1.8 expected at a rate of 5 %; five or more have 3 % there, and 88 % at a rate of 20 %
+    assert scored(tmp_path, "E", 36)["false_alarms"]["share"] <= 4 / 36
 
 
 def test_a_fixed_set_of_several_faults_is_taken_apart(tmp_path):
-    assert scored(tmp_path, "C", 3, signal=(20.0, 100.0))["exact"]["tool"]["share"] >= 2 / 3
+    assert scored(tmp_path, "C", 6, signal=(20.0, 100.0))["exact"]["tool"]["share"] >= 2 / 3
 
 
 def test_a_fixed_set_of_unknown_faults_is_refused(tmp_path):
-    found = scored(tmp_path, "D", 6, signal=(50.0, 100.0))
+    """On petra3: on the small ring no launch makes some of the unknown faults that strong."""
+    found = scored(tmp_path, "D", 6, "petra3", signal=(50.0, 100.0))
     kinds = [row for row in found["rows"] if row["unknown"]["kind"] != "taken_out"]
     assert sum(row["refused"] for row in kinds) >= len(kinds) - 1

@@ -11,8 +11,8 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from command import tmlattice
 
-from tmlattice.cli.command import main
 from tmlattice.diagnosis import diagnose
 from tmlattice.effects import Cause
 from tmlattice.files import write_json
@@ -73,20 +73,6 @@ def folders(tmp_path_factory, small_ring):
         text = file.read_text().replace("last_a", "last_c")
         (place / "strange" / file.name).write_text(text)
     return place
-
-
-@pytest.fixture
-def tmlattice(monkeypatch, capsys):
-    """The command in this process: exit code, what it printed, its errors."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["tmlattice", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        printed = capsys.readouterr()
-        return end.value.code, printed.out, printed.err
-
-    return run
 
 
 class References(HTMLParser):
@@ -152,14 +138,14 @@ def test_page_opens_offline_and_holds_its_figures(outcome):
         assert words in html
 
 
-def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, tmlattice, schema):
+def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, schema):
     path = tmp_path / "a.json"
-    code, out, errors = tmlattice(
+    done = tmlattice(
         "diagnose", SMALL, folders / "weak", "--quiet", "--json", path, "--effects",
         "quadrupole_gradient, quadrupole_roll", "--background", "monitor_offset_x=1e-7",
-        "--seed", 3, "--max-effects", 2, "--radiation",
+        "--seed", 3, "--max-effects", 2, "--radiation", cwd=tmp_path,
     )  # fmt: skip
-    assert (code, out, errors) == (0, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == [path]
     document = json.loads(path.read_text())
     jsonschema.validate(document, schema)
@@ -171,14 +157,13 @@ def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, 
     assert document["provenance"]["seed"] == 3
 
 
-def test_reference_and_single_shot(folders, tmp_path, tmlattice, schema):
+def test_reference_and_single_shot(folders, tmp_path, schema):
     path = tmp_path / "a.json"
-    code, out, _ = tmlattice(
+    done = tmlattice(
         "diagnose", SMALL, folders / "one", "--reference", folders / "before", "--json", path,
-        "--background", "quadrupole_gradient=1e-4",
+        "--background", "quadrupole_gradient=1e-4", cwd=tmp_path, check=0,
     )  # fmt: skip
-    assert code == 0
-    assert "No shot was held out" in out
+    assert "No shot was held out" in done.stdout
     document = json.loads(path.read_text())
     jsonschema.validate(document, schema)
     assert document["provenance"]["options"]["reference"] is True
@@ -208,19 +193,17 @@ def test_reference_and_single_shot(folders, tmp_path, tmlattice, schema):
     ],
 )
 def test_wrong_input_ends_in_one_sentence_and_leaves_out_untouched(
-    folders, tmp_path, tmlattice, arguments, words
+    folders, tmp_path, arguments, words
 ):
     out = tmp_path / "out"
     out.mkdir()
     (out / "diagnosis.json").write_text("of yesterday")
     local = {path.name: path for path in folders.iterdir()}
-    code, printed, errors = tmlattice(
-        "diagnose", *(local.get(word, word) for word in arguments), "--out", out
-    )
-    assert code == 2
-    assert printed == ""
-    assert words in errors
-    assert len(errors.strip().splitlines()) == 1
+    words_of_it = (local.get(word, word) for word in arguments)
+    done = tmlattice("diagnose", *words_of_it, "--out", out, cwd=tmp_path, check=2)
+    assert done.stdout == ""
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
     assert [path.name for path in out.iterdir()] == ["diagnosis.json"]
     assert (out / "diagnosis.json").read_text() == "of yesterday"
 
@@ -355,10 +338,9 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
 
 
 def test_a_fine_tuned_network_is_read_as_physics(folders, tmp_path):
-    fitted = subprocess.run(
-        [sys.executable, "-m", "tmlattice", "tune-fit", SMALL, "--measurement", folders / "weak",
-         "--epochs", "50", "--out", "fit"],
-        cwd=tmp_path, check=True, capture_output=True, text=True,
+    fitted = tmlattice(
+        "tune-fit", SMALL, "--measurement", folders / "weak", "--epochs", 50, "--out", "fit",
+        cwd=tmp_path, check=0,
     )  # fmt: skip
     assert "network.pt" in fitted.stdout
     for network, code, words in (
@@ -366,12 +348,10 @@ def test_a_fine_tuned_network_is_read_as_physics(folders, tmp_path):
         ("fit/tune-fit.json", 2, "does not hold the weights of a network"),
         ("nowhere.pt", 2, "nowhere.pt"),
     ):
-        done = subprocess.run(
-            [sys.executable, "-m", "tmlattice", "diagnose", SMALL, folders / "weak",
-             "--network", network, "--out", f"out-{code}"],
-            cwd=tmp_path, check=False, capture_output=True, text=True,
+        done = tmlattice(
+            "diagnose", SMALL, folders / "weak", "--network", network, "--out", f"out-{code}",
+            cwd=tmp_path, check=code,
         )  # fmt: skip
-        assert done.returncode == code, done.stderr
         assert words in done.stdout + done.stderr
     reading = json.loads((tmp_path / "out-0" / "weights.json").read_text())
     assert reading

@@ -13,13 +13,27 @@ from tmlattice.maps import element_map, ring_maps
 
 
 def parts(element, energy):
-    """OCELOT's second-order parts of an element: three for a bend."""
+    """(B, R, T) of OCELOT's second-order parts of an element: three for a bend."""
     source = copy.deepcopy(element.source)
     source.set_tm(SecondTM)
-    return [part.get_params(energy) for part in source.tms]
+    made = [part.get_params(energy) for part in source.tms]
+    return [(p.B.reshape(6, 1), p.get_rotated_R(), p.get_rotated_T()) for p in made]
 
 
-def ocelot_first_turn(ring, launch, whole_elements):
+@pytest.fixture(scope="module")
+def parts_of():
+    """The parts of every element of a ring, made once."""
+    made = {}
+
+    def of(ring):
+        if id(ring) not in made:
+            made[id(ring)] = ring, [parts(element, ring.energy) for element in ring.elements]
+        return made[id(ring)][1]
+
+    return of
+
+
+def ocelot_first_turn(ring, parts, launch, whole_elements):
     """Readings [batch, monitor, 2] and the last state [batch, 4], by OCELOT's own functions.
 
     A bend is applied as one second-order map, composed by OCELOT (`whole_elements`), or as its
@@ -29,31 +43,25 @@ def ocelot_first_turn(ring, launch, whole_elements):
     states[:4] = launch.T
     apply = SecondOrderMult().tmat_multip
     readings = []
-    for element in ring.elements:
+    for element, maps in zip(ring.elements, parts, strict=True):
         if element.kind == "monitor":
             readings.append(states[[0, 2]].T.copy())
-        maps = [
-            (p.B.reshape(6, 1), p.get_rotated_R(), p.get_rotated_T())
-            for p in parts(element, ring.energy)
-        ]
-        if whole_elements:
-            total = maps[0]
-            for part in maps[1:]:
-                total = transfer_maps_mult_full_py(*total, *part)
-            maps = [total]
-        for B, R, T in maps:
+        whole = maps[0]
+        for part in maps[1:]:
+            whole = transfer_maps_mult_full_py(*whole, *part)
+        for B, R, T in [whole] if whole_elements else maps:
             apply(states, R, T)
-            states += np.reshape(B, (6, 1))
+            states += np.reshape(B, (6, 1))  # of a composed element: flat
     return np.stack(readings, axis=1), states[:4].T
 
 
 @pytest.mark.parametrize("name", ["petra3", "small_ring"])
 @pytest.mark.parametrize("amplitude", [1e-3, 1e-4])
-def test_readings_match_ocelot_maps_one_by_one(name, amplitude, request, rng):
+def test_readings_match_ocelot_maps_one_by_one(name, amplitude, request, parts_of, rng):
     ring = request.getfixturevalue(name)
     network = TaylorNetwork.from_ring(ring)
     launch = amplitude * rng.standard_normal((3, 4)) * [1, 0.05, 1, 0.05]
-    readings, last = ocelot_first_turn(ring, launch, whole_elements=True)
+    readings, last = ocelot_first_turn(ring, parts_of(ring), launch, whole_elements=True)
     # 1e-12 m: rounding over the turn
     np.testing.assert_allclose(network(launch).detach().numpy(), readings, rtol=0, atol=1e-12)
     turn = network.track(launch, 1)[:, 1]
@@ -61,22 +69,24 @@ def test_readings_match_ocelot_maps_one_by_one(name, amplitude, request, rng):
     assert np.abs(readings).max() > amplitude / 2  # the beam really went round
 
 
-def test_composing_the_edges_of_a_bend_leaves_out_the_third_order_alone(petra3, rng):
+def test_composing_the_edges_of_a_bend_leaves_out_the_third_order_alone(petra3, parts_of, rng):
     network = TaylorNetwork.from_ring(petra3)
     shape = rng.standard_normal((3, 4)) * [1, 0.05, 1, 0.05]
     errors = []
     for amplitude in (1e-3, 5e-4):
-        readings, _ = ocelot_first_turn(petra3, amplitude * shape, whole_elements=False)
+        readings, _ = ocelot_first_turn(
+            petra3, parts_of(petra3), amplitude * shape, whole_elements=False
+        )
         mine = network(amplitude * shape).detach().numpy()
         errors.append(np.abs(mine - readings).max())
     assert errors[0] < 1e-9  # a nanometre, where the orbit has several millimetres
     assert 6 < errors[0] / errors[1] < 10  # third order: a factor of eight
 
 
-def test_a_kick_in_a_corrector_reaches_the_monitors_behind_it(small_ring):
+def test_a_kick_in_a_corrector_reaches_the_monitors_behind_it(small_ring, parts_of):
     kicked = small_ring.with_changed("v5", angle=1e-5)
     launch = np.zeros((1, 4))
-    readings, _ = ocelot_first_turn(kicked, launch, whole_elements=True)
+    readings, _ = ocelot_first_turn(kicked, parts_of(kicked), launch, whole_elements=True)
     maps = ring_maps(kicked)
     network = TaylorNetwork(maps)(launch).detach().numpy()
     np.testing.assert_allclose(network, readings, rtol=0, atol=1e-13)
@@ -93,9 +103,9 @@ def test_element_map_matches_ocelot_to_second_order(small_ring, name, dimension,
     x = np.zeros((6, 20))
     x[:dimension] = 1e-5 * rng.standard_normal((dimension, 20))
     image = element_map(element, small_ring.energy, dimension)(x[:dimension].T)
-    for part in parts(element, small_ring.energy):
-        SecondOrderMult().tmat_multip(x, part.get_rotated_R(), part.get_rotated_T())
-        x += part.B.reshape(6, 1)
+    for B, R, T in parts(element, small_ring.energy):
+        SecondOrderMult().tmat_multip(x, R, T)
+        x += B
     np.testing.assert_allclose(image, x[:dimension].T, rtol=0, atol=1e-15)
 
 
