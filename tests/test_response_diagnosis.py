@@ -20,7 +20,7 @@ from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
 from tmlattice.machine import draw_background
-from tmlattice.machine.response import simulate_response
+from tmlattice.machine.response import simulate_response as simulated
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
@@ -34,8 +34,16 @@ real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no PETRA
 CAUSES = [
     Cause("quadrupole_gradient", "QD::5", 0.01),
     Cause("quadrupole_gradient", "QF::9", -0.008),
+    Cause("quadrupole_gradient", "QF::3", 0.006),
+    Cause("quadrupole_gradient", "QD::12", 0.005),
     Cause("corrector_calibration", "v2", 0.1),
 ]
+"""More than a few: the families are fitted."""
+
+
+def simulate_response(ring, causes=(), **options):
+    """A step of the RF that is small in the small ring: other errors are what is tested here."""
+    return simulated(ring, causes, **{"rf_step": -3000.0, **options})
 
 
 def fitted(ring, measured, seed=1):
@@ -149,7 +157,7 @@ def test_options_act_and_are_told(small_ring, measured):
     assert options["effects"] == ["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"]
     assert options["max_effects"] == 1
     assert options["false_alarm"] == 0.01
-    with pytest.raises(MeasurementError, match="has no family of monitor_offset_x"):
+    with pytest.raises(MeasurementError, match="does not see monitor_offset_x"):
         diagnose(small_ring, measured, effects=["monitor_offset_x"])
     with pytest.raises(MeasurementError, match="'reference' has no meaning for an orbit response"):
         diagnose(small_ring, measured, reference=measured)
@@ -280,9 +288,13 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
     rows = {row.effect: row for row in weigh(state)}
     assert rows[effect].judgement == "helps"
     assert rows[effect] == min(rows.values(), key=lambda row: row.heldout_rms_in_plane)
-    expected = {"energy offset of the beam": 0.05, "nonlinear monitors (cubic)": 8e-4}
+    # calibrations, kept where single columns want them, take a part of what cubic monitors do
+    expected = {
+        "energy offset of the beam": (0.05, 0.15), "nonlinear monitors (cubic)": (8e-4, 0.25)
+    }  # fmt: skip
     if effect in expected:
-        assert rows[effect].amount == pytest.approx(expected[effect], rel=0.15)
+        amount, share = expected[effect]
+        assert rows[effect].amount == pytest.approx(amount, rel=share)
     together = rows["none"].on_top_in_plane
     assert together < 0.98 * rows["none"].heldout_rms_in_plane
 

@@ -137,7 +137,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     "--rf-step",
     type=float,
     default=None,
-    help="Orbit response: the step of the RF, Hz; 0 for none; else 0.5 % of energy.",
+    help="Orbit response: the step of the RF, Hz; 0 for none; else 1.3 mm of orbit.",
 )
 @click.option(
     "--one-sided",

@@ -17,7 +17,6 @@ from tmlattice.diagnosis.families import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
-from tmlattice.effects import find
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import fit
@@ -30,9 +29,10 @@ Flags = NDArray[np.bool_]
 MOST = 3
 """More causes are not few: each costs a search of its own."""
 
-NOISE = 1.5
-"""Chi-square per reading below which a few causes explain a response: second-order maps, a step's
-rounding and a noise stated a little low leave as much."""
+NOISE, REST = 1.5, 0.01
+"""Where what is left is more than noise, a few causes explain a response if they leave less than
+this chi-square per reading, and this share of the gap: a noise stated a little low leaves as much,
+small errors everywhere leave more."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,14 @@ def few_causes(
     if not before.chi2 / count > NOISE and chi2.sf(before.chi2, count) > judgement.false_alarm:
         return None
     number = min(most, MOST)
+    gap = max(before.chi2 - count, 1.0)
+    enough = float(chi2.isf(judgement.noise[1], count))
+    enough = max(enough, min(NOISE * count, count + REST * gap))
     search = Search(
-        problem, hypotheses, 1, unnamed=False, enough=NOISE * count, seed=seed, progress=progress
+        problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
     found = explain(search, before)
-    explained = (before.chi2 - found.fit.chi2) / max(before.chi2 - count, 1.0)
-    if not found.fit.causes or explained < 1 / (2 * number):
+    if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
         return None  # the strongest of a few would explain its share
     if found.fit.chi2 > search.enough and number > 1:
         found = explain(replace(search, most=number), before)
@@ -125,7 +127,7 @@ def _told(
     state = design
     for i, cause in enumerate(causes, 1):
         state = replace(design, at=base.with_causes(causes[:i]))
-        name = f"{find(cause.effect).words}: {cause.element}"
+        name = f"{cause.effect} {cause.element or ''}".rstrip()
         steps.append(Step.scored(name, 1, score(state, split.held)))
     heldout = (score(design, split.held), score(state, split.held))
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()

@@ -23,9 +23,8 @@ Array = NDArray[np.float64]
 
 NOISE = (2e-6, 1.2e-6)
 """rms of an orbit change, m: averaged readings of a stored beam (x, y)."""
-RF_ENERGY = 5e-3
-"""Relative change of the energy by the RF's step: millimetres of orbit, half of what rings with a
-small acceptance hold."""
+RF_ORBIT = 1.3e-3
+"""m; rms over the monitors of the orbit change by the RF's step: hundreds of times the noise."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,8 @@ def simulate_response(
         causes: what is wrong with it.
         correctors: names; None: all, in beam order.
         kick: the whole change of each corrector, rad.
-        rf_step: Hz; 0: the RF is not stepped; None: what raises the energy by 5e-3, from the
-            design's own compaction, to two digits.
+        rf_step: Hz; 0: the RF is not stepped; None: what raises the energy so that the design's
+            orbit changes by 1.3 mm rms, to two digits.
         one_sided: from the corrector's own kick to `kick` more, else from half below to half above.
         background: small random errors: effect -> rms (None: the catalogue's own), or "all".
         noise: rms of one orbit change, m, one number or (x, y).
@@ -114,7 +113,9 @@ def simulate_response(
     rf = rf_of(ring)
     harmonic, frequency = rf.harmonic, rf.frequency(ring)
     if rf_step is None:
-        rf_step = float(f"{RF_ENERGY / design.rf_start[5] * frequency:.1e}")
+        size = float(np.sqrt(np.mean(design.rf_response()[:, 0] ** 2)))
+        sign = np.sign(design.rf_start[5])
+        rf_step = float(f"{sign * RF_ORBIT / size * frequency:.1e}") if size else 0.0
     low, high = (0.0, kick) if one_sided else (-kick / 2, kick / 2)
     steps: list[tuple[str | None, float, float]] = [(name, low, high) for name in columns.names]
     if rf_step:
