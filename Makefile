@@ -4,8 +4,9 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
-# A process for each processor; a file's tests share its fixtures, so they stay in one process.
-PARALLEL = --numprocesses logical --maxprocesses 8 --dist loadfile
+# A process for each processor. The tests of a file share its fixtures and stay in one process;
+# files in their order: the long ones are not the last.
+PARALLEL = --numprocesses logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 .PHONY: run test test-all coverage check bench docs notebooks clean
 

@@ -1,5 +1,7 @@
 """The scan and its ingredients against explicit algebra, simulation and finite changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -8,6 +10,7 @@ from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.inference import scan as scanning
 from tmlattice.inference.newton import fit
+from tmlattice.inference.rivals import _linear_evidence
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import simulate
 from tmlattice.observe.data import of_measurement
@@ -141,6 +144,24 @@ def test_every_statistic_of_noise_is_a_chi_square(petra3):
     seen = found.statistic[found.information > 0]
     assert np.mean(seen) == pytest.approx(1.0, abs=0.35)  # thousands, but strongly correlated
     assert seen.max() < stats.chi2.isf(1e-7, 1)
+
+
+def test_evidence_by_the_scan_differs_between_places_as_that_of_the_refits(small_ring):
+    """A weak fault, so that the model is linear: what the scan says picks those that are refitted,
+    and a preference for large amounts would leave out the others."""
+    fault = Cause("quadrupole_gradient", "QD::5", 0.01)
+    base = Base(small_ring, [fault], settings=[{}] * 3, amplitude=1e-4, noise=2e-6)
+    problem = replace(base.problem, places={"quadrupole_gradient": 16})
+    found = base.scan([("quadrupole_gradient", f"QD::{k}") for k in range(16)], effective=16.0)
+    linear = _linear_evidence(problem, found)
+    seen = np.flatnonzero(found.statistic > 1.5)  # of what is not seen the scan knows no amount
+    assert found.statistic[seen].max() > 10 * found.statistic[seen].min()
+    refitted = [
+        fit(problem, [Cause(*found.hypotheses[i], found.amount[i])], base.fit.nuisances)
+        for i in seen
+    ]
+    away = np.array([one.log_evidence for one in refitted]) - linear[seen]
+    assert np.ptp(away) < 0.05  # 0.002 was seen; half the logarithm of ten is 1.2
 
 
 def test_noise_is_estimated_within_five_percent_beside_a_strong_fault(petra3):
