@@ -4,17 +4,22 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+# A process for each processor; a file's tests share its fixtures, so they stay in one process.
+PARALLEL = --numprocesses logical --maxprocesses 8 --dist loadfile
 
-.PHONY: run test test-all check bench docs notebooks clean
+.PHONY: run test test-all coverage check bench docs notebooks clean
 
 run: $(VENV)/installed
 	$(BIN)/tmlattice tune-fit
 
 test: $(VENV)/installed
-	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term
+	$(BIN)/python -m pytest -m "not slow" $(PARALLEL)
 
 test-all: $(VENV)/installed
-	$(BIN)/python -m pytest --cov --cov-report=term
+	$(BIN)/python -m pytest $(PARALLEL)
+
+coverage: $(VENV)/installed
+	$(BIN)/python -m pytest -m "not slow" $(PARALLEL) --cov --cov-report=term-missing:skip-covered
 
 check: $(VENV)/installed
 	$(BIN)/ruff check .

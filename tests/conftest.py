@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-_kept = tempfile.TemporaryDirectory(prefix="tmlattice-tests-")
-os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
+if "PYTEST_XDIST_WORKER" in os.environ:  # one of several processes: a thread each, one cache
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+else:
+    _kept = tempfile.TemporaryDirectory(prefix="tmlattice-tests-")
+    os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 
