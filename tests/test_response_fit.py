@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.inference.priors import Group, normal_equations, solve
+from tmlattice.inference.normal import normal_equations, solve
+from tmlattice.inference.priors import Group
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from tmlattice.diagnosis.state import (
     one_round,
     rms_of,
 )
-from tmlattice.inference.priors import Posterior, solve
+from tmlattice.inference.normal import Posterior, solve
 from tmlattice.observe.orbit_response import ResponseData, Split
 
 Array = NDArray[np.float64]

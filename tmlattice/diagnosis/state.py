@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import Family
-from tmlattice.inference.priors import Group, Normal, normal_equations, solve
+from tmlattice.inference.normal import Normal, normal_equations, solve
+from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
 
 Array = NDArray[np.float64]

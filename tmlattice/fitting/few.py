@@ -16,9 +16,9 @@ from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
-from tmlattice.inference.amounts import AmountPrior, Student
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.priors import AmountPrior, Student
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement

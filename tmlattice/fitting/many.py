@@ -18,8 +18,8 @@ from tmlattice.beam.shifts import Shifts
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.few import few_causes
-from tmlattice.inference.amounts import Student
 from tmlattice.inference.dual import MostProbable, best_of, most_probable, posterior_base
+from tmlattice.inference.priors import Student
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork

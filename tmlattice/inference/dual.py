@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from tmlattice.errors import BeamLostError
-from tmlattice.inference.amounts import Student
+from tmlattice.inference.priors import Student
 
 Array = NDArray[np.float64]
 

@@ -1,91 +1,104 @@
-"""Linear least squares with Gaussian priors for one pair of planes of an orbit response.
+"""How likely amounts are before the data: one distribution, whose tails are a number.
 
-Three kinds of parameter meet in one residual d [column, monitor]: what scales all readings of a
-monitor (gain, or the other plane's share), what scales a column (corrector calibration, or roll),
-and what changes the ring. Their normal equations are dense only in the last.
+A fault has an amount of its own (`AmountPrior`); small errors come in groups (`Group`): each has
+its own scale, which follows the evidence (EM), and may be shared: an error of a family beside the
+errors of its members.
 
-Parameters have priors in groups: each has its own scale, which follows the evidence (EM), and may
-be shared: an error of a family beside the errors of its members. A prior is Student's with some
-degree of freedom: infinite is Gauss', 4 has tails, so that one wrong magnet does not widen the
-prior of all.
+The degree of freedom says how heavy they are: infinite is Gauss, 4 forgives a few large ones, 1 is
+Cauchy, and 0 the limit in which every power of ten is as likely, so that the cost of an amount is
+that of its relative error, whatever the effect.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.blas import dsyrk
-from scipy.linalg.lapack import dpotri
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammaln
+
+from tmlattice.effects import Cause, find
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-SMALLEST = 1e-9
-"""A prior's rms does not fall below."""
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Normal equations; parameters: monitor and plane, then column, then error of the ring.
+class Student:
+    """Student's distribution about zero.
 
     Attributes:
-        matrix: J^T W J, [parameter, parameter].
-        vector: J^T W residual, [parameter].
+        width: in the unit of the amounts.
+        freedom: degrees of freedom, above 0; infinite: Gauss.
     """
 
-    matrix: Array
-    vector: Array
+    width: float
+    freedom: float
+
+    def penalty(self, amounts: ArrayLike) -> Array:
+        """- log density less that at zero."""
+        squares = np.square(np.asarray(amounts, dtype=float) / self.width)
+        if np.isinf(self.freedom):
+            return np.asarray(0.5 * squares)
+        return np.asarray((self.freedom + 1) / 2 * np.log1p(squares / self.freedom))
+
+    def precision(self, amounts: ArrayLike) -> Array:
+        """Of the Gaussian that touches the distribution from below at the amounts: its pull towards
+        zero is this times the amount."""
+        squares = np.square(np.asarray(amounts, dtype=float))
+        if np.isinf(self.freedom):
+            return np.full(squares.shape, self.width**-2.0)
+        return np.asarray((self.freedom + 1) / (self.freedom * self.width**2 + squares))
+
+    @property
+    def peak(self) -> float:
+        """Log density at zero."""
+        nu = self.freedom
+        if np.isinf(nu):
+            return float(-np.log(self.width * np.sqrt(2 * np.pi)))
+        shape = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi)
+        return float(shape - np.log(self.width))
 
 
-def normal_equations(
-    residual: Array,
-    weight: Array,
-    plane: Indices,
-    by_monitor: Array,
-    by_column: Array,
-    by_ring: Array | Sequence[Array],
-) -> Normal:
-    """Sums over all readings.
+@dataclass(frozen=True)
+class AmountPrior:
+    """Of the amount of one fault.
 
-    Args:
-        residual: measured less model, m, [column, monitor]; weight 0 where missing.
-        weight: 1 / variance, 1/m^2, [column, monitor].
-        plane: in which each column is read, 0 or 1, [column].
-        by_monitor: d reading / d monitor's parameter, [column, monitor].
-        by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
-        by_ring: d reading / d error, [error, column, monitor]; may be empty.
+    Attributes:
+        tails: its distribution; None: no degree of freedom, even in log |amount|, over `decades` up
+            to the largest fault, thin beyond it.
+        decades: powers of ten.
+        bound: no larger amount is possible.
     """
-    columns, monitors = residual.shape
-    J = np.asarray(by_ring, dtype=float).reshape(-1, columns, monitors)
-    m, c = 2 * monitors, columns
-    A = np.zeros((m + c + len(J),) * 2)
-    b = np.zeros(len(A))
-    y = np.where(weight > 0, residual, 0.0)
-    place = np.arange(monitors)
-    rows = [plane == p for p in (0, 1)]
-    wu, wv = weight * by_monitor, weight * by_column
-    for p in (0, 1):
-        at = 2 * place + p
-        A[at, at] = (wu * by_monitor)[rows[p]].sum(axis=0)
-        A[np.ix_(at, m + np.flatnonzero(rows[p]))] = (wu * by_column)[rows[p]].T
-        b[at] = (wu * y)[rows[p]].sum(axis=0)
-    own = m + np.arange(c)
-    A[own, own] = (wv * by_column).sum(axis=1)
-    b[own] = (wv * y).sum(axis=1)
-    root = np.sqrt(weight)
-    flat = np.empty((len(J), residual.size))
-    for i, slope in enumerate(J):
-        both = wu * slope
-        for p in (0, 1):
-            A[2 * place + p, m + c + i] = both[rows[p]].sum(axis=0)
-        A[own, m + c + i] = (wv * slope).sum(axis=1)
-        flat[i] = (root * slope).ravel()
-    if len(J):
-        A[m + c :, m + c :] = dsyrk(1.0, flat.T, trans=1, lower=0)
-        b[m + c :] = flat @ (root * y).ravel()
-    return Normal(np.triu(A) + np.triu(A, 1).T, b)
+
+    tails: Student | None = None
+    decades: float = 4.0
+    bound: float = np.inf
+
+    def log_density(self, cause: Cause) -> float:
+        """Of the amount; 0 for what is there or not."""
+        effect = find(cause.effect)
+        if effect.discrete:
+            return 0.0
+        size = abs(cause.amount)
+        if size > self.bound:
+            return -np.inf
+        if self.tails is not None:
+            return self.tails.peak - float(self.tails.penalty(size))
+        size = max(size, 1e-300)
+        density = -np.log(2 * size * self.decades * np.log(10))
+        return float(density - 8 * max(np.log(size / effect.largest), 0.0))
+
+    def precision(self, cause: Cause) -> float:
+        """Its pull towards zero over the amount; a logarithm has no zero to be pulled to."""
+        if self.tails is None or find(cause.effect).discrete:
+            return 0.0
+        return float(self.tails.precision(cause.amount))
+
+
+EVEN = AmountPrior()
+"""Even in the logarithm: of a fault that may have any size."""
+
+
+SMALLEST = 1e-9
+"""A prior's rms does not fall below."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +130,7 @@ class Group:
 
     def share(self, squares: Array, rms: float) -> Array:
         """By which a parameter of this expected square counts: 1 for Gauss, less in the tails."""
-        if np.isinf(self.freedom):
-            return np.ones(len(squares))
-        return np.asarray((self.freedom + 1) / (self.freedom + squares / rms**2))
+        return rms**2 * Student(rms, self.freedom).precision(np.sqrt(squares))
 
     def learn(self, squares: Array) -> "Group":
         """One step of EM from the expected squares of the parameters."""
@@ -132,62 +143,3 @@ class Group:
                 rms = max(float(np.sqrt(mean)), SMALLEST)
         each = rms / np.sqrt(self.share(squares, rms))
         return replace(self, rms=rms, each=np.minimum(each, self.most))
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """What the residual is explained by.
-
-    Attributes:
-        values: of the base parameters, [parameter].
-        sigma: their posterior errors.
-        covariance: of the groups' parameters, in units of their priors, [p, p].
-        spread: of the base parameters: basis times prior rms, [parameter, p].
-        groups: with the scales that they have learnt.
-    """
-
-    values: Array
-    sigma: Array
-    covariance: Array
-    spread: Array
-    groups: tuple[Group, ...]
-
-
-def solve(
-    normal: Normal,
-    groups: Sequence[Group],
-    start: Array | None = None,
-    trust: Array | None = None,
-    rounds: int = 2,
-) -> Posterior:
-    """One step of Gauss and Newton: the most probable parameters, and the groups' scales.
-
-    Args:
-        normal: at `start`.
-        groups: the priors, about zero; every base parameter that may move is in one of them.
-        start: the base parameters where the residual was taken; None: zero.
-        trust: rms by which each may move away from `start`; None: freely. It shortens the step and
-            not the result: a fixed point does not know it.
-        rounds: of EM; 0: the priors stay as they are.
-    """
-    known = np.zeros(len(normal.vector)) if start is None else start
-    groups = tuple(groups)
-    basis = np.concatenate([g.basis for g in groups], axis=1)
-    edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
-    base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
-    A = basis.T @ base @ basis
-    b = basis.T @ (normal.vector + base @ known)
-    for turn in range(max(rounds, 1)):
-        prior = np.concatenate([g.scale for g in groups])
-        # in units of the priors, so that the matrix is well scaled
-        factor = cho_factor(A * np.outer(prior, prior) + np.eye(len(A)), lower=True)
-        found = prior * cho_solve(factor, prior * b)
-        covariance = dpotri(factor[0], lower=1)[0]
-        if turn < rounds:
-            squares = found**2 + np.diag(covariance) * prior**2
-            parts = np.split(squares, edges)
-            groups = tuple(g.learn(own) for g, own in zip(groups, parts, strict=True))
-    covariance = np.tril(covariance) + np.tril(covariance, -1).T
-    spread = basis * prior
-    sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))
-    return Posterior(basis @ found, sigma, covariance, spread, groups)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause
-from tmlattice.inference.amounts import EVEN, AmountPrior
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.metric import Metric
+from tmlattice.inference.priors import EVEN, AmountPrior
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]

@@ -1,0 +1,143 @@
+"""Linear least squares with Gaussian priors for one pair of planes of an orbit response.
+
+Three kinds of parameter meet in one residual d [column, monitor]: what scales all readings of a
+monitor (gain, or the other plane's share), what scales a column (corrector calibration, or roll),
+and what changes the ring. Their normal equations are dense only in the last.
+
+Parameters have priors in groups, see `inference.priors.Group`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.blas import dsyrk
+from scipy.linalg.lapack import dpotri
+
+from tmlattice.inference.priors import Group
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations; parameters: monitor and plane, then column, then error of the ring.
+
+    Attributes:
+        matrix: J^T W J, [parameter, parameter].
+        vector: J^T W residual, [parameter].
+    """
+
+    matrix: Array
+    vector: Array
+
+
+def normal_equations(
+    residual: Array,
+    weight: Array,
+    plane: Indices,
+    by_monitor: Array,
+    by_column: Array,
+    by_ring: Array | Sequence[Array],
+) -> Normal:
+    """Sums over all readings.
+
+    Args:
+        residual: measured less model, m, [column, monitor]; weight 0 where missing.
+        weight: 1 / variance, 1/m^2, [column, monitor].
+        plane: in which each column is read, 0 or 1, [column].
+        by_monitor: d reading / d monitor's parameter, [column, monitor].
+        by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
+        by_ring: d reading / d error, [error, column, monitor]; may be empty.
+    """
+    columns, monitors = residual.shape
+    J = np.asarray(by_ring, dtype=float).reshape(-1, columns, monitors)
+    m, c = 2 * monitors, columns
+    A = np.zeros((m + c + len(J),) * 2)
+    b = np.zeros(len(A))
+    y = np.where(weight > 0, residual, 0.0)
+    place = np.arange(monitors)
+    rows = [plane == p for p in (0, 1)]
+    wu, wv = weight * by_monitor, weight * by_column
+    for p in (0, 1):
+        at = 2 * place + p
+        A[at, at] = (wu * by_monitor)[rows[p]].sum(axis=0)
+        A[np.ix_(at, m + np.flatnonzero(rows[p]))] = (wu * by_column)[rows[p]].T
+        b[at] = (wu * y)[rows[p]].sum(axis=0)
+    own = m + np.arange(c)
+    A[own, own] = (wv * by_column).sum(axis=1)
+    b[own] = (wv * y).sum(axis=1)
+    root = np.sqrt(weight)
+    flat = np.empty((len(J), residual.size))
+    for i, slope in enumerate(J):
+        both = wu * slope
+        for p in (0, 1):
+            A[2 * place + p, m + c + i] = both[rows[p]].sum(axis=0)
+        A[own, m + c + i] = (wv * slope).sum(axis=1)
+        flat[i] = (root * slope).ravel()
+    if len(J):
+        A[m + c :, m + c :] = dsyrk(1.0, flat.T, trans=1, lower=0)
+        b[m + c :] = flat @ (root * y).ravel()
+    return Normal(np.triu(A) + np.triu(A, 1).T, b)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the residual is explained by.
+
+    Attributes:
+        values: of the base parameters, [parameter].
+        sigma: their posterior errors.
+        covariance: of the groups' parameters, in units of their priors, [p, p].
+        spread: of the base parameters: basis times prior rms, [parameter, p].
+        groups: with the scales that they have learnt.
+    """
+
+    values: Array
+    sigma: Array
+    covariance: Array
+    spread: Array
+    groups: tuple[Group, ...]
+
+
+def solve(
+    normal: Normal,
+    groups: Sequence[Group],
+    start: Array | None = None,
+    trust: Array | None = None,
+    rounds: int = 2,
+) -> Posterior:
+    """One step of Gauss and Newton: the most probable parameters, and the groups' scales.
+
+    Args:
+        normal: at `start`.
+        groups: the priors, about zero; every base parameter that may move is in one of them.
+        start: the base parameters where the residual was taken; None: zero.
+        trust: rms by which each may move away from `start`; None: freely. It shortens the step and
+            not the result: a fixed point does not know it.
+        rounds: of EM; 0: the priors stay as they are.
+    """
+    known = np.zeros(len(normal.vector)) if start is None else start
+    groups = tuple(groups)
+    basis = np.concatenate([g.basis for g in groups], axis=1)
+    edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
+    base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
+    A = basis.T @ base @ basis
+    b = basis.T @ (normal.vector + base @ known)
+    for turn in range(max(rounds, 1)):
+        prior = np.concatenate([g.scale for g in groups])
+        # in units of the priors, so that the matrix is well scaled
+        factor = cho_factor(A * np.outer(prior, prior) + np.eye(len(A)), lower=True)
+        found = prior * cho_solve(factor, prior * b)
+        covariance = dpotri(factor[0], lower=1)[0]
+        if turn < rounds:
+            squares = found**2 + np.diag(covariance) * prior**2
+            parts = np.split(squares, edges)
+            groups = tuple(g.learn(own) for g, own in zip(groups, parts, strict=True))
+    covariance = np.tril(covariance) + np.tril(covariance, -1).T
+    spread = basis * prior
+    sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))
+    return Posterior(basis @ found, sigma, covariance, spread, groups)
