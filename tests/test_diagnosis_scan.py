@@ -7,8 +7,10 @@ import pytest
 from scipy import stats
 
 from tmlattice.beam.model import Model
+from tmlattice.diagnosis.findings import sensitivity
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.inference import scan as scanning
+from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import fit
 from tmlattice.inference.rivals import _linear_evidence
 from tmlattice.inference.whitening import Projection, Whitening
@@ -162,6 +164,18 @@ def test_evidence_by_the_scan_differs_between_places_as_that_of_the_refits(small
     ]
     away = np.array([one.log_evidence for one in refitted]) - linear[seen]
     assert np.ptp(away) < 0.05  # 0.002 was seen; half the logarithm of ten is 1.2
+
+
+@pytest.mark.parametrize("name", ["energy_spread", "energy_offset", "radiation_loss_bends"])
+def test_the_least_amount_that_is_seen_reaches_the_threshold(base, name):
+    """Put into the model: of a spread the readings know the square."""
+    found = base.scan(effective=100.0)
+    judgement = Judgement()
+    least = Cause(name, None, sensitivity(found, judgement)[name])
+    launches = base.fit.nuisances
+    change = base.model.readings(launches, [least]) - base.model.readings(launches)
+    seen = base.fit.projection.out(base.whitening.signature(np.nan_to_num(change)))
+    assert seen @ seen == pytest.approx(found.threshold(judgement.false_alarm), rel=0.01)
 
 
 def test_noise_is_estimated_within_five_percent_beside_a_strong_fault(petra3):
