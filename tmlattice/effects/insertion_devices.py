@@ -12,6 +12,7 @@ class InsertionDeviceFocusing(ErrorEffect):
     name = "insertion_device_focusing"
     words = "unmodelled focusing of an insertion device"
     group = "insertion devices"
+    responds = True
     headline = True
     error = "entrance_k1l"
     unit = "1/m"

@@ -33,6 +33,7 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
 
 class _Gradient(RingEffect):
     group = "quadrupoles"
+    responds = True
     unit = "1/m"
     largest = 0.03
     sits_on_text = "quadrupoles, skew quadrupoles, sextupoles, wigglers, markers"
