@@ -1,0 +1,137 @@
+"""How a fit ends is said, and where it has to be said: linear algebra and rings as referees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.beam.model import Model
+from tmlattice.errors import BeamLostError
+from tmlattice.inference.dual import most_probable
+from tmlattice.inference.newton import Outcome, fit
+from tmlattice.inference.priors import Student
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
+
+FAULT = Cause("quadrupole_gradient", "QD::5", -0.05)
+
+
+@pytest.fixture(scope="module")
+def measured(small_ring):
+    return simulate(
+        small_ring, [FAULT], shots=3, amplitude=1e-4, noise=1e-6, engine="ocelot", seed=2
+    ).measurement()
+
+
+@pytest.fixture(scope="module")
+def problem(small_ring, measured):
+    data = of_measurement(small_ring, measured)
+    return FirstTurns(
+        model=Model(small_ring, data.settings), data=data, places={"quadrupole_gradient": 32}
+    )
+
+
+def test_a_settled_fit_finds_the_amount(problem):
+    found = fit(problem, [replace(FAULT, amount=-0.01)], problem.data.launches)
+    assert found.outcome is Outcome.CONVERGED
+    assert found.good
+    sigma = np.sqrt(found.covariance[0, 0])
+    assert abs(found.causes[0].amount - FAULT.amount) < 4 * sigma < 0.002
+
+
+def test_too_few_steps_are_said(problem):
+    found = fit(problem, [replace(FAULT, amount=0.2)], problem.data.launches, steps=1)
+    assert found.outcome is Outcome.STEPS
+
+
+def test_a_lost_beam_is_no_explanation(problem):
+    far = problem.data.launches + np.array([0.2, 0, 0, 0, 0])
+    found = fit(problem, [FAULT], far)
+    assert found.outcome is Outcome.LOST
+    assert not found.good
+    assert found.log_evidence == -np.inf
+    assert "lost" in found.point.lost
+
+
+def test_what_is_far_worse_is_given_up(problem):
+    wrong = Cause("quadrupole_gradient", "QF::9", 0.01)
+    right = fit(problem, [FAULT], problem.data.launches)
+    found = fit(problem, [wrong], problem.data.launches, hopeless=right.log_evidence)
+    assert found.outcome is Outcome.GIVEN_UP
+    assert found.log_evidence < right.log_evidence - 50
+
+
+def test_launches_that_the_design_loses_are_one_sentence(small_ring, measured):
+    launches = measured.launches.copy()
+    launches[:, 0] = 0.3
+    with pytest.raises(BeamLostError, match=r"lost in .*check the launches' units"):
+        diagnose(small_ring, replace(measured, launches=launches), holdout=0)
+
+
+def test_the_false_alarm_rate_acts_on_what_would_have_been_seen(small_ring):
+    """A stricter rate asks for larger amounts: the roots of two thresholds."""
+    quiet = simulate(
+        small_ring, [], shots=3, amplitude=1e-4, noise=1e-6, engine="ocelot", seed=2
+    ).measurement()
+    usual, strict = (
+        diagnose(small_ring, quiet, holdout=0, false_alarm=rate) for rate in (5e-3, 1e-9)
+    )
+    assert usual.verdict == strict.verdict == "nothing"
+    for effect, least in usual.sensitivity.items():
+        assert strict.sensitivity[effect] > 1.2 * least
+    assert strict.provenance["options"]["false_alarm"] == 1e-9
+
+
+class Straight:
+    """Readings that are a matrix times the amounts."""
+
+    largest = np.inf
+
+    def __init__(self, J, measured, sigma):
+        self.J, self.measured, self.sigma = J, measured, np.full(len(measured), sigma)
+
+    def residual(self, amounts):
+        return self.measured - self.J @ amounts
+
+    def slopes(self, amounts):
+        return self
+
+    def times(self, amounts):
+        return self.J @ amounts
+
+    def transposed(self, rows):
+        return self.J.T @ rows
+
+    def kernel(self, variance):
+        return (self.J * variance) @ self.J.T
+
+    def nuisances(self, amounts):
+        return np.zeros((len(self.measured),) * 2)
+
+
+def test_most_probable_amounts_are_ridge_regression_where_all_is_linear(rng):
+    """The primal normal equations are the referee of the dual ones."""
+    J = rng.standard_normal((20, 50))
+    true = 0.3 * rng.standard_normal(50)
+    problem = Straight(J, J @ true + 0.1 * rng.standard_normal(20), 0.1)
+    found = most_probable(problem, Student(0.3, np.inf), np.zeros(50))
+    ridge = np.linalg.solve(J.T @ J / 0.1**2 + np.eye(50) / 0.3**2, J.T @ problem.measured / 0.1**2)
+    assert found.settled
+    np.testing.assert_allclose(found.amounts, ridge, atol=1e-9)
+
+
+def test_tails_leave_one_large_amount_where_it_is(rng):
+    """A Gauss of the same width shares it among columns that look like it."""
+    J = rng.standard_normal((40, 1)) + 0.3 * rng.standard_normal((40, 30))
+    true = np.zeros(30)
+    true[7] = 1.0
+    problem = Straight(J, J @ true + 1e-3 * rng.standard_normal(40), 1e-3)
+    largest = {}
+    for freedom in (1.0, np.inf):
+        amounts = most_probable(
+            problem, Student(1e-3, freedom), np.zeros(30), iterations=40
+        ).amounts
+        assert np.abs(amounts).argmax() == 7
+        largest[freedom] = np.abs(np.delete(amounts, 7)).max()
+    assert largest[1.0] < 0.05 * largest[np.inf]
