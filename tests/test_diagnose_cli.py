@@ -252,6 +252,14 @@ def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):
     assert max(map(len, text.splitlines())) <= 100
 
 
+def test_report_says_how_much_is_closed_and_how_surely(diagnoses):
+    text = " ".join(report_text(diagnoses["named"]).split())
+    found = re.search(r"([\d.]+) % of the gap .* \(95 % interval ([\d.]+) to ([\d.]+) %\)", text)
+    closed, low, high = map(float, found.groups())
+    assert 90 < low < closed < high < 110  # a gap of three times the noise
+    assert closed == pytest.approx(100 * diagnoses["named"].gap["closed"], abs=0.06)
+
+
 def test_dead_monitor_in_report_and_json(small_ring, schema, tmp_path):
     data = simulate(small_ring, [Cause("monitor_dead", "end_3", 1.0)], **SHOTS).measurement()
     diagnosis = diagnose(small_ring, data)
