@@ -215,7 +215,7 @@ def _gap(fit: DenseFit, noise: float) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     before, after = (max(m.rms**2 - noise**2, 0.0) for m in (misfits[0], misfits[-1]))
     seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
-    there = before > 0 and seen.total - seen.count > 5 * np.sqrt(2 * seen.count)
+    there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
     return Gap(misfits, np.zeros((0, 0, 0)), 1 - after / before if there else None, None)
 
 
