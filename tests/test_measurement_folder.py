@@ -519,7 +519,7 @@ def peak_memory(folder, shots, rng):
     tracemalloc.start()
     with measurement_writer(folder, names, noise=(1e-5, 1e-5)) as writer:
         for shot in range(shots):
-            writer.add(shot, np.full(5, 1e-4), np.full(5, 1e-5), {"c": {"kick": 1e-5}}, one)
+            writer.add(shot, np.full(5, 1e-4), np.full(5, 1e-5), {"c": {"kick": 1e-5}}, one.copy())
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak
