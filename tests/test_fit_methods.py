@@ -108,6 +108,10 @@ def test_sparse_says_what_it_needs(small_ring, small_network):
     silent = Measurement(LAUNCH, measurement.readings, measurement.monitors)
     with pytest.raises(MeasurementError, match="noise"):
         fine_tune(small_network, silent, method="sparse")
+    with pytest.raises(ValueError, match="candidates="):
+        fine_tune(small_network, measurement, method="told")
+    told = fine_tune(small_network, measurement, method="told", candidates=["QD::5"])
+    assert set(told.changes) == {"QD::5"}
     with pytest.raises(ValueError, match="magic"):
         fine_tune(small_network, measurement, method="magic")
 

@@ -5,6 +5,8 @@ files, ...) or stands above all (the package's own `__init__`).
 """
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -111,3 +113,12 @@ def test_files_and_functions_are_short(path):
             if lines > FUNCTION:
                 long.append(f"{node.name}: {lines} lines")
     assert not long
+
+
+def test_the_diagnosis_needs_neither_torch_nor_ocelot():
+    code = (
+        "import sys, tmlattice.diagnosis, tmlattice.diagnosis.response, tmlattice.report.plain\n"
+        "print(*sorted({'torch', 'ocelot', 'at', 'matplotlib'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not done.stdout.strip()

@@ -1,4 +1,4 @@
-"""`fine_tune`: one call, three methods."""
+"""`fine_tune`: one call, four methods."""
 
 from enum import StrEnum
 from typing import Any
@@ -16,6 +16,7 @@ class Method(StrEnum):
     ADAM = "adam"
     MAP = "map"
     SPARSE = "sparse"
+    TOLD = "told"
 
 
 def fine_tune(
@@ -33,7 +34,9 @@ def fine_tune(
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
             (`fitting.many.fit_map`); "sparse", as few changed magnets as the evidence asks for
-            (`fitting.few.fit_sparse`). The last two state the error of their tunes.
+            (`fitting.few.fit_sparse`); "told", the same that knows which magnets may have changed
+            (`candidates=`): nothing else can be better. All but the first state the error of their
+            tunes.
         options: of the method, see there.
 
     Raises:
@@ -45,8 +48,12 @@ def fine_tune(
         return fit_adam(network, measurement, **options)
     if chosen is Method.MAP:
         return fit_map(network, measurement, **options)
+    if chosen is Method.TOLD and not options.get("candidates"):
+        raise ValueError(
+            "method 'told' is told the magnets that may have changed: give candidates="
+        )
     if isinstance(network, SymplecticNetwork):
         if network.ring is None:
-            raise ValueError("method 'sparse' needs a network made from a ring")
+            raise ValueError("methods 'sparse' and 'told' need a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
     return fit_sparse(network, measurement, **options)

@@ -182,8 +182,7 @@ def run_case(
             predicted = network_tunes(fit.network, start, turns)[0]
         else:
             only = {"candidates": names} if method == "told" else {}
-            way = "sparse" if method == "told" else method
-            fit = fine_tune(design, measurement, method=way, noise=noise, progress=False, **only)
+            fit = fine_tune(design, measurement, method=method, noise=noise, progress=False, **only)
             if fit.tunes is None:
                 return dataclasses.replace(known, problem="the fitted network has no tune")
             predicted = fit.tunes
