@@ -318,3 +318,24 @@ def test_tails_of_chi_square_vs_scipy_stats():
         assert np.array_equal(
             chi2.isf(rate, freedom), stats.chi2.isf(rate, freedom), equal_nan=True
         )
+
+
+def test_kept_directions_are_those_worked_out(small_ring, tmp_path, monkeypatch):
+    from tmlattice.beam.assembly import assembly
+    from tmlattice.beam.model import Model
+    from tmlattice.effects import RingEffect, directions, find
+    from tmlattice.effects.directions import ARRAYS, kept_directions
+
+    monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path))
+    ring = load_ring(SMALL)
+    layers = assembly(ring).layers
+    hypotheses = Model(ring, [{}]).hypotheses()
+    hypotheses = [h for h in hypotheses if isinstance(find(h[0]), RingEffect)]
+    worked_out = directions(layers, hypotheses)
+    first = kept_directions(layers, hypotheses)
+    entries = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    again = kept_directions(layers, hypotheses)
+    assert entries == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    for name in ARRAYS:
+        for found in (first, again):
+            np.testing.assert_array_equal(getattr(found, name), getattr(worked_out, name))

@@ -39,8 +39,10 @@ def _makers() -> str:
     from tmlattice import __version__
 
     own = Path(__file__).parent
-    files = [p for room in ("lattice", "maps") for p in sorted((own / room).glob("*.py"))]
-    changed = [(p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in files]
+    files = [
+        p for room in ("lattice", "maps", "effects") for p in sorted((own / room).glob("*.py"))
+    ]
+    changed = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files]
     packages = [version(name) for name in ("ocelot-collab", "numpy", "accelerator-toolbox")]
     return repr((__version__, packages, changed))
 

@@ -19,10 +19,10 @@ from tmlattice.effects import (
     RingEffect,
     Settings,
     apply,
-    directions,
     find,
     set_elements,
 )
+from tmlattice.effects.directions import directions, kept_directions
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 
@@ -135,7 +135,7 @@ class Assembly:
         key = tuple(hypotheses)
         if key not in self._directions:
             design = assembly(self.design, (), self.layers.dimension).layers
-            self._directions[key] = directions(design, key)
+            self._directions[key] = kept_directions(design, key)
         return self._directions[key]
 
 

@@ -9,14 +9,17 @@ The derivatives are central differences of the layers' own maps; every map that 
 for is kept by `LayerMaps`, so that equal magnets cost one.
 """
 
+import io
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice import cache
 from tmlattice.effects.effect import RingEffect, find
 from tmlattice.lattice import Element
+from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
 from tmlattice.maps.magnets import Quadratic, Weights
 
@@ -72,6 +75,32 @@ class Directions:
         )
 
 
+MANY = 100
+"""Hypotheses whose directions are worth keeping for the next call."""
+
+
+def kept_directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) -> Directions:
+    """`directions`, from the user's cache folder where they were worked out before.
+
+    Args:
+        layers: of a ring as its file has it.
+        hypotheses: (effect, place).
+    """
+    file = layers.ring.memory.get(KEPT)
+    if file is None or len(hypotheses) < MANY:
+        return directions(layers, hypotheses)
+    key = cache.key("directions", file, layers.dimension, tuple(hypotheses))
+    content = cache.load(key)
+    if content is not None:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return Directions(tuple(hypotheses), **arrays)
+    found = directions(layers, hypotheses)
+    written = io.BytesIO()
+    np.savez(written, **{name: getattr(found, name) for name in ARRAYS})
+    cache.save(key, written.getvalue())
+    return found
+
+
 def directions(
     layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], step: float = STEP
 ) -> Directions:
@@ -117,6 +146,9 @@ def directions(
                 if any(m.any() for m in slope):
                     reads.add(owner, int(start + i), slope)
     return Directions(tuple(hypotheses), *rows.stacked(), *reads.stacked())
+
+
+ARRAYS = ("owner", "layer", "D0", "D1", "D2", "read_owner", "monitor", "E0", "E1", "E2")
 
 
 def _derivative(
