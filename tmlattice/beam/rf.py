@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import c as SPEED_OF_LIGHT
 
 from tmlattice.effects import Settings, expected_loss
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import Ring
 
+SPEED_OF_LIGHT = 299_792_458.0  # m/s
 FREQUENCY = 499.65e6
 """Hz; where neither a cavity nor the caller says otherwise."""
 OVERVOLTAGE = 4.0
