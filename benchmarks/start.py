@@ -4,14 +4,13 @@ Processor time is user + system of the process and its children, s: of the first
 caches (the package's and numba's), and the least of the later calls. The last column names the
 heavy packages that were loaded.
 
-21 November 2026, `python benchmarks/start.py --repeat 3` on two cores, NOT quiet (a load
-of 7 from other work), first / later, s:
+21 November 2026, `python benchmarks/start.py`, two cores, one of them busy; first / later, s; goal:
 
-    --help              0.09 / 0.09
-    info petra3         2.58 / 1.25   none of the heavy packages in the later calls
-    simulate            3.58 / 2.56   ocelot, matplotlib, at
-    diagnose            5.97 / 3.43   ocelot
-    tune-fit --epochs 1 17.2 / 6.98   torch, ocelot, matplotlib
+    --help              0.09 / 0.08   0.15
+    info petra3         2.53 / 1.06   2.5    none of the heavy packages in the later calls
+    simulate            2.97 / 2.20          ocelot, matplotlib, at
+    diagnose            5.63 / 2.87   2.5    ocelot; 1.6 s are the search itself
+    tune-fit --epochs 1 15.6 / 4.62   3.5    torch, ocelot, matplotlib; three figures are 1.8 s
 """
 
 import argparse
