@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.beam.model import Model
+from tmlattice.beam.strengths import LARGEST
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
@@ -33,9 +34,6 @@ EFFECTS = {"quadrupole": "quadrupole_gradient", "sextupole": "sextupole_strength
 
 FAULT = 0.3
 """Prior rms of the relative change of a strength that has changed."""
-
-LARGEST = 1.5
-"""A strength may change by this much, either way; beyond, it is another magnet."""
 
 LARGEST_NUMBER, REFINED = 5, 12
 """Of causes, and of candidates that are refined after each scan."""

@@ -7,9 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-UNKNOWN_LAUNCH = (float("inf"),) * 4 + (0.0,)
-"""rms of a launch (x, px, y, py, delta) that nobody states: the energy is the nominal one."""
-
 
 def _shares() -> Mapping[str, float]:
     return MappingProxyType({"named": 0.6, "kick": 0.2, "monitor": 0.1, "reading": 0.1})
@@ -25,7 +22,6 @@ class Judgement:
         shares: how the kinds of findings share the false alarms: most for what has a name.
         mass: probability that a credible set is to hold.
         unknown: prior share of faults that the catalogue does not hold.
-        decades: amounts of a fault reach from its largest down by so many powers of ten, evenly.
         rivals: hypotheses that are refitted at a step; more change no case of challenge A.
         window, drift: log evidence below the linear scan's leader at which no hypothesis is
             refitted any more, and what of the statistic adds to it: the scan errs by a share of it.
@@ -33,7 +29,6 @@ class Judgement:
         nearly: a free kick has a parameter a shot, and so takes up some of what another cause does:
             where one with a name explains this share of it, names are tried first once more.
         spikes, spike: single readings left out at most; log probability of one being wrong once.
-        draws: of pure noise, for the threshold: its effective number is known to 12 %.
         same: a slope is good while amount and orbit change by no more than this share.
         silent: where more monitors than this have no signal, they are not there: no finding each.
         alien: a local misfit above this share of the orbit: the data are of another ring.
@@ -46,7 +41,6 @@ class Judgement:
     shares: Mapping[str, float] = field(default_factory=_shares)
     mass: float = 0.95
     unknown: float = 0.05
-    decades: float = 4.0
     rivals: int = 24
     window: float = 12.0
     drift: float = 0.03
@@ -54,7 +48,6 @@ class Judgement:
     nearly: float = 0.5
     spikes: int = 40
     spike: float = -16.0
-    draws: int = 64
     same: float = 0.02
     silent: float = 0.2
     alien: float = 0.35

@@ -380,27 +380,3 @@ class Predicted:
     def with_causes(self, causes: Sequence[Cause]) -> "Predicted":
         """The same with more causes, not linearised."""
         return Predicted(self.data, self.errors.with_causes(self.data, causes), self.bent)
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Readings that are used, whitened by their noise.
-
-    Attributes:
-        data: whose noise.
-        used: which of [column, monitor, 2].
-    """
-
-    data: ResponseData
-    used: Flags
-
-    @classmethod
-    def fitted(cls, data: ResponseData, split: Split, good: Flags) -> "Rows":
-        """All but those of held-out correctors, bad monitors, and those that judge the RF."""
-        used = np.isfinite(data.orbits) & good[None, :, None] & ~split.held[:, None, None]
-        used[-1] &= split.half[-1][:, None]
-        return cls(data, used)
-
-    def whitened(self, readings: Array) -> Array:
-        """[..., column, monitor, 2] in units of the noise, [..., row]."""
-        return np.asarray((readings / self.data.noise)[..., self.used])
