@@ -226,6 +226,8 @@ class Builder:
         return self._straight(element, [0.0, 0.0, 0.0, k3], wrong, False)(1.0)
 
     def _multipole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
+        if element.length > 0:  # a thick one, as AT's files have them
+            return self._straight(element, [0.0, element.k1, element.k2], wrong, False)(1.0)
         strengths = np.asarray(element.source.kn, dtype=float)
         if strengths[0]:
             raise LatticeError(f"AT cannot build '{element.name}', a thin multipole that bends")
