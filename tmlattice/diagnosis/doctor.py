@@ -20,9 +20,10 @@ from tmlattice.effects import Cause, expected_radiation
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
-from tmlattice.measurement.assume import ASSUMPTIONS, Data, assume, in_beam_order
-from tmlattice.observe.global_errors import Judge, Verdict, certain
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.observe.global_errors import Judge, Names, Verdict, certain
 from tmlattice.observe.noise import random_part
+from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
 from tmlattice.observe.sections import Found, Passes
 
 Array = NDArray[np.float64]
@@ -78,18 +79,19 @@ def check_data(
     return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
 
 
-_TOLD = ("energy", "copied monitors", "lost beam", "signs, units and order", "launches")
+_GLOBAL = "signs, units and order"
+_TOLD = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
 """Of what is noted, what the diagnosis does not find by itself."""
 
 
-def consulted(ring: Ring, data: Data, assumed: Sequence[str], radiation: bool = False) -> list[str]:
-    """What a diagnosis of these data, with what is assumed undone, has to say of them.
+def consulted(ring: Ring, data: Measurement | OrbitResponse, radiation: bool = False) -> list[str]:
+    """What a diagnosis of these data has to say of them.
 
     Raises:
         MeasurementError: something has to be mended first.
         UnknownNameError: see `check_data`.
     """
-    checkup = check_data(ring, data, assumed=assumed, radiation=radiation)
+    checkup = check_data(ring, data, radiation=radiation)
     checkup.stop()
     return [check.sentence for check in checkup.told if check.name in _TOLD]
 
@@ -154,28 +156,21 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
 def _global(verdicts: Sequence[Verdict]) -> list[Check]:
     """One sentence for each global error."""
     if not verdicts:
-        return [fine("signs, units and order", "no global error would make the data agree better")]
+        return [fine(_GLOBAL, "no global error would make the data agree better")]
     return [_sentence(verdict) for verdict in verdicts]
 
 
 def _sentence(verdict: Verdict) -> Check:
-    words = " and ".join(ASSUMPTIONS[n].words for n in verdict.names)
-    mend = ", ".join(ASSUMPTIONS[n].mend for n in verdict.names)
+    words, others, mend = _words(verdict.names, verdict.alike)
     where, before, after = "", verdict.before[0], verdict.after[0]
     if not before > 2 * after:  # the sections agree either way: the launches tell
         where, before, after = " of the launches", verdict.before[1], verdict.after[1]
     if not np.isfinite(before):
         where, before, after = "", verdict.before[0], verdict.after[0]
-    others = "; ".join(
-        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)} ({_options(own)})"
-        for own in verdict.alike
-    )
     sure = certain(verdict)
     said = (
-        f"{words if sure else f'it may be that {words}'}"
-        f"{f' ({others})' if others else ''}: chi-square per reading{where} {_number(before)} as "
-        f"stated, {_number(after)} with that undone; {mend}, or go on with "
-        f"{_options(verdict.names)}"
+        f"{words if sure else f'it may be that {words}'}{others}: chi-square per reading{where} "
+        f"{_number(before)} as stated, {_number(after)} with that undone; {mend}"
     )
     make = wrong if sure else note
     return make("signs, units and order", said, before=before, after=after, assume=verdict.names)
@@ -238,10 +233,9 @@ def _launches(judge: Judge) -> Check:
 
 def _noise(judge: Judge, passes: Passes, found: Found) -> Check:
     """The stated noise against what neighbouring monitors leave."""
-    there = found.freedom > 0
-    if not there.any():
+    level = float(np.sqrt(found.level))
+    if not np.isfinite(level):
         return fine("noise", "too few monitors to judge the noise")
-    level = float(np.sqrt(np.median(found.misfit[there])))
     typical = float(np.median(passes.sigma))
     if judge.measurement.noise is None:
         return fine("noise", f"none is stated; the readings leave {_micro(level * typical)}")
@@ -276,7 +270,7 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
     there = found.freedom > 2
     if len(found.misfit) < 3 or not there.any():
         return none
-    square = float(np.median(found.misfit[there]))
+    square = found.level
     usual = np.median(found.misfit, axis=0) < SPOILT * square  # [section]
     odd = there & (found.misfit > SPOILT * square) & usual
     told = []
@@ -295,4 +289,39 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
 
 # --- an orbit response ----------------------------------------------------------------------------
 def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
-    return signals.monitors(data.monitors, data.response)
+    checks = signals.monitors(data.monitors, data.response)
+    judge = ResponseJudge(ring, data)
+    verdicts = judge.verdicts()
+    for verdict in verdicts:
+        judge = judge.mended(verdict.names)
+    left = judge.misfit(())
+    typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
+    if typical > ANOTHER:  # no wrong sign, unit or order mends that
+        return [*checks, wrong(
+            "lattice",
+            f"the response is not that of '{ring.name}': the typical column differs from the "
+            f"design's by {100 * np.sqrt(typical):.0f} % of its size; name the lattice of this "
+            "machine, and check the names and the order of monitors and correctors",
+        )]  # fmt: skip
+    if not verdicts:
+        checks.append(fine(_GLOBAL, "no global error would make the response agree better"))
+    for verdict in verdicts:
+        words, others, mend = _words(verdict.names, verdict.alike)
+        before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
+        said = (
+            f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
+            f"stated, by {after:.0f} % with that undone; {mend}"
+        )
+        checks.append(wrong(_GLOBAL, said, assume=verdict.names))
+    said = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
+    return [*checks, fine("lattice", said)]
+
+
+def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
+    """What is wrong, what else it might be, and the mend."""
+    words = " and ".join(ASSUMPTIONS[n].words for n in names)
+    others = "; ".join(
+        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}" for own in alike
+    )
+    mends = ", ".join(dict.fromkeys(ASSUMPTIONS[n].mend for n in names))
+    return words, f" ({others})" if others else "", f"{mends}, or go on with {_options(names)}"

@@ -94,9 +94,9 @@ def diagnose(
     }
     judgement = Judgement(false_alarm=false_alarm)
     progress("data")
-    said = consulted(ring, measurement, assume, radiation)
     measurement = mended(ring, measurement, assume)
     reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
+    said = consulted(ring, measurement, radiation)
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:

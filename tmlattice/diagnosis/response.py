@@ -80,8 +80,9 @@ def diagnose_response(
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
-    said, measured = consulted(ring, measured, assume), mended(ring, measured, assume)
+    measured = mended(ring, measured, assume)
     trials, data = _trials(effects), response_data(ring, measured)
+    said = consulted(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)

@@ -208,6 +208,15 @@ def _kicks(data: OrbitResponse, x: float, y: float) -> OrbitResponse:
     return replace(data, kicks=data.kicks * factor)
 
 
+def _columns_shifted(data: OrbitResponse, by: int) -> OrbitResponse:
+    """The columns of each plane, in their order, belong to the corrector `by` places on."""
+    order = np.arange(len(data.planes))
+    for plane in ("x", "y"):
+        own = np.flatnonzero(np.array(data.planes) == plane)
+        order[own] = np.roll(own, -by)
+    return replace(data, response=data.response[order])
+
+
 def _rf(data: OrbitResponse, factor: float) -> OrbitResponse:
     if data.rf is None:
         raise MeasurementError("there is no RF step of which anything could be assumed")
@@ -255,6 +264,12 @@ ASSUMPTIONS: dict[str, Assumption] = {
     "readings-in-um": _both("the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
     "readings-in-km": _both(
         "the readings are a thousand times too small", UNIT.format("them", "m"), _unit, 1e3
+    ),
+    "readings-doubled": _both(
+        "the readings are twice what they should be", "halve them", _unit, 0.5
+    ),
+    "readings-halved": _both(
+        "the readings are half of what they should be", "double them", _unit, 2.0
     ),
     **_shifts(),
     "monitors-backwards": _both(
@@ -358,6 +373,14 @@ ASSUMPTIONS: dict[str, Assumption] = {
     "kicks-halved": _columns(
         "the kicks are twice those that were made", "give the step that the orbit change belongs "
         "to", _kicks, 0.5, 0.5,
+    ),
+    "correctors-shifted=1": _columns(
+        "the columns of each plane stand one corrector too late", "give each its own corrector's "
+        "name", _columns_shifted, 1,
+    ),
+    "correctors-shifted=-1": _columns(
+        "the columns of each plane stand one corrector too early", "give each its own corrector's "
+        "name", _columns_shifted, -1,
     ),
     "rf-reversed": _columns(
         "the RF's step has the wrong sign", SIGN.format("step_hz"), _rf, -1

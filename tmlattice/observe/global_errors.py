@@ -59,6 +59,7 @@ class Terms:
         launch: mean squares of launches, each plane's own, in units of noise and stated rms, by
             the scale of the noise: see `Judge`.
         noise: log of what the stated noise differs by, or 0 where it is not stated.
+        level: of the sections: see `Found`.
         unit: chi-square per reading of a mean square of 1: of the noise as it is stated, or where
             it is not, as the best assumption leaves it.
     """
@@ -68,6 +69,7 @@ class Terms:
     freedom: NDArray[np.int64]
     launch: Array
     noise: float
+    level: float
     unit: float
 
     def cost(self, square: float) -> Array:
@@ -189,6 +191,7 @@ class Judge:
             found.freedom.ravel(),
             launch,
             noise,
+            found.level,
             unit,
         )
 
@@ -275,13 +278,9 @@ class Judge:
     def square(self, several: Iterable[Names]) -> float:
         """Square of the readings' noise in units of the stated one: what the best of several
         assumptions leaves."""
-        levels = []
-        for names in several:
-            _, found = self.found(assume(self.measurement, names, self.monitors))
-            there = found.freedom > 0
-            if there.any():
-                levels.append(float(np.median(found.misfit[there])))
-        return max(min(levels), 1e-12) if levels else 1.0
+        data = (assume(self.measurement, names, self.monitors) for names in several)
+        levels = [self.found(own)[1].level for own in data]
+        return max(float(np.nanmin(levels)), 1e-12) if np.isfinite(levels).any() else 1.0
 
     def verdict(self) -> Verdict | None:
         """The assumption that makes the data far better, if there is one; two together where that
@@ -353,9 +352,9 @@ def _widely(stated: Terms, other: Terms, square: float) -> bool:
 
 def _levels(terms: Terms) -> tuple[float, float]:
     """Chi-square per reading: of the sections, of the launches; medians."""
-    there = terms.freedom > 0
-    local = terms.unit * float(np.median(terms.local[there])) if there.any() else float("nan")
-    return local, float(np.median(terms.launch)) if len(terms.launch) else float("nan")
+    return terms.unit * terms.level, float(np.median(terms.launch)) if len(terms.launch) else float(
+        "nan"
+    )
 
 
 def _part(data: Measurement) -> Measurement:

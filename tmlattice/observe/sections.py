@@ -130,6 +130,16 @@ class Found:
     end: Array
     carried: Array
 
+    @property
+    def level(self) -> float:
+        """Mean square of the noise in units of the stated one, as most sections have it; NaN where
+        none can tell."""
+        there = self.freedom > 0
+        if not there.any():
+            return float("nan")
+        usual = (1 - 2 / (9 * self.freedom[there])) ** 3  # median of chi-square over its freedom
+        return float(np.median(self.misfit[there] / usual))
+
     def joints(self) -> Array:
         """Chi-square over its freedom of four of where one section ends and the next begins,
         [pass, section - 1]."""
