@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
-from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
@@ -30,8 +29,9 @@ Array = NDArray[np.float64]
 
 ENERGY = 0.02
 """Share by which a stated beam energy may differ from the lattice's."""
-ALIEN = DEFAULT.alien
-"""Share of the orbit that no trajectory of a section explains: the data are of another ring."""
+ALIEN = 0.85
+"""Share of the orbit that no trajectory of a section explains, of which noise or readings in no
+order leave all and strong errors everywhere 0.7: the data are of another ring."""
 FAR = 25.0
 """Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
 EXACT = 0.01
@@ -186,27 +186,18 @@ def _number(value: float) -> str:
 
 def _lattice(ring: Ring, judge: Judge, passes: Passes, found: Found) -> Check:
     """Whether the readings follow trajectories of this ring at all."""
-    owner = np.maximum(found.owner, 0)
-    plane = np.arange(owner.shape[1]) % 2
-    sigma = passes.sigma[owner, plane]
-    read = np.where(found.there, passes.readings[:, owner, plane], 0.0)
-    enough = found.freedom > 3
-    if enough.sum() < 3:
+    share = found.share(passes)
+    if not np.isfinite(share):
         return fine("lattice", "too few monitors to say whether this is the machine's lattice")
-    freedom = np.maximum(found.freedom, 1)
-    left = np.sqrt(((found.left * sigma) ** 2).sum(axis=2) / freedom)
-    orbit = np.sqrt((read**2).sum(axis=2) / np.maximum(found.there.sum(axis=2), 1))
-    share = float(np.median((left / np.maximum(orbit, 1e-30))[enough]))
-    size, noise = float(np.median(left[enough])), float(np.median(passes.sigma))
     stated = judge.measurement.noise is not None
-    if share > ALIEN and not (stated and size < 2 * noise):
+    if share > ALIEN and not (stated and found.level < 4):
         return wrong(
             "lattice",
             f"the readings follow no trajectory of '{ring.name}': {100 * share:.0f} % of the orbit "
-            f"({1e6 * size:.0f} µm) is left even between neighbouring monitors; name the lattice "
-            "of this machine, and check the names and the order of the monitors",
-            before=float(np.median(found.misfit[enough])),
-        )  # fmt: skip
+            "is left even between neighbouring monitors; name the lattice of this machine, and "
+            "check the names and the order of the monitors",
+            before=found.level if stated else None,
+        )
     return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
 
 

@@ -7,6 +7,7 @@ undoes it. The data doctor tries them all; a user goes on with those that he has
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -53,6 +54,9 @@ def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Da
         UnknownNameError: no such assumption, or a monitor that the ring does not have.
         MeasurementError: one without meaning for these data.
     """
+    names = list(names)
+    if names:
+        data = in_beam_order(data, ring_monitors)
     for name in names:
         known = ASSUMPTIONS.get(name)
         if known is None:
@@ -61,7 +65,7 @@ def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Da
         if own is None:
             kind = "first turns" if isinstance(data, Measurement) else "an orbit response"
             raise MeasurementError(f"the assumption '{name}' has no meaning for {kind}")
-        data = own(in_beam_order(data, ring_monitors))  # type: ignore[arg-type]
+        data = own(data)  # type: ignore[arg-type]
     return data
 
 
@@ -71,6 +75,8 @@ def in_beam_order(data: Data, ring_monitors: Sequence[str]) -> Data:
     Raises:
         UnknownNameError: a monitor that the ring does not have.
     """
+    if data.monitors == tuple(ring_monitors):
+        return data
     names = Names("monitor", ring_monitors)
     at = [names[name] for name in data.monitors]
     if at == sorted(at):
@@ -79,6 +85,15 @@ def in_beam_order(data: Data, ring_monitors: Sequence[str]) -> Data:
 
 
 # --- readings -------------------------------------------------------------------------------------
+def _with(data: Data, **values: Any) -> Data:
+    """`replace` without its checks, which cost more than a fit: these values can be, as the
+    old ones could."""
+    made = copy(data)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
 SAME_UNIT = 1e-3
 """Noise of this share of the readings, or an rms of this share of the launches, is written in their
 unit; a smaller one is in m already."""
@@ -95,11 +110,11 @@ def _of_unit(size: Array, of: Array, factor: Array | float) -> Array:
 def _read(data: Data, change: Callable[[Array], Array]) -> Data:
     """With a change of everything that was read, [..., monitor, 2]."""
     if isinstance(data, Measurement):
-        return replace(data, readings=change(data.readings))
+        return _with(data, readings=change(data.readings))
     rf = data.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=change(rf.orbit))
-    return replace(data, response=change(data.response), rf=rf)
+    return _with(data, response=change(data.response), rf=rf)
 
 
 def _values(data: Measurement | OrbitResponse) -> Array:
@@ -114,19 +129,19 @@ def _unit(data: Data, factor: float) -> Data:
     scaled = _read(data, lambda values: values * factor)
     if data.noise is None:
         return scaled
-    return replace(scaled, noise=_of_unit(data.noise, _values(data), factor))
+    return _with(scaled, noise=_of_unit(data.noise, _values(data), factor))
 
 
 def _exchanged(data: Data) -> Data:
     noise = None if data.noise is None else data.noise[:, ::-1]
-    return replace(_read(data, lambda values: values[..., ::-1]), noise=noise)
+    return _with(_read(data, lambda values: values[..., ::-1]), noise=noise)
 
 
 def _reordered(data: Data, order: Callable[[Sequence[str]], Order]) -> Data:
     """The readings of the monitor i are those that stand at order[i]."""
     at = order(data.monitors)
     noise = None if data.noise is None else data.noise[at]
-    return replace(_read(data, lambda values: values[..., at, :]), noise=noise)
+    return _with(_read(data, lambda values: values[..., at, :]), noise=noise)
 
 
 def _shift(monitors: Sequence[str], by: int) -> Order:
@@ -147,7 +162,7 @@ def _alphabet(monitors: Sequence[str]) -> Order:
 
 
 def _no_noise(data: Measurement) -> Measurement:
-    return replace(data, noise=None)
+    return _with(data, noise=None)
 
 
 # --- launches, settings, turns --------------------------------------------------------------------
@@ -159,19 +174,19 @@ def _launches(data: Measurement, *factor: float) -> Measurement:
         sigma = sigma.copy()
         for i in np.flatnonzero(np.abs(scale) != 1):
             sigma[:, i] = _of_unit(sigma[:, i], data.launches[:, i], abs(scale[i]))
-    return replace(data, launches=data.launches * scale, launch_sigma=sigma)
+    return _with(data, launches=data.launches * scale, launch_sigma=sigma)
 
 
 def _launches_exchanged(data: Measurement) -> Measurement:
     order = [2, 3, 0, 1, 4]
     sigma = None if data.launch_sigma is None else data.launch_sigma[:, order]
-    return replace(data, launches=data.launches[:, order], launch_sigma=sigma)
+    return _with(data, launches=data.launches[:, order], launch_sigma=sigma)
 
 
 def _no_launches(data: Measurement) -> Measurement:
     sigma = np.full(data.launches.shape, np.inf)
     sigma[:, 4] = 0.0 if data.launch_sigma is None else data.launch_sigma[:, 4]
-    return replace(data, launch_sigma=sigma)
+    return _with(data, launch_sigma=sigma)
 
 
 def _kicks_set(data: Measurement, factor: float) -> Measurement:
@@ -183,7 +198,7 @@ def _kicks_set(data: Measurement, factor: float) -> Measurement:
         }
         for shot in data.settings
     )
-    return replace(data, settings=changed)
+    return _with(data, settings=changed)
 
 
 def _earlier(data: Measurement) -> Measurement:
@@ -193,19 +208,19 @@ def _earlier(data: Measurement) -> Measurement:
             "turns are said to count from 1, but there are readings of turn 0, or of no other; "
             "leave 'turns-from-1' out"
         )
-    return replace(data, readings=data.readings[:, 1:])
+    return _with(data, readings=data.readings[:, 1:])
 
 
 def _backwards(data: Measurement) -> Measurement:
     """The last turn first, and the launch free: what was the launch is where the beam ends."""
-    free = _no_launches(replace(data, launches=data.launches * [0, 0, 0, 0, 1]))
-    return replace(free, readings=data.readings[:, ::-1])
+    free = _no_launches(_with(data, launches=data.launches * [0, 0, 0, 0, 1]))
+    return _with(free, readings=data.readings[:, ::-1])
 
 
 # --- an orbit response ----------------------------------------------------------------------------
 def _kicks(data: OrbitResponse, x: float, y: float) -> OrbitResponse:
     factor = np.array([x if plane == "x" else y for plane in data.planes])
-    return replace(data, kicks=data.kicks * factor)
+    return _with(data, kicks=data.kicks * factor)
 
 
 def _columns_shifted(data: OrbitResponse, by: int) -> OrbitResponse:
@@ -214,13 +229,13 @@ def _columns_shifted(data: OrbitResponse, by: int) -> OrbitResponse:
     for plane in ("x", "y"):
         own = np.flatnonzero(np.array(data.planes) == plane)
         order[own] = np.roll(own, -by)
-    return replace(data, response=data.response[order])
+    return _with(data, response=data.response[order])
 
 
 def _rf(data: OrbitResponse, factor: float) -> OrbitResponse:
     if data.rf is None:
         raise MeasurementError("there is no RF step of which anything could be assumed")
-    return replace(data, rf=replace(data.rf, step=data.rf.step * factor))
+    return _with(data, rf=replace(data.rf, step=data.rf.step * factor))
 
 
 # --- the list -------------------------------------------------------------------------------------

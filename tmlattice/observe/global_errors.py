@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
@@ -37,8 +37,12 @@ NOISE_WIDTH = np.log(3.0)
 GAIN, CERTAIN = 9.0, 15.0
 """Log evidence from which a global error is told, and from which it is certain: no healthy
 measurement of `benchmarks/doctor.py` gains as much."""
-SHARE = 0.8
-"""Of the terms that it changes, how many it has to change for the better."""
+SHARE = 0.65
+"""Of all that it changes, how much it has to change for the better: a fault's section may win much
+by chance, but then many others lose."""
+CLEAR, FINE = 3.0, 0.1
+"""Factor by which sections or launches agree better with what was wrong undone; and the share of
+the orbit that the sections leave from which they agree anyhow, where curvature alone may tell."""
 ALIKE = 3.0
 """Log evidence below which two assumptions explain the data alike."""
 _LAST = ("noise-from-data", "launches-unknown")  # of these others decide
@@ -59,7 +63,7 @@ class Terms:
         launch: mean squares of launches, each plane's own, in units of noise and stated rms, by
             the scale of the noise: see `Judge`.
         noise: log of what the stated noise differs by, or 0 where it is not stated.
-        level: of the sections: see `Found`.
+        level, share: of the sections: see `Found`.
         unit: chi-square per reading of a mean square of 1: of the noise as it is stated, or where
             it is not, as the best assumption leaves it.
     """
@@ -70,6 +74,7 @@ class Terms:
     launch: Array
     noise: float
     level: float
+    share: float
     unit: float
 
     def cost(self, square: float) -> Array:
@@ -118,23 +123,38 @@ class Judge:
     ring: Ring
     measurement: Measurement
     known: Sequence[Cause] = ()
-    _sections: dict[object, Sections] = field(default_factory=dict, repr=False)
+    _sections: dict[float, Sections] = field(default_factory=dict, repr=False)
     _found: dict[object, tuple[object, Passes, Found]] = field(default_factory=dict, repr=False)
+    _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self.monitors = [monitor.name for monitor in self.ring.monitors]
         self.measurement = _part(in_beam_order(self.measurement, self.monitors))
         self.scale = _size(self.measurement)
+        self.kicks = _kicks(self.measurement.settings)
+
+    def assumed(self, names: Names) -> Measurement:
+        """The data with what is assumed undone."""
+        if names not in self._made:
+            self._made[names] = assume(self.measurement, names, self.monitors)
+        return self._made[names]
 
     # --- one assumption -------------------------------------------------------------------------
     def found(self, data: Measurement) -> tuple[Passes, Found]:
         """The trajectories of the sections of a measurement."""
-        key = (id(data.readings), id(data.settings) if data.settings else 0)
+        factor = self._times(data)
+        key = (id(data.readings), factor)
         if key not in self._found:
-            self._found[key] = (data, *self._fit(data))  # the data stay: so does their id
+            self._found[key] = (data, *self._fit(data, factor))  # the data stay: so does their id
         return self._found[key][1:]
 
-    def _fit(self, data: Measurement) -> tuple[Passes, Found]:
+    def _times(self, data: Measurement) -> float:
+        """By what the kicks of the shots are multiplied."""
+        if data.settings is self.measurement.settings or not self.kicks.any():
+            return 1.0
+        return float(_kicks(data.settings) @ self.kicks / (self.kicks @ self.kicks))
+
+    def _fit(self, data: Measurement, times: float) -> tuple[Passes, Found]:
         shots, turns = data.readings.shape[:2]
         readings = data.readings.reshape(shots * turns, -1, 2)
         read = np.isfinite(readings).any(axis=(1, 2))
@@ -144,16 +164,22 @@ class Judge:
             own = self._noise(data)
             noise = np.where(np.isfinite(own), own, np.nanmedian(own))
         factor = _size(data) / self.scale if self.scale > 0 else 1.0
-        passes = Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn)
-        key = repr(data.settings)
-        if key not in self._sections:
+        sigma = data.launch_sigma
+        alone = sigma is not None and bool(sigma[:, 4].any())
+        passes = Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn, alone)
+        return passes, self._section(times).fit(passes)
+
+    def _section(self, times: float) -> Sections:
+        """The sections, the shots' kicks multiplied."""
+        if 1.0 not in self._sections:
             at = {name.casefold(): i for i, name in enumerate(self.monitors)}
-            places = [self.ring[name].name.casefold() for name in data.monitors]
-            settings = data.settings or tuple({} for _ in range(shots))
-            self._sections[key] = Sections(
-                self.ring, settings, np.array([at[p] for p in places]), self.known
-            )
-        return passes, self._sections[key].fit(passes)
+            data = self.measurement
+            places = np.array([at[self.ring[name].name.casefold()] for name in data.monitors])
+            settings = data.settings or tuple({} for _ in data.launches)
+            self._sections[1.0] = Sections(self.ring, settings, places, self.known)
+        if times not in self._sections:
+            self._sections[times] = self._sections[1.0].with_kicks(times)
+        return self._sections[times]
 
     def _noise(self, data: Measurement) -> Array:
         """As it was stated, monitor by monitor in the order in which the data stand now."""
@@ -170,7 +196,7 @@ class Judge:
             names: what is assumed, together; () for the data as stated.
             square: of the readings' noise, in units of the stated one.
         """
-        data = assume(self.measurement, names, self.monitors)
+        data = self.assumed(names)
         passes, found = self.found(data)
         joints = [found.joints().ravel()]
         follows = np.flatnonzero((np.diff(passes.shot) == 0) & (np.diff(passes.turn) == 1))
@@ -192,6 +218,7 @@ class Judge:
             launch,
             noise,
             found.level,
+            found.share(passes),
             unit,
         )
 
@@ -241,7 +268,7 @@ class Judge:
         self, data: Measurement, passes: Passes, first: NDArray[np.intp]
     ) -> tuple[Array, Array]:
         """Launches carried to the first turn that was read."""
-        sections = self._sections[repr(data.settings)]
+        sections = self._section(self._times(data))
         stated, slopes = np.zeros((len(first), 5)), np.zeros((len(first), 4, 4))
         for i, one in enumerate(first):
             shot = passes.shot[one : one + 1]
@@ -270,7 +297,7 @@ class Judge:
 
     def _possible(self, names: Names) -> bool:
         try:
-            assume(self.measurement, names, self.monitors)
+            self.assumed(names)
         except MeasurementError:
             return False
         return True
@@ -278,8 +305,7 @@ class Judge:
     def square(self, several: Iterable[Names]) -> float:
         """Square of the readings' noise in units of the stated one: what the best of several
         assumptions leaves."""
-        data = (assume(self.measurement, names, self.monitors) for names in several)
-        levels = [self.found(own)[1].level for own in data]
+        levels = [self.found(self.assumed(names))[1].level for names in several]
         return max(float(np.nanmin(levels)), 1e-12) if np.isfinite(levels).any() else 1.0
 
     def verdict(self) -> Verdict | None:
@@ -327,7 +353,9 @@ class Judge:
 
     def mended(self, names: Names) -> "Judge":
         """The same with what is assumed undone."""
-        return Judge(self.ring, assume(self.measurement, names, self.monitors), self.known)
+        data = self.assumed(names)
+        sections = {1.0: self._section(self._times(data))}
+        return Judge(self.ring, data, self.known, sections)
 
 
 def certain(verdict: Verdict) -> bool:
@@ -345,9 +373,13 @@ def _widely(stated: Terms, other: Terms, square: float) -> bool:
     a, b = stated.cost(square), other.cost(square)
     if len(a) != len(b):
         return True
-    change = b - a
-    moved = np.abs(change) > 0.2
-    return bool((change[moved] < 0).mean() >= SHARE) if moved.any() else False
+    local, launch = (
+        b / max(a, 1e-12) for a, b in zip(_levels(other), _levels(stated), strict=True)
+    )
+    if not (local > CLEAR or launch > CLEAR or stated.share < FINE):
+        return False  # what was wrong stays wrong
+    better, worse = np.maximum(a - b, 0).sum(), np.maximum(b - a, 0).sum()
+    return bool(better > SHARE * (better + worse))
 
 
 def _levels(terms: Terms) -> tuple[float, float]:
@@ -355,6 +387,13 @@ def _levels(terms: Terms) -> tuple[float, float]:
     return terms.unit * terms.level, float(np.median(terms.launch)) if len(terms.launch) else float(
         "nan"
     )
+
+
+def _kicks(settings: Sequence[Settings]) -> Array:
+    """All that were set, in their order."""
+    return np.array([
+        own["kick"] for shot in settings for own in shot.values() if "kick" in own
+    ])  # fmt: skip
 
 
 def _part(data: Measurement) -> Measurement:

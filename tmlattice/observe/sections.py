@@ -12,6 +12,7 @@ that is lost is far below any noise.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
 from tmlattice.lattice import Ring
@@ -30,8 +32,12 @@ Places = NDArray[np.intp]
 _KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates; a pass without RF does not ask for tau
 WEAK = 1e-8
 """Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
-STEPS = 4
+STEPS = 6
 """Of Newton's method: the maps are nearly linear."""
+SETTLED = 1e-2
+"""Change of the typical reading, in units of its noise, behind which there is no further step."""
+ENERGY = 5e-3
+"""Relative; rms of the energy deviations that a pass may have, in all its sections."""
 MOST = 8
 """Monitors of a section; four coordinates leave three quarters of their readings to judge."""
 
@@ -84,6 +90,10 @@ def _five(weights: Sequence[Array]) -> Maps:
     return Maps(W0, W1[..., _KEPT], T[..., _KEPT, :][..., _KEPT])
 
 
+def _stacked(several: Sequence[Maps]) -> Maps:
+    return Maps(*(np.stack([getattr(own, c) for own in several]) for c in ("c0", "c1", "c2")))
+
+
 @dataclass(frozen=True)
 class Passes:
     """What was read, pass by pass: a turn of a shot each.
@@ -91,8 +101,9 @@ class Passes:
     Attributes:
         readings: [pass, monitor, 2], m; NaN where nothing was read.
         sigma: noise of a reading, m, [monitor, 2].
-        delta: relative energy deviation, [pass].
+        delta: relative energy deviation, [pass]; it is fitted, and this is where it starts.
         shot, turn: of each, [pass].
+        alone: whether each has an energy of its own; else all have what the first guess lacks.
     """
 
     readings: Array
@@ -100,6 +111,7 @@ class Passes:
     delta: Array
     shot: Places
     turn: Places
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,6 +126,7 @@ class Found:
         free: share of its noise that the trajectory does not take up, [pass, section, reading].
         freedom: [pass, section].
         misfit: chi-square over the freedom, [pass, section].
+        delta: relative energy deviation, [pass].
         start: trajectories at the sections' starts, [pass, section, 4].
         covariance: of these, [pass, section, 4, 4].
         end, carried: the trajectories and covariances at the sections' ends.
@@ -125,6 +138,7 @@ class Found:
     free: Array
     freedom: NDArray[np.int64]
     misfit: Array
+    delta: Array
     start: Array
     covariance: Array
     end: Array
@@ -139,6 +153,19 @@ class Found:
             return float("nan")
         usual = (1 - 2 / (9 * self.freedom[there])) ** 3  # median of chi-square over its freedom
         return float(np.median(self.misfit[there] / usual))
+
+    def share(self, passes: Passes) -> float:
+        """What the typical trajectory leaves of its readings: 1 where the readings follow none."""
+        owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
+        read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
+        left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
+        enough = self.freedom > 3
+        if enough.sum() < 3:
+            return float("nan")
+        count = self.there.sum(axis=2)[enough]
+        whole = (read**2).sum(axis=2)[enough] / count
+        part = (left**2).sum(axis=2)[enough] / self.freedom[enough]
+        return float(np.median(np.sqrt(part / np.maximum(whole, 1e-60))))
 
     def joints(self) -> Array:
         """Chi-square over its freedom of four of where one section ends and the next begins,
@@ -181,8 +208,9 @@ class Sections:
         for group in model.groups:
             self.group[group.shots] = group.number
         layers = [group.layers for group in model.groups]
-        self._steps = [_five(own.W) for own in layers]
-        self._reads = [_five(own.R)[monitors] for own in layers]
+        self._steps = _stacked([_five(own.W) for own in layers])
+        self._reads = _stacked([_five(own.R)[monitors] for own in layers])
+        self._design = _five(Layers.of(model.maps).W)
         exits = layers[0].at[monitors]
         size = int(np.clip(len(monitors) // 12, 4, MOST))
         count = max(len(monitors) // size, 1)
@@ -191,15 +219,25 @@ class Sections:
         self._bounds = list(zip(starts, [*starts[1:], layers[0].steps], strict=True))
         self._exits = exits
 
+    def with_kicks(self, factor: float) -> "Sections":
+        """The same with what the settings change multiplied: maps are linear in kicks."""
+        made = copy(self)
+        made.__dict__.pop("_made", None)
+        made._steps = Maps(*(
+            getattr(self._design, c)
+            + factor * (getattr(self._steps, c) - getattr(self._design, c))
+            for c in ("c0", "c1", "c2")
+        ))  # fmt: skip
+        return made
+
     @cached_property
     def _made(self) -> tuple[Maps, Maps]:
         """From the start of each section to its monitors [group, monitor], and to its end [group,
         section]: all sections side by side, step by step."""
-        groups, count = len(self._steps), len(self._bounds)
+        groups, count = len(self._steps.c0), len(self._bounds)
         first = np.array([start for start, _ in self._bounds])
         length = np.array([end - start for start, end in self._bounds])
-        steps = Maps(*(np.stack([getattr(s, c) for s in self._steps]) for c in ("c0", "c1", "c2")))
-        reads = Maps(*(np.stack([getattr(r, c) for r in self._reads]) for c in ("c0", "c1", "c2")))
+        steps, reads = self._steps, self._reads
         way = Maps(
             np.zeros((groups, count, 5)),
             np.tile(np.eye(5), (groups, count, 1, 1)),
@@ -227,29 +265,37 @@ class Sections:
         group = self.group[passes.shot]
         width = max(len(own) for own in self._members)
         owner = np.full((len(self._members), width), -1, dtype=np.int64)
-        for w, own in enumerate(self._members):
-            owner[w, : len(own)] = own
+        for w, members in enumerate(self._members):
+            owner[w, : len(members)] = members
         padded = owner >= 0
         P, W = len(passes.readings), len(owner)
         maps = seen[group[:, None, None], np.where(padded, owner, 0)]
         data = passes.readings[:, owner]
         there = np.isfinite(data) & padded[None, :, :, None]
         sigma = np.where(there, passes.sigma[owner], np.inf)
+        freedom = np.maximum(np.asarray(there.sum(axis=(2, 3)), dtype=np.int64) - 4, 0)
         x = np.zeros((P, W, 5))
         x[..., 4] = passes.delta[:, None]
+        moved = np.inf
         with np.errstate(all="ignore"):
-            for step in range(STEPS + 1):
+            for step in range(STEPS):
                 image, slope = maps(x[:, :, None])
                 left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
                 A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
                 curvature = _held(np.swapaxes(A, -1, -2) @ A)
-                if step == STEPS:
+                if step == STEPS - 1 or not moved > SETTLED:
                     break
-                asked = np.swapaxes(A, -1, -2) @ left[..., None]
-                x[..., :4] += np.nan_to_num(np.linalg.solve(curvature, asked)[..., 0])
-                x[..., :4] = np.clip(x[..., :4], -1e6, 1e6)
-        freedom = np.maximum(there.sum(axis=(2, 3)) - 4, 0)
-        square = np.nan_to_num((left**2).sum(axis=2), nan=1e30, posinf=1e30)
+                own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
+                back = np.linalg.solve(curvature, np.swapaxes(A, -1, -2))
+                step_4 = (back @ left[..., None])[..., 0]
+                fitted = (A @ step_4[..., None])[..., 0]
+                moved, clean = float(np.nanmedian(np.abs(fitted))), left - fitted
+                alone = own - (A @ (back @ own[..., None]))[..., 0]
+                change = _shared(clean, alone, freedom, passes.delta - x[:, 0, 4], passes.alone)
+                step_4 = step_4 - (back @ own[..., None])[..., 0] * change[:, None, None]
+                x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
+                x[..., 4] += change[:, None]
+        whole: Array = np.nan_to_num((left**2).sum(axis=2), nan=1e30, posinf=1e30)
         covariance = np.asarray(np.linalg.inv(curvature), dtype=float)
         end, slope = way[group[:, None], np.arange(W)](x)
         J = slope[..., :4, :4]
@@ -259,7 +305,8 @@ class Sections:
             there=there.reshape(P, W, -1),
             free=1 - np.einsum("pwri,pwij,pwrj->pwr", A, covariance, A),
             freedom=freedom,
-            misfit=square / np.maximum(freedom, 1),
+            misfit=whole / np.maximum(freedom, 1),
+            delta=x[:, 0, 4],
             start=x[..., :4],
             covariance=covariance,
             end=end[..., :4],
@@ -276,6 +323,26 @@ class Sections:
                 x = np.concatenate([image[:, :4], x[:, 4:]], axis=1)
                 J = slope[:, :4, :4] @ J
         return x, J
+
+
+def _shared(
+    left: Array, slope: Array, freedom: NDArray[np.int64], prior: Array, alone: bool
+) -> Array:
+    """What all sections of a pass, or of all passes, say together of the energy, [pass].
+
+    Args:
+        left, slope: of the readings, cleaned of their own trajectories, [pass, section, reading].
+        freedom: [pass, section].
+        prior: where the energy is expected to be, [pass].
+        alone: see `Passes`.
+    """
+    misfit = (left**2).sum(axis=2) / np.maximum(freedom, 1)
+    judged = np.where(freedom > 0, misfit, np.nan)
+    level = np.nan_to_num(np.nanmedian(judged, axis=1), nan=1.0)[:, None] + 1e-12
+    weight = (freedom > 0) / np.maximum(misfit, level)  # a spoilt section says little
+    asked = np.nan_to_num((weight * (left * slope).sum(axis=2)).sum(axis=1)) + prior / ENERGY**2
+    told = np.nan_to_num((weight * (slope**2).sum(axis=2)).sum(axis=1)) + 1 / ENERGY**2
+    return asked / told if alone else np.full(len(left), asked.sum() / told.sum())
 
 
 def _held(curvature: Array) -> Array:
