@@ -136,7 +136,7 @@ def _stated(ring: Ring, data: Measurement | OrbitResponse) -> Check:
 # --- first turns ----------------------------------------------------------------------------------
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
     flat = data.readings.reshape(-1, len(data.monitors), 2)
-    checks = [*signals.monitors(data.monitors, flat), *signals.first_turns(ring, data)]
+    checks = [*signals.monitors(ring, data.monitors, flat), *signals.first_turns(ring, data)]
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
     judge = Judge(ring, data, known)
@@ -280,7 +280,7 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
 
 # --- an orbit response ----------------------------------------------------------------------------
 def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
-    checks = signals.monitors(data.monitors, data.response)
+    checks = signals.monitors(ring, data.monitors, data.response)
     judge = ResponseJudge(ring, data)
     verdicts = judge.verdicts()
     for verdict in verdicts:

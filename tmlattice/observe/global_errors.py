@@ -34,6 +34,8 @@ TRUSTED = 0.03
 the first section spoil it by as much."""
 NOISE_WIDTH = np.log(3.0)
 """A stated noise is right to a factor of three, one standard deviation."""
+ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
+"""m; first turns have an orbit of a millimetre, to a factor of ten, one standard deviation."""
 GAIN, CERTAIN = 9.0, 15.0
 """Log evidence from which a global error is told, and from which it is certain: no healthy
 measurement of `benchmarks/doctor.py` gains as much."""
@@ -48,7 +50,6 @@ ALIKE = 3.0
 _LAST = ("noise-from-data", "launches-unknown")  # of these others decide
 BEAM = 4
 """Assumptions, the best ones, that are tried together with every other."""
-_PAIRS: tuple[Names, ...] = (("x-reversed", "y-reversed"),)
 _TURNED = np.array([1.0, -1.0, 1.0, -1.0])
 
 
@@ -62,7 +63,8 @@ class Terms:
         freedom: of the sections' terms.
         launch: mean squares of launches, each plane's own, in units of noise and stated rms, by
             the scale of the noise: see `Judge`.
-        noise: log of what the stated noise differs by, or 0 where it is not stated.
+        stated: log of what the stated noise differs by, or 0 where it is not stated; log of the
+            orbit over a usual one; each in standard deviations.
         level, share: of the sections: see `Found`.
         unit: chi-square per reading of a mean square of 1: of the noise as it is stated, or where
             it is not, as the best assumption leaves it.
@@ -72,7 +74,7 @@ class Terms:
     joints: Array
     freedom: NDArray[np.int64]
     launch: Array
-    noise: float
+    stated: Array
     level: float
     share: float
     unit: float
@@ -83,7 +85,7 @@ class Terms:
             self.freedom / 2 * _robust(self.local / square),
             2 * _robust(self.joints / square),
             np.log(np.maximum(self.launch, 1.0)),  # their information differs
-            [(self.noise / NOISE_WIDTH) ** 2 / 2],
+            self.stated**2 / 2,
         ])  # fmt: skip
 
 
@@ -206,9 +208,10 @@ class Judge:
                 distance(miss, found.covariance[follows + 1, 0] + found.carried[follows, -1])
             )
         noise, unit = 0.0, 1 / square
+        orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
         if data.noise is not None:
             ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
-            noise, unit = float(np.log(ratio * np.sqrt(square))), ratio**2
+            noise, unit = float(np.log(ratio * np.sqrt(square))) / NOISE_WIDTH, ratio**2
         backwards = "beam-backwards" in names
         launch = self._launch(data, passes, found, square, backwards)
         return Terms(
@@ -216,7 +219,7 @@ class Judge:
             np.concatenate(joints),
             found.freedom.ravel(),
             launch,
-            noise,
+            np.array([noise, orbit]),
             found.level,
             found.share(passes),
             unit,
@@ -292,7 +295,6 @@ class Judge:
         if len(data.monitors) < 4:
             without += ["monitors"]
         found: list[Names] = [(n,) for n in names if n.split("-")[0] not in without]
-        found += _PAIRS
         return [own for own in found if self._possible(own)]
 
     def _possible(self, names: Names) -> bool:
@@ -364,8 +366,8 @@ def certain(verdict: Verdict) -> bool:
 
 
 def _worth(verdict: Verdict) -> float:
-    """Log evidence; each assumption beyond the first has to gain as much as the first."""
-    return verdict.gain - GAIN * (len(verdict.names) - 1)
+    """Log evidence; each assumption beyond the first has to be certain by itself."""
+    return verdict.gain - CERTAIN * (len(verdict.names) - 1)
 
 
 def _widely(stated: Terms, other: Terms, square: float) -> bool:

@@ -337,8 +337,9 @@ def _shared(
         alone: see `Passes`.
     """
     misfit = (left**2).sum(axis=2) / np.maximum(freedom, 1)
-    judged = np.where(freedom > 0, misfit, np.nan)
-    level = np.nan_to_num(np.nanmedian(judged, axis=1), nan=1.0)[:, None] + 1e-12
+    level = np.array([np.median(own[free > 0]) if free.any() else 1.0
+                      for own, free in zip(misfit, freedom, strict=True)])  # fmt: skip
+    level = np.nan_to_num(level, nan=1.0)[:, None] + 1e-12
     weight = (freedom > 0) / np.maximum(misfit, level)  # a spoilt section says little
     asked = np.nan_to_num((weight * (left * slope).sum(axis=2)).sum(axis=1)) + prior / ENERGY**2
     told = np.nan_to_num((weight * (slope**2).sum(axis=2)).sum(axis=1)) + 1 / ENERGY**2
