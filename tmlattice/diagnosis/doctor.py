@@ -32,7 +32,7 @@ ENERGY = 0.02
 ALIEN = 0.85
 """Share of the orbit that no trajectory of a section explains, of which noise or readings in no
 order leave all and strong errors everywhere 0.7: the data are of another ring."""
-FAR = 25.0
+FAR = 100.0
 """Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first monitors spoil them by."""
