@@ -39,7 +39,7 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     own = _trajectory_figures if diagnosis.kind == "trajectory" else response_figures
     yield from own(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
-        if len(finding.credible_set) > 1:
+        if len(finding.remedies) > 1:
             height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
             _, ax = plt.subplots(figsize=(9, height), layout="constrained")
             plot_credible_set(finding, ax)

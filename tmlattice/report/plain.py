@@ -32,7 +32,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         diagnosis: of `diagnose`.
         width: columns.
     """
-    lines = [*wrapped(f"{diagnosis.verdict.upper()}. {verdict_sentence(diagnosis)}", "", width)]
+    lines = [*wrapped(f"{diagnosis.verdict.upper()}: {verdict_sentence(diagnosis)}", "", width)]
     for number, finding in enumerate(diagnosis.findings, 1):
         lines += ["", *wrapped(title(finding), f"{number}. ", width)]
         for name, text in finding_rows(finding):
