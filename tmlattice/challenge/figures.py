@@ -73,11 +73,19 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["clean_gap_closed"] = _closed(clear)
     strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
     out["clean_gap_closed_above_20"] = _closed(strong)
+    out["one_remedy"] = _one_remedy(clear)
+    out["one_remedy_above_20"] = _one_remedy(strong)
     out["false_refusals"] = rate([row["refused"] for row in clear])
     out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
     out["relative_to_oracle"] = _relative(clear)
     out["classes"] = classes(rows)
     return out
+
+
+def _one_remedy(rows: Sequence[Row]) -> dict[str, Any]:
+    """Share of cases told as one named finding with the element and the remedy of the truth."""
+    told = [row.get("one_remedy") for row in rows]
+    return rate([flag for flag in told if flag is not None])
 
 
 def _exact(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.diagnosis.remedies import leading
 from tmlattice.effects import Cause, find
 from tmlattice.lattice import Ring
 
@@ -25,6 +26,7 @@ class Places:
     """Where elements, families and monitors stand."""
 
     def __init__(self, ring: Ring) -> None:
+        self.ring = ring
         self.monitors = sorted(monitor.s for monitor in ring.monitors)
         self.s: dict[str, list[float]] = {}
         for element in ring.elements:
@@ -102,6 +104,17 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
         "probability": finding.get("probability"),
         "pull": pull,
     }
+
+
+def one_remedy(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | None:
+    """Whether the answer is one finding, named, with the remedy that takes the true cause away;
+    None of a result from before there were remedies."""
+    if any("remedy" not in finding for finding in result["findings"]):
+        return None
+    if result["verdict"] != "named" or len(result["findings"]) != 1:
+        return False
+    told, true = result["findings"][0]["remedy"], leading(ring, cause)
+    return (told["effect"], told["element"]) == (true.effect, true.element)
 
 
 def column(result: Mapping[str, Any], cause: Cause) -> str:
