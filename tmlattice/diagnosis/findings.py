@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.consequences import consequences
+from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.remedies import credible as credible_remedies
 from tmlattice.diagnosis.remedies import remedies_of, remedy_of
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member
@@ -20,8 +21,6 @@ from tmlattice.inference.search import Explanation, Named
 from tmlattice.lattice import Element, Ring
 
 Array = NDArray[np.float64]
-Span = tuple[tuple[float, float], tuple[str, ...]]
-"""From where to where, m, and the names of the monitors there."""
 
 
 def credible(rivals: Sequence[Rival], mass: float) -> tuple[list[Rival], Array]:
@@ -151,18 +150,6 @@ def _positions(ring: Ring, hypothesis: Hypothesis) -> list[float]:
     if place is not None:
         return [place]
     return [e.s for e in ring.elements if hypothesis[1] is not None and e.family == hypothesis[1]]
-
-
-def between(ring: Ring, positions: Sequence[float]) -> Span:
-    """From the last monitor before to the first one behind."""
-    s = np.array([monitor.s for monitor in ring.monitors])
-    low, high = min(positions), max(positions)
-    before = int(np.searchsorted(s, low, side="left")) - 1
-    behind = int(np.searchsorted(s, high, side="right"))
-    start = float(s[before]) if before >= 0 else 0.0
-    end = float(s[behind]) if behind < len(s) else ring.length
-    near = [ring.monitors[i].name for i in (before, behind) if 0 <= i < len(s)]
-    return (start, end), tuple(near)
 
 
 def verdict_of(

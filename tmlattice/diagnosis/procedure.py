@@ -28,6 +28,7 @@ from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measureme
 from tmlattice.diagnosis.prepare import Prepared, prepare, same_monitors
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
+from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
@@ -128,6 +129,7 @@ def diagnose(
         next=_next(ring, ready, explanation, seed),
         sensitivity=sensitivity(explanation.first, judgement),
         warnings=_said(said, ready, told, left_out),
+        suspects=suspects(ring, explanation, judgement) if told.verdict == "distributed" else (),
         left_out=left_out,
         noise=ready.noise,
         noise_estimated=ready.estimated,

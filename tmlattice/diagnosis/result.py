@@ -27,6 +27,7 @@ from tmlattice.optics import matrix_tunes
 if TYPE_CHECKING:
     from tmlattice.diagnosis.dense import Step
     from tmlattice.diagnosis.missing import Weighed
+    from tmlattice.diagnosis.suspects import Suspect
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
@@ -196,6 +197,7 @@ class Diagnosis:
         priors: rms of the families' priors, as the data have them, by name.
         degenerate: what the data alone do not settle, in words.
         hypotheses: effects that may be missing, weighed; None: not asked.
+        suspects: of a `distributed` verdict on trajectories: where to look first.
     """
 
     verdict: str
@@ -224,6 +226,7 @@ class Diagnosis:
     priors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     hypotheses: "tuple[Weighed, ...] | None" = None
+    suspects: "tuple[Suspect, ...]" = ()
 
     @property
     def kind(self) -> str:
@@ -314,6 +317,7 @@ class Diagnosis:
             ],
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             "gap": self.gap,
+            "suspects": [suspect.as_json() for suspect in self.suspects],
             "unexplained": {"patterns": None, **self.unexplained},
             "tunes": self.tunes,
             "next_measurement": None if self.next is None else self.next.as_json(),

@@ -281,6 +281,25 @@ def sensitivity_rows(
     return [(words(name), least_text(name, known[name])) for name in chosen if name in known]
 
 
+def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Where to look first where nothing explains the data: (kind, where, what would explain most).
+
+    Suspects, not findings.
+    """
+    rows: list[tuple[str, str, str]] = []
+    for one in diagnosis.suspects:
+        low, high = one.where
+        place = one.element
+        if one.kind == "section":
+            place = f"s = {low:.1f} m to {high:.1f} m"
+            place += f", {' to '.join(dict.fromkeys(one.near))}" if one.near else ""
+        what = "something without a name" if one.effect is None else words(one.effect)
+        if one.kind == "section" and one.effect is not None:
+            what += f", {one.element}"
+        rows.append((one.kind, place, f"{what} (statistic {one.statistic:.4g})"))
+    return rows
+
+
 # --- lines of text --------------------------------------------------------------------------------
 def columns(rows: Sequence[Sequence[str]], indent: str = "", *, right: bool = False) -> list[str]:
     """Cells under one another; all but the first to the right, or to the left."""
