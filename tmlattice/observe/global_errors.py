@@ -45,10 +45,11 @@ by chance, but then many others lose."""
 CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
 """Factors by which chi-square of sections or launches falls with what was wrong undone: at least;
 with a unit undone; of sections where launches say the contrary. Units are powers of a thousand."""
-RIGHT = 9.0
+RIGHT = 5.0
 """Chi-square of launches that are right then."""
-FINE = 0.1
-"""Share of the orbit that sections leave from which they agree anyhow."""
+FINE, FINE_GAIN = 0.1, 30.0
+"""Share of the orbit that sections leave from which they agree anyhow, and log evidence that
+curvature, or a few correctors that were set, have to gain then."""
 ALIKE = 3.0
 """Log evidence below which two assumptions explain the data alike."""
 _LAST = ("noise-from-data", "launches-unknown")  # of these others decide
@@ -415,7 +416,7 @@ def _believable(verdict: Verdict, share: float) -> bool:
     clear = CLEAR_UNIT if unit else CLEAR
     if local_clears > clear or (launch_clears > clear and launch_then < RIGHT):
         return True
-    return share < FINE and not unit  # the sections agree anyhow: curvature tells
+    return share < FINE and not unit and verdict.gain > FINE_GAIN
 
 
 def _levels(terms: Terms) -> tuple[float, float]:

@@ -32,7 +32,7 @@ Places = NDArray[np.intp]
 _KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates; a pass without RF does not ask for tau
 WEAK = 1e-8
 """Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
-STEPS = 6
+STEPS = 8
 """Of Newton's method: the maps are nearly linear."""
 FAR_OFF = 1e15
 """Sigma that stand for a trajectory which cannot be followed."""
@@ -297,11 +297,13 @@ class Sections:
                 back = np.linalg.solve(curvature, np.swapaxes(A, -1, -2))
                 step_4 = (back @ left[..., None])[..., 0]
                 fitted = (A @ step_4[..., None])[..., 0]
-                moved, clean = float(np.nanmedian(np.abs(fitted))), left - fitted
+                clean = left - fitted
                 alone = own - (A @ (back @ own[..., None]))[..., 0]
                 prior = passes.delta - x[:, 0, 4]
                 change, known = _shared(clean, alone, freedom, prior, passes.alone)
                 by_energy = -(back @ own[..., None])[..., 0] / np.sqrt(known)[:, None, None]
+                by_change = np.abs(alone * change[:, None, None])
+                moved = float(np.nanmedian(np.maximum(np.abs(fitted), by_change)))
                 step_4 = step_4 - (back @ own[..., None])[..., 0] * change[:, None, None]
                 x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
                 x[..., 4] += change[:, None]
