@@ -219,8 +219,8 @@ def _launches(judge: Judge) -> Check:
         return note(
             "launches",
             f"the fitted launches differ from the stated ones by {np.sqrt(worst):.0f} of their "
-            "launch_sigma, unless something is wrong before the first monitors: mend the launches or "
-            "their rms, or go on with --assume launches-unknown",
+            "launch_sigma, unless something is wrong before the first monitors: mend the launches "
+            "or their rms, or go on with --assume launches-unknown",
             before=worst, assume=("launches-unknown",),
         )  # fmt: skip
     return fine("launches", "the fitted launches are the stated ones")
