@@ -129,6 +129,8 @@ def wrong_response(data, ring):
         ("correctors shifted by 1", "correctors-shifted=-1", "correctors-shifted=1"),
         ("RF step of wrong sign", "rf-reversed", "rf-reversed"),
     ):
+        if name.startswith("horizontal") and data.planes.count("x") < 2:
+            continue  # no one could tell it from a bad corrector
         if name == "kicks in mrad":
             yield name, replace(data, kicks=data.kicks * 1e3), {asked}
         else:

@@ -27,7 +27,7 @@ USUAL = 0.01
 """Mean square of what the usual errors leave of a column, in units of the column's own: a tenth."""
 GAIN = 2.5
 """Log of the misfit that each of the changed columns has to lose in the mean."""
-COLUMNS = 3
+COLUMNS = 2
 """At least, that an assumption about correctors or monitors changes: one may be a bad corrector."""
 SHARE = 0.8
 """Of the columns that an assumption changes, how many it has to change for the better."""
