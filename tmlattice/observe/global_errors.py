@@ -344,7 +344,7 @@ class Judge:
             tuple(sorted({*first.names, *second}, key=list(ASSUMPTIONS).index))
             for first in found[:BEAM]
             for second in several
-            if not set(first.names) & set(second)
+            if not _same_part(first.names[0], second[0])
         } - set(several)
         found += [
             own for names in sorted(pairs)
@@ -382,6 +382,14 @@ class Judge:
         data = self.assumed(names)
         sections = {1.0: self._section(self._times(data))}
         return Judge(self.ring, data, self.known, sections)
+
+
+def _same_part(one: str, other: str) -> bool:
+    """Whether two assumptions are about the order of the monitors, about the settings, or about the
+    unit of one thing: of such, one is true."""
+    (a, *_), (b, *_) = one.split("-"), other.split("-")
+    units = "-in-" in one and "-in-" in other
+    return one == other or (a == b and (units or a in ("monitors", "settings")))
 
 
 def certain(verdict: Verdict) -> bool:

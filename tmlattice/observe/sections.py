@@ -37,7 +37,8 @@ STEPS = 8
 FAR_OFF = 1e15
 """Sigma that stand for a trajectory which cannot be followed."""
 SETTLED = 1e-2
-"""Change of the typical reading, in units of its noise, behind which there is no further step."""
+"""Change of the typical reading, in units of its noise or of what is left of it, behind which there
+is no further step."""
 ENERGY = 5e-3
 """Relative; rms of the energy deviations that a pass may have, in all its sections."""
 MOST = 8
@@ -306,6 +307,7 @@ class Sections:
                 by_energy = drift / np.sqrt(known)[:, None, None]
                 moved = float(np.nanmedian(np.abs(fitted)))
                 moved = max(moved, float(np.nanmax(np.abs(change) * np.sqrt(known))))
+                moved /= max(1.0, float(np.nanmedian(np.abs(left - fitted))))
                 step_4 = step_4 + drift * change[:, None, None]
                 x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
                 x[..., 4] += change[:, None]
