@@ -108,9 +108,11 @@ def backwards(ring, data):
     """Launched at the ring's end, against the lattice: what a trajectory forward ends with."""
     from tmlattice.beam.model import Model
 
-    paths = Model(ring, [{}] * len(data.launches)).paths(data.launches)
-    ends = paths.states[:, -1][:, [0, 1, 2, 3, 5]]
-    return replace(data, launches=ends * [1, -1, 1, -1, 1])
+    exact = simulate(ring, shots=SHOTS, seed=1, launch_sigma=[0] * 5).measurement()
+    paths = Model(ring, [{}] * SHOTS).paths(exact.launches)
+    ends = paths.states[:, -1][:, [0, 1, 2, 3, 5]] * [1, -1, 1, -1, 1]
+    error = np.random.default_rng(1).standard_normal(ends.shape) * data.launch_sigma
+    return replace(exact, launches=ends + error, launch_sigma=data.launch_sigma)
 
 
 def wrong_response(data, ring):
