@@ -179,14 +179,17 @@ def undone(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]
     """The ring with the settings that take causes away, and the causes that no setting does.
 
     With the causes in it, a magnet of the returned ring acts as the given ring's does: a quadrupole
-    that gives 20 % less than it is told is told 25 % more. What has to be moved, turned or mended,
-    and what is wrong with monitors or the beam, is handed back.
+    that gives 20 % less than it is told is told 25 % more. What has to be moved, turned, calibrated
+    or mended, and what is wrong with monitors or the beam, is handed back; known physics that is no
+    fault is passed over.
     """
     settings: dict[int, Element] = {}
     by_hand: list[Cause] = []
     for cause in reversed(causes):  # the last that acts is undone first
         effect = find(cause.effect)
-        if not isinstance(effect, RingEffect) or effect.natural:
+        if effect.natural:
+            continue
+        if not isinstance(effect, RingEffect) or effect.acts_on_settings:
             by_hand.append(cause)
             continue
         places = effect.members(ring, cause.element)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.remedies import Remedy
+from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judge import Gap, Misfit
@@ -186,8 +186,8 @@ class Diagnosis:
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options as used, seed, seconds.
         ring: the design.
-        repaired: the ring with the named causes in it; monitors and correctors are in
-            `calibration`.
+        repaired: the model repaired, which is the ring as found: the design with the named causes
+            in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
         view: what figures need; it says what was measured.
@@ -268,6 +268,19 @@ class Diagnosis:
             if (cause.effect, cause.element) == (effect, element):
                 return cause.amount, sigma
         raise KeyError((effect, element))
+
+    @property
+    def as_found(self) -> Ring:
+        """The design with the named causes in it: the machine as it is."""
+        return self.repaired
+
+    def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
+        """The design with the settings that take the faults away, and what settings do not mend.
+
+        Loaded into the machine as it was found, these settings make it the design again: see
+        `remedies.undone`.
+        """
+        return undone(self.ring, self.causes)
 
     @property
     def gap(self) -> dict[str, Any]:

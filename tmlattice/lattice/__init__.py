@@ -10,6 +10,7 @@ from tmlattice.lattice.default_magnet import middle_of_first_arc
 from tmlattice.lattice.json_file import save_ring
 from tmlattice.lattice.load import builtin_lattices, load_ring
 from tmlattice.lattice.ring import Element, Kind, Ring
+from tmlattice.lattice.write import write_ring
 
 __all__ = [
     "Element",
@@ -19,4 +20,5 @@ __all__ = [
     "load_ring",
     "middle_of_first_arc",
     "save_ring",
+    "write_ring",
 ]

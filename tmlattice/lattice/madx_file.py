@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice.at_file import ring_from_at
+from tmlattice.lattice.madx_matrix import matrix_command
 from tmlattice.lattice.ring import Ring
 
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
@@ -28,7 +29,7 @@ def read_madx(
     """
     import at
 
-    parser = at.MadxParser(verbose=False)
+    parser = at.MadxParser(verbose=False, matrix=matrix_command())
     try:
         with redirect_stdout(StringIO()):
             parser.parse_files(str(path))

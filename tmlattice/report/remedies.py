@@ -1,9 +1,11 @@
 """What is to be done about a finding, in the words of a control room."""
 
+from collections.abc import Sequence
+
 from tmlattice.diagnosis.consequences import Beam, Consequences
-from tmlattice.diagnosis.remedies import Remedy
+from tmlattice.diagnosis.remedies import Remedy, action
 from tmlattice.diagnosis.result import Finding
-from tmlattice.effects import ReadingEffect, RingEffect, find
+from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.report.amounts import amount_text, probability_text, words
 
 _KINDS = {
@@ -65,6 +67,19 @@ def or_text(finding: Finding, most: int) -> str:
         rest = sum(r.probability for r in others[most:])
         shown.append(f"{len(others) - most} more ({probability_text(rest)} together)")
     return "\n".join(shown)
+
+
+SAID = 6
+"""Things to be done by hand that a sentence names."""
+
+
+def by_hand_text(causes: Sequence[Cause]) -> str:
+    """What no setting mends, in a sentence; empty where nothing is left."""
+    todo = list(dict.fromkeys(action(cause.effect, cause.element) for cause in causes))
+    if not todo:
+        return ""
+    more = f"; and {len(todo) - SAID} more" if len(todo) > SAID else ""
+    return f"no setting in it mends what is left to do: {'; '.join(todo[:SAID])}{more}"
 
 
 # --- what it does to the stored beam --------------------------------------------------------------
