@@ -56,7 +56,7 @@ def test_at_itself_finds_the_tunes_in_the_file(uneven, tmp_path):
 
 @pytest.mark.parametrize("file", FOREIGN)
 def test_errors_that_a_format_can_say_are_written(small_ring, file, tmp_path):
-    """A roll, a kick of a corrector in the other plane, a wiggler's focusing and a skew field in it."""
+    """A roll, kicks of a corrector in both planes, a wiggler's focusing and a skew field in it."""
     causes = [
         Cause("quadrupole_roll", "QF::3", 0.01),
         Cause("corrector_kick_x", "v3", 2e-5),

@@ -42,7 +42,8 @@ class Remedy:
     Attributes:
         effect, element: that the remedy is named for; None for the beam.
         kind: of the element; of a family that of its members.
-        amount, amount_sigma: in that effect's unit, of the likeliest explanation that shares it.
+        amount, amount_sigma: in that effect's unit: its own where it is among the explanations,
+            else that of the likeliest one.
         probability: of all explanations that share it.
         mechanisms: their effects with their probabilities, the likeliest first.
         strength: of the magnet, designed and found, where the effect scales one.
@@ -56,6 +57,11 @@ class Remedy:
     probability: float
     mechanisms: tuple[tuple[str, float], ...]
     strength: Strength | None
+
+    @property
+    def cause(self) -> Cause:
+        """What is told to be wrong."""
+        return Cause(self.effect, self.element, self.amount)
 
     @property
     def action(self) -> str:
@@ -123,9 +129,12 @@ def remedies_of(
         own = ((cause.effect, share),)
         if key in found:
             known = found[key]
-            found[key] = replace(
+            known = replace(
                 known, probability=known.probability + share, mechanisms=known.mechanisms + own
             )
+            if cause.effect == lead.effect:  # its own fit is better than a thin one converted
+                known = replace(known, amount=lead.amount, strength=_strength(ring, lead))
+            found[key] = known
             continue
         error = None
         if cause is causes[0] and sigma is not None:

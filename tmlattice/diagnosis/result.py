@@ -1,7 +1,7 @@
 """What a diagnosis says, whatever was measured: findings with what else each could be, amounts with
 errors, the gap, and the file format."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, apply
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
@@ -131,6 +131,12 @@ class Finding:
             "or_remedies": [remedy.as_json() for remedy in self.remedies[1:]],
             "consequences": None if self.consequences is None else self.consequences.as_json(),
         }
+
+
+def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """The causes, those of findings as their remedies name them."""
+    named = {(f.effect, f.element): f.remedy.cause for f in findings if f.remedy is not None}
+    return tuple(named.get((cause.effect, cause.element), cause) for cause in causes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,9 +276,16 @@ class Diagnosis:
         raise KeyError((effect, element))
 
     @property
+    def faults(self) -> tuple[Cause, ...]:
+        """The causes, those of findings as their remedies name them: a thin gradient that explains
+        a quadrupole's is the quadrupole's own."""
+        return faults_of(self.findings, self.causes)
+
+    @property
     def as_found(self) -> Ring:
-        """The design with the named causes in it: the machine as it is."""
-        return self.repaired
+        """The design with the faults in it: the machine as it is."""
+        faults = self.faults
+        return self.repaired if faults == self.causes else apply(self.ring, faults)
 
     def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
         """The design with the settings that take the faults away, and what settings do not mend.
@@ -280,7 +293,7 @@ class Diagnosis:
         Loaded into the machine as it was found, these settings make it the design again: see
         `remedies.undone`.
         """
-        return undone(self.ring, self.causes)
+        return undone(self.ring, self.faults)
 
     @property
     def gap(self) -> dict[str, Any]:

@@ -50,12 +50,17 @@ def title(finding: Finding) -> str:
     return remedy_text(finding.remedy)
 
 
+LIKELY = 0.01
+"""Share of a remedy's probability from which on a mechanism is told."""
+
+
 def mechanism_text(remedy: Remedy) -> str:
     """Which explanations share a remedy, and how likely each is."""
-    if len(remedy.mechanisms) == 1:
-        effect = remedy.mechanisms[0][0]
+    likely = [m for m in remedy.mechanisms if m[1] >= LIKELY * remedy.probability]
+    if len(likely) == 1:
+        effect = likely[0][0]
         return f"{words(effect)} ({effect}: {find(effect).sign})"
-    told = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in remedy.mechanisms)
+    told = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in likely)
     return "; or ".join(told) + ": the remedy is the same"
 
 
@@ -115,14 +120,15 @@ def _beam_text(beam: Beam | None, told: Consequences) -> str:
     if beam is None:
         return "unstable: no beam can be stored"
     x, y = beam.tunes
-    design = f"{told.design[0]:.4f}, {told.design[1]:.4f}"
-    return (
-        f"tunes {x:.4f}, {y:.4f} (design {design}); "
-        f"beta beat {_pair(beam.beta_beat_rms, 100, 1)} % rms, "
-        f"{_pair(beam.beta_beat_max, 100, 1)} % at most; "
-        f"dispersion off by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms; "
-        f"closed orbit {_pair(beam.orbit_rms, 1e6, 1)} µm rms"
-    )
+    said = [f"tunes {x:.4f}, {y:.4f} (design {told.design[0]:.4f}, {told.design[1]:.4f})"]
+    if max(beam.beta_beat_max) > SETTLED.beta_beat_max[0]:
+        rms, most = _pair(beam.beta_beat_rms, 100, 2), _pair(beam.beta_beat_max, 100, 2)
+        said.append(f"beta beat {rms} % rms, {most} % at most")
+    if max(beam.dispersion_rms) > SETTLED.dispersion_rms[0]:
+        said.append(f"dispersion off by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms")
+    if max(beam.orbit_rms) > SETTLED.orbit_rms[0]:
+        said.append(f"closed orbit {_pair(beam.orbit_rms, 1e6, 1)} µm rms")
+    return "; ".join(said)
 
 
 def _pair(values: tuple[float, float], factor: float, digits: int) -> str:
