@@ -23,11 +23,11 @@ from tmlattice.lattice.source import blank, made
 FORMAT, VERSION = "tmlattice-lattice", 1
 
 CLASSES = (
-    "Aperture", "Bend", "Cavity", "Drift", "Hcor", "Marker", "Matrix", "Monitor", "Multipole",
-    "Octupole", "Quadrupole", "RBend", "SBend", "Sextupole", "Solenoid", "TDCavity", "TWCavity",
-    "Undulator", "UnknownElement", "Vcor", "XYQuadrupole",
+    "Aperture", "Bend", "Cavity", "CombinedMultipole", "Drift", "Hcor", "Marker", "Matrix",
+    "Monitor", "Multipole", "Octupole", "Quadrupole", "RBend", "SBend", "Sextupole", "Solenoid",
+    "TDCavity", "TWCavity", "Undulator", "UnknownElement", "Vcor", "XYQuadrupole",
 )  # fmt: skip
-"""OCELOT's element classes that a file may name."""
+"""OCELOT's element classes that a file may name, and the package's own of them."""
 
 
 def save_ring(ring: Ring, path: str | Path) -> None:
