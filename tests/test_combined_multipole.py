@@ -1,4 +1,4 @@
-"""Magnets of several fields in one: nothing lost between the file, the maps, the engine and JSON."""
+"""Magnets of several fields in one: nothing is lost in the maps, the engines or the JSON."""
 
 import at
 import numpy as np

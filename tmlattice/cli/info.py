@@ -5,10 +5,18 @@ from typing import Any
 
 import click
 
-from tmlattice.cli.options import console, json_option, lattice_argument, quiet_option, table
+from tmlattice.cli.options import (
+    Careful,
+    console,
+    json_option,
+    lattice_argument,
+    open_ring,
+    quiet_option,
+    table,
+)
 
 
-@click.command("info")
+@click.command("info", cls=Careful)
 @lattice_argument
 @json_option
 @quiet_option
@@ -32,10 +40,9 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
     from tmlattice import __version__
     from tmlattice.beam.chain import Chain
     from tmlattice.errors import UnstableRingError
-    from tmlattice.lattice import load_ring
     from tmlattice.optics import off_momentum, twiss
 
-    ring = load_ring(lattice, sequence, energy)
+    ring = open_ring(lattice, sequence, energy, read=False)
     facts: dict[str, Any] = {
         "format": "tmlattice-info",
         "version": 1,

@@ -21,7 +21,8 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,8 @@ def read_at(
 
     options = {"use": sequence} if sequence else {}
     try:
-        lattice = at.load_lattice(str(path), **options)
+        with quiet_at():
+            lattice = at.load_lattice(str(path), **options)
     except Exception as error:  # each of AT's readers fails in its own way
         said = " ".join(str(error).split()) or type(error).__name__
         raise LatticeError(
@@ -76,6 +78,16 @@ def read_at(
             "save_lattice, or name its variable with sequence="
         ) from error
     return ring_from_at(lattice, name, energy)
+
+
+@contextmanager
+def quiet_at() -> Iterator[None]:
+    """What AT warns of stays in the log: it is about AT's tracking, or about words of a file."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        yield
+    for warning in told:
+        log.info("AT: %s", warning.message)
 
 
 def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:

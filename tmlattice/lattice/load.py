@@ -1,11 +1,13 @@
 """One door to all lattice files: the suffix says which reader it is."""
 
 import warnings
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice import stored
+from tmlattice.lattice.marked import marked
 from tmlattice.lattice.ring import Ring
 
 AT_SUFFIXES = (".mat", ".m", ".repr")
@@ -24,7 +26,11 @@ def builtin_lattices() -> list[str]:
 
 
 def load_ring(
-    name_or_path: str | Path, sequence: str | None = None, energy: float | None = None
+    name_or_path: str | Path,
+    sequence: str | None = None,
+    energy: float | None = None,
+    monitors: str | Sequence[str] | None = None,
+    correctors: str | Sequence[str] | None = None,
 ) -> Ring:
     """The ring of a built-in lattice or of a lattice file.
 
@@ -37,10 +43,16 @@ def load_ring(
             `.m`, `.repr`, `.json`), MAD-X (`.seq`, `.madx`) or the package's own JSON.
         sequence: which one the file's variables, keys or sequences is the ring.
         energy: GeV; else what the file states.
+        monitors, correctors: patterns of names, such as "BPM*", of elements that are monitors or
+            correctors although the file does not say so: see `marked`.
 
     Raises:
         LatticeError: no such file, it cannot be read, or it holds no ring.
     """
+    return marked(_loaded(name_or_path, sequence, energy), monitors, correctors)
+
+
+def _loaded(name_or_path: str | Path, sequence: str | None, energy: float | None) -> Ring:
     path = _find(str(name_or_path))
     name = str(name_or_path)
     key = stored.key_of(path, sequence, energy)

@@ -6,7 +6,7 @@ from io import StringIO
 from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
-from tmlattice.lattice.at_file import ring_from_at
+from tmlattice.lattice.at_file import quiet_at, ring_from_at
 from tmlattice.lattice.ring import Ring
 
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
@@ -30,7 +30,7 @@ def read_madx(
 
     parser = at.MadxParser(verbose=False)
     try:
-        with redirect_stdout(StringIO()):
+        with redirect_stdout(StringIO()), quiet_at():
             parser.parse_files(str(path))
     except Exception as error:
         raise _unreadable(path, error) from error
@@ -49,7 +49,7 @@ def read_madx(
     if energy is None and not stated and beams == [dict(at.MadxParser()["beam%"])]:
         raise LatticeError(f"'{path}' has no BEAM with an energy; say energy= (GeV)")
     try:
-        with redirect_stdout(StringIO()):
+        with redirect_stdout(StringIO()), quiet_at():
             lattice = parser.lattice(use=use)
     except Exception as error:
         raise _unreadable(path, error) from error
