@@ -49,6 +49,7 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "package": __version__,
         "lattice": ring.name,
         "energy_gev": ring.energy,
+        "mass_gev": ring.mass,
         "length": ring.length,
         "counts": dict(sorted(ring.counts().items())),
         "layers": len(ring.magnets),
@@ -65,9 +66,11 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
         energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
-        facts["chromaticity"] = energy_effects.chromaticity.tolist()
-        facts["dispersion_max"] = abs(energy_effects.dispersion).max(axis=0).tolist()
-        facts["momentum_compaction"] = energy_effects.momentum_compaction
+        # per momentum, not per energy dE / (p0 c) = beta delta; and of the path, not of its time
+        beta, lag = (1.0, 0.0) if ring.gamma > 1e3 else (ring.beta, ring.gamma**-2)
+        facts["chromaticity"] = (beta * energy_effects.chromaticity).tolist()
+        facts["dispersion_max"] = (beta * abs(energy_effects.dispersion)).max(axis=0).tolist()
+        facts["momentum_compaction"] = beta**2 * energy_effects.momentum_compaction + lag
     except UnstableRingError as error:
         facts["problem"] = str(error)
     return facts

@@ -23,6 +23,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,13 +34,11 @@ from numpy.typing import NDArray
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.at_fields import bend, straight, thin
 from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
-from tmlattice.lattice.ring import Kind, Ring
+from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-
-ELECTRON_GEV = 0.51099895e-3
 
 _VERTICAL = re.compile(r"^(f?v|c[hy]?v|pcv|pkv|c_?y|ky)|vcor|vkick|vcm|_v(_|\d|$)", re.IGNORECASE)
 _HORIZONTAL = re.compile(r"^(f?h|c[vx]?h|pch|pkh|c_?x|kx)|hcor|hkick|hcm|_h(_|\d|$)", re.IGNORECASE)
@@ -108,22 +107,25 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         second, which are left out.
     """
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
+    rest = float(lattice.particle.rest_energy) / 1e9
+    light = rest < 2 * ELECTRON_GEV  # an electron, or AT's particle that is as fast as light
+    design = Ring(name, (), energy_gev, mass=ELECTRON_GEV if light else rest)
     left_out: Counter[str] = Counter()
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
     for element in lattice:
         if id(element) not in known:
             family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
-            known[id(element)] = _places(element, family, energy_gev, left_out)
+            known[id(element)] = _places(element, family, design.map_energy, left_out)
         converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     if left_out:
         what = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
         warnings.warn(f"'{name}': left out of the model: {what}", stacklevel=3)
-    merged = _merge_wigglers(converted, energy_gev) * max(1, int(lattice.periodicity))
+    merged = _merge_wigglers(converted, design.map_energy) * max(1, int(lattice.periodicity))
     families, kinds, sources = zip(*merged, strict=True)
-    return Ring(name, place_elements(families, sources, kinds), energy_gev)
+    return replace(design, elements=place_elements(families, sources, kinds))
 
 
 def _roll(element: Any, left_out: Counter[str]) -> float:

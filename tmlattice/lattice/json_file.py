@@ -17,7 +17,7 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice.places import place_elements
-from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring, number_names
+from tmlattice.lattice.ring import ELECTRON_GEV, NO_ERRORS, Element, Errors, Ring, number_names
 from tmlattice.lattice.source import blank, made
 
 FORMAT, VERSION = "tmlattice-lattice", 1
@@ -75,6 +75,7 @@ def save_ring(ring: Ring, path: str | Path) -> None:
                 "package": __version__,
                 "name": ring.name,
                 "energy_gev": ring.energy,
+                **({} if ring.mass == ELECTRON_GEV else {"mass_gev": ring.mass}),
                 "changes": {name: dict(change) for name, change in ring.changes.items()},
                 "definitions": definitions,
                 "sequence": sequence,
@@ -135,7 +136,8 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
         for e, key in zip(elements, keys, strict=True)
     )
     energy = float(content["energy_gev"]) if energy is None else energy
-    return Ring(name, elements, energy, content.get("changes", {}))
+    mass = float(content.get("mass_gev", ELECTRON_GEV))
+    return Ring(name, elements, energy, content.get("changes", {}), mass)
 
 
 def _content(path: Path) -> Any:

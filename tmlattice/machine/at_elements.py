@@ -54,6 +54,10 @@ def wiggler_curvature(element: Element, energy: float) -> float:
 
 def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
     """Energy loss of the design orbit in a turn, eV: C_gamma E^4 / 2 pi, integral of 1/rho^2."""
+    if not ring.radiates:
+        if bends or wigglers:
+            raise LatticeError(f"the particles of '{ring.name}' are too heavy to radiate")
+        return 0.0
     energy = ring.energy * 1e9
     bent = sum(e.angle**2 / e.length for e in ring.elements if e.kind == "bend")
     wiggled = sum(wiggler_curvature(e, energy) for e in ring.elements if e.kind == "wiggler")
