@@ -303,7 +303,7 @@ def test_files_with_no_ring_end_in_one_sentence(tmp_path):
     with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
         load_ring(write(tmp_path, "e.mat", "no matlab"))
     with pytest.raises(LatticeError, match="no lattice file that can be read"):
-        load_ring(write(tmp_path, "f.lte", ""))
+        load_ring(write(tmp_path, "f.xyz", ""))
 
 
 @pytest.fixture(scope="module")

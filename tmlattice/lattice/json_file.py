@@ -95,6 +95,16 @@ def is_own(path: Path) -> bool:
     return "format" in content or "atjson" not in content
 
 
+def is_xsuite(path: Path) -> bool:
+    """Whether a JSON file is a line or an environment of Xsuite.
+
+    Raises:
+        LatticeError: it is no JSON.
+    """
+    content = _content(path)
+    return isinstance(content, dict) and "elements" in content and "xtrack_version" in content
+
+
 def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
     """The ring of a file that `save_ring` wrote.
 
