@@ -1,4 +1,4 @@
-"""Rings that accelerator-toolbox ships, from their files: the questions of `benchmarks/rings.py`."""
+"""Rings that accelerator-toolbox ships: the questions of `benchmarks/rings.py`, of their files."""
 
 import sys
 from pathlib import Path
