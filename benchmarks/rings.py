@@ -170,8 +170,8 @@ def follow(case: Case, ring, row: dict, lap) -> None:
 
 
 def place_is(ring, fault: str, name: str | None) -> bool:
-    """The magnet itself, or one so near that the monitors between cannot tell (0.5 m)."""
-    return name is not None and abs(ring[name].s - ring[fault].s) < 0.5
+    """The magnet itself, or another piece of it."""
+    return name is not None and name in ring.pieces(fault)
 
 
 LIMITS = {"tunes_at": 1e-3, "turn_file": 2e-2, "turn_engines": 2e-3, "turns_engines": 2e-2,
