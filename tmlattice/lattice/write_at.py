@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.at_file import ELECTRON_GEV
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -37,7 +36,12 @@ def at_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
     left_out: Counter[str] = Counter()
     line = [_element(element, ring, left_out) for element in ring.elements]
     name = Path(ring.name).stem
-    lattice = at.Lattice(line, name=name, energy=ring.energy * 1e9, periodicity=1)
+    particle = at.Particle("relativistic")
+    if not ring.radiates:
+        particle = at.Particle("particle", rest_energy=ring.mass * 1e9, charge=1.0)
+    lattice = at.Lattice(
+        line, name=name, energy=ring.energy * 1e9, particle=particle, periodicity=1
+    )
     return lattice, tuple(f"{what} ({count} elements)" for what, count in left_out.items())
 
 
@@ -98,6 +102,8 @@ def _element(element: Element, ring: Ring, left_out: Counter[str]) -> Any:
             other = x if vertical else y
             mad = {} if other else {"MADType": "VKICKER" if vertical else "HKICKER"}
             return at.Corrector(name, length, [x, y], **mad)
+        case "CombinedMultipole":
+            return _combined(element, turn)
         case "Multipole" if not length:
             kn = np.asarray(source.kn, dtype=float)
             factorials = np.cumprod([1, *range(1, len(kn))])
@@ -111,7 +117,23 @@ def _element(element: Element, ring: Ring, left_out: Counter[str]) -> Any:
                 left_out["what matrix elements do beyond their matrix is left out"] += 1
         case _:
             left_out["elements that AT has not are written as first-order matrices"] += 1
-    return at.M66(name, _to_at(first_order(element, ring.energy), ring.energy), Length=length)
+    return at.M66(name, _to_at(first_order(element, ring.map_energy), ring.beta), Length=length)
+
+
+def _combined(element: Element, turn: dict[str, Any]) -> Any:
+    """Of the class of its kind, with all its fields."""
+    import at
+
+    source, name, length = element.source, element.family, element.length
+    normal = [float(source.k0), float(source.k1), float(source.k2) / 2]
+    skew = [float(source.k0s), float(source.k1s), float(source.k2s) / 2]
+    if not length:
+        return at.ThinMultipole(name, skew, normal, **turn)
+    if element.kind == "quadrupole":
+        return at.Quadrupole(name, length, normal[1], PolynomA=skew, PolynomB=normal, **turn)
+    if element.kind == "sextupole":
+        return at.Sextupole(name, length, normal[2], PolynomA=skew, PolynomB=normal, **turn)
+    return at.Multipole(name, length, skew, normal, **turn)
 
 
 def _bend(element: Element, turn: dict[str, Any]) -> Any:
@@ -145,15 +167,14 @@ def _cavity(element: Element, ring: Ring) -> Any:
         element.length,
         float(element.source.v) * 1e9,
         frequency,
-        max(round(frequency * ring.length / LIGHT), 1),
+        max(round(frequency * ring.length / (ring.beta * LIGHT)), 1),
         ring.energy * 1e9,
         PassMethod="DriftPass" if element.length else "IdentityPass",
     )
 
 
-def _to_at(r: Array, energy: float) -> Array:
+def _to_at(r: Array, beta: float) -> Array:
     """The matrix in AT's coordinates: the last two swap places and differ by beta."""
-    beta = math.sqrt(1.0 - (ELECTRON_GEV / energy) ** 2)
     to_ocelot = np.eye(6)
     to_ocelot[4:, 4:] = [[0.0, 1.0], [beta, 0.0]]
     return np.asfortranarray(np.linalg.inv(to_ocelot) @ r @ to_ocelot)

@@ -33,7 +33,7 @@ def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
         path: to write to.
     """
     left_out: Counter[str] = Counter()
-    texts = [_definition(element, ring.energy, left_out) for element in ring.elements]
+    texts = [_definition(element, ring.map_energy, left_out) for element in ring.elements]
     kinds: dict[str, dict[str, int]] = {}
     for element, text in zip(ring.elements, texts, strict=True):
         known = kinds.setdefault(element.family.casefold(), {})
@@ -56,9 +56,10 @@ def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
     if several:
         some = ", ".join(sorted(several)[:4]) + (", ..." if len(several) > 4 else "")
         told.append(f"members of {some} differ, and have names of their own: NAME..k for NAME::k")
+    particle = "ELECTRON" if ring.radiates else "PROTON"
     content = [
         f"! {Path(ring.name).name}, by tmlattice",
-        f"BEAM, PARTICLE=ELECTRON, ENERGY={_number(ring.energy)};",
+        f"BEAM, PARTICLE={particle}, ENERGY={_number(ring.energy)};",
         *(f"{name}: {text};" for name, text in definitions.items()),
         "ring: LINE=(",
         *(f"  {', '.join(line[i : i + 8])}," for i in range(0, len(line) - 8, 8)),
@@ -110,6 +111,8 @@ def _definition(element: Element, energy: float, left_out: Counter[str]) -> str:
             if x if vertical else y:
                 return _with("KICKER", l=l, hkick=x, vkick=y)
             return _with("VKICKER" if vertical else "HKICKER", l=l, kick=y if vertical else x)
+        case "CombinedMultipole":
+            return _combined(element, left_out)
         case "Multipole" if not l:
             kn = ", ".join(_number(k) for k in np.asarray(source.kn))
             return _with("MULTIPOLE", tilt=tilt) + f", KNL={{{kn}}}"
@@ -128,6 +131,21 @@ def _definition(element: Element, energy: float, left_out: Counter[str]) -> str:
         case _:
             left_out["elements that MAD-X has not are written as first-order matrices"] += 1
     return _matrix(element, energy)
+
+
+def _combined(element: Element, left_out: Counter[str]) -> str:
+    """A thin one with all its fields, a thick one with those of its kind."""
+    source, l = element.source, element.length  # noqa: E741
+    normal, skew = ([float(getattr(source, f"k{n}{what}")) for n in range(3)] for what in ("", "s"))
+    if not l:
+        knl, ksl = (", ".join(map(_number, fields)) for fields in (normal, skew))
+        return _with("MULTIPOLE", tilt=element.tilt) + f", KNL={{{knl}}}, KSL={{{ksl}}}"
+    order = 2 if element.kind == "sextupole" else 1
+    rest = [k for n in range(3) if n != order for k in (normal[n], skew[n])]
+    if any(rest):
+        left_out["of thick magnets with several fields the main one is written"] += 1
+    own = {f"k{order}": normal[order], f"k{order}s": skew[order], "tilt": element.tilt}
+    return _with("SEXTUPOLE" if order == 2 else "QUADRUPOLE", l=l, **own)
 
 
 def _bend(element: Element, left_out: Counter[str]) -> str:

@@ -36,6 +36,7 @@ def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
             variables[key] = variable
             code += _lines(variable, element.family, content)
         sequence.append(variables[key])
+    combined = any("CombinedMultipole" in line for line in code)
     rows = [", ".join(sequence[i : i + 8]) for i in range(0, len(sequence), 8)]
     text = [
         f'"""{Path(ring.name).name}, by tmlattice."""',
@@ -43,7 +44,8 @@ def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
         "import numpy as np",
         "from ocelot.cpbd.elements import *",
         "",
-        f"energy = {ring.energy!r}",
+        *(["from tmlattice.lattice.combined import CombinedMultipole", ""] if combined else []),
+        f"energy = {ring.map_energy!r}",
         "",
         *code,
         "",
@@ -53,10 +55,15 @@ def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
         "",
     ]
     path.write_text("\n".join(text), encoding="utf-8")
+    told = []
+    if not ring.radiates:
+        told.append("the energy is that of an electron as fast as the ring's particles")
+    if combined:
+        told.append("magnets of several fields are tmlattice's own, which the file imports")
     other = sum(element.kind != source_kind(element.source) for element in ring.elements)
     if other:
-        return (f"OCELOT's classes do not tell the kind of {other} elements: it is read otherwise",)
-    return ()
+        told.append(f"OCELOT's classes do not tell the kind of {other} elements")
+    return tuple(told)
 
 
 def _lines(variable: str, family: str, content: dict[str, Any]) -> list[str]:
