@@ -1,6 +1,7 @@
 """Rings in the formats of other codes: what is read back is the ring that was written."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from tmlattice.diagnosis.result import ring_tunes
 from tmlattice.effects import apply
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import write_ring
+from tmlattice.lattice.ring import PROTON_GEV
 from tmlattice.measurement import write_measurement
 
 FORMATS = ("ring.json", "ring.at.json", "ring.madx", "ring.seq", "ring.py")
@@ -43,6 +45,16 @@ def test_ring_that_is_read_back_has_the_same_maps(uneven, file, tmp_path):
     launch = [[1e-3, 1e-4, -5e-4, 2e-4, 0.0, 1e-3]]
     turns = [Chain.from_ring(ring, 6).track(launch, 1)[0, 1] for ring in (uneven, back)]
     assert turns[1][:4] == pytest.approx(turns[0][:4], abs=1e-13)
+
+
+@pytest.mark.parametrize("file", FORMATS)
+def test_protons_are_as_fast_in_the_file(small_ring, file, tmp_path):
+    ring = replace(small_ring, mass=PROTON_GEV)
+    write_ring(ring, tmp_path / file)
+    back = load_ring(tmp_path / file)
+    # OCELOT's maps are told the energy of an electron that is as fast
+    assert back.map_energy == pytest.approx(ring.map_energy, rel=1e-12)
+    assert file.endswith(".py") or back.mass == pytest.approx(PROTON_GEV, rel=1e-9)
 
 
 def test_at_itself_finds_the_tunes_in_the_file(uneven, tmp_path):

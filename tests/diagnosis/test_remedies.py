@@ -81,6 +81,22 @@ def test_other_actions_and_other_places_are_other_remedies(small_ring):
     assert len(remedies(("family_gradient", "QD"), ("quadrupole_gradient", "QD::5"))) == 2
 
 
+def test_pieces_of_one_magnet_are_one_place(petra3):
+    """A sextupole's halves, with a corrector between them; the next sextupole is another."""
+    halves = petra3.pieces("s1::48")
+    assert len(halves) == 2
+    one, two = (Cause("sextupole_offset_x", name, 1e-3) for name in halves)
+    other = Cause("sextupole_offset_x", "s1::46", 1e-3)
+    first, second = remedies_of(petra3, [two, one, other], [0.5, 0.4, 0.1])
+    assert first.probability == pytest.approx(0.9)
+    assert (first.element, first.pieces) == (two.element, halves)
+    assert first.mechanisms == (("sextupole_offset_x", pytest.approx(0.9)),)
+    assert second.element == "s1::46"
+    assert (
+        remedy_of(petra3, one) == remedy_of(petra3, two) == "move s1::48 + s1::49 back horizontally"
+    )
+
+
 def test_probability_of_a_remedy_is_that_of_all_that_share_it(small_ring):
     causes = [
         Cause("quadrupole_gradient", "QD::5", -0.1),

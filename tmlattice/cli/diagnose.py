@@ -212,7 +212,7 @@ def _write_rings(
     if repaired_out:
         ring, by_hand = result.repair()
         told = write_ring(ring, repaired_out)
-        more = by_hand_text(by_hand)
+        more = by_hand_text(result.ring, by_hand)
         written[str(repaired_out)] = (*told, more) if more else told
     return written
 

@@ -2,7 +2,7 @@
 
 A thin gradient in the middle of a quadrupole and a wrong strength of it are two hypotheses and one
 line in a logbook: the gradient of that magnet. Which effects share a remedy at an element, and in
-which amount, the catalogue says (`Effect.stands_for`).
+which amount, the catalogue says (`Effect.stands_for`). A magnet that stands in pieces is one.
 
 >>> remedy = remedies_of(ring, rivals, probability)[0]
 >>> remedy.action, remedy.amount, remedy.probability
@@ -41,6 +41,8 @@ class Remedy:
 
     Attributes:
         effect, element: that the remedy is named for; None for the beam.
+        pieces: of the magnet that the element is a piece of, or the element alone; empty for the
+            beam.
         kind: of the element; of a family that of its members.
         amount, amount_sigma: in that effect's unit: its own where it is among the explanations,
             else that of the likeliest one.
@@ -51,6 +53,7 @@ class Remedy:
 
     effect: str
     element: str | None
+    pieces: tuple[str, ...]
     kind: Kind | None
     amount: float
     amount_sigma: float | None
@@ -66,7 +69,7 @@ class Remedy:
     @property
     def action(self) -> str:
         """What to do, in words."""
-        return action(self.effect, self.element)
+        return action(self.effect, self.pieces)
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -76,6 +79,7 @@ class Remedy:
             "check": effect.to_check,
             "effect": self.effect,
             "element": self.element,
+            "pieces": list(self.pieces),
             "quantity": effect.quantity or effect.words,
             "amount": self.amount,
             "amount_sigma": self.amount_sigma,
@@ -86,9 +90,16 @@ class Remedy:
         }
 
 
-def action(effect: str, element: str | None) -> str:
+def action(effect: str, pieces: Sequence[str]) -> str:
     """What takes an effect away, in words."""
-    return find(effect).remedy.replace("{}", element or "the ring")
+    return find(effect).remedy.replace("{}", " + ".join(pieces) or "the ring")
+
+
+def pieces_of(ring: Ring, name: str | None) -> tuple[str, ...]:
+    """Of the magnet that an element is a piece of; a family's name, or an element's, alone."""
+    if name is None:
+        return ()
+    return ring.pieces(name) if _is_element(ring, name) else (name,)
 
 
 def leading(ring: Ring, cause: Cause) -> Cause:
@@ -102,7 +113,7 @@ def leading(ring: Ring, cause: Cause) -> Cause:
 def remedy_of(ring: Ring, cause: Cause) -> str:
     """What takes a cause away, in words: the same for causes that one adjustment takes away."""
     lead = leading(ring, cause)
-    return action(lead.effect, lead.element)
+    return action(lead.effect, pieces_of(ring, lead.element))
 
 
 def remedies_of(
@@ -122,17 +133,19 @@ def remedies_of(
     Returns:
         That of the first one first, the others by falling probability.
     """
-    found: dict[tuple[str, str | None], Remedy] = {}
+    found: dict[tuple[str, tuple[str, ...]], Remedy] = {}
     for cause, share in zip(causes, np.asarray(probability).tolist(), strict=True):
         lead = leading(ring, cause)
-        key = (lead.effect, lead.element)
+        key = (lead.effect, pieces_of(ring, lead.element))
         own = ((cause.effect, share),)
         if key in found:
             known = found[key]
             known = replace(
-                known, probability=known.probability + share, mechanisms=known.mechanisms + own
+                known, probability=known.probability + share, mechanisms=_more(known, *own)
             )
-            if cause.effect == lead.effect:  # its own fit is better than a thin one converted
+            thin = known.effect not in [effect for effect, _ in found[key].mechanisms]
+            if thin and cause.effect == lead.effect and lead.element == known.element:
+                # its own fit is better than a thin one converted
                 known = replace(known, amount=lead.amount, strength=_strength(ring, lead))
             found[key] = known
             continue
@@ -140,13 +153,20 @@ def remedies_of(
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
         found[key] = Remedy(
-            lead.effect, lead.element, _kind(ring, lead.element), lead.amount, error, share, own,
-            _strength(ring, lead),
+            lead.effect, lead.element, key[1], _kind(ring, lead.element), lead.amount, error, share,
+            own, _strength(ring, lead),
         )  # fmt: skip
     if not found:
         return ()
     first, *rest = found.values()
     return (first, *sorted(rest, key=lambda remedy: -remedy.probability))
+
+
+def _more(known: Remedy, mechanism: tuple[str, float]) -> tuple[tuple[str, float], ...]:
+    """Mechanisms with one more, those of the same effect (in other pieces) added up."""
+    shares = dict(known.mechanisms)
+    shares[mechanism[0]] = shares.get(mechanism[0], 0.0) + mechanism[1]
+    return tuple(shares.items())
 
 
 def credible(remedies: Sequence[Remedy], mass: float) -> tuple[Remedy, ...]:

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 from tmlattice.diagnosis.consequences import Beam, Consequences
-from tmlattice.diagnosis.remedies import Remedy, action
+from tmlattice.diagnosis.remedies import Remedy, remedy_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
+from tmlattice.lattice import Ring
 from tmlattice.report.amounts import amount_text, probability_text, words
 
 _KINDS = {
@@ -25,7 +26,9 @@ def subject(remedy: Remedy) -> str:
         return "the beam"
     kind = _KINDS.get(remedy.kind, remedy.kind)
     family = " family" if remedy.effect.startswith("family") else ""
-    return f"{kind}{family} {remedy.element}"
+    others = [name for name in remedy.pieces if name != remedy.element]
+    magnet = f" (one magnet with {', '.join(others)})" if others else ""
+    return f"{kind}{family} {remedy.element}{magnet}"
 
 
 def remedy_text(remedy: Remedy) -> str:
@@ -78,9 +81,9 @@ SAID = 6
 """Things to be done by hand that a sentence names."""
 
 
-def by_hand_text(causes: Sequence[Cause]) -> str:
+def by_hand_text(ring: Ring, causes: Sequence[Cause]) -> str:
     """What no setting mends, in a sentence; empty where nothing is left."""
-    todo = list(dict.fromkeys(action(cause.effect, cause.element) for cause in causes))
+    todo = list(dict.fromkeys(remedy_of(ring, cause) for cause in causes))
     if not todo:
         return ""
     more = f"; and {len(todo) - SAID} more" if len(todo) > SAID else ""
