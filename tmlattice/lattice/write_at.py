@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.lattice.at_file import quiet_at
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -36,12 +37,13 @@ def at_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
     left_out: Counter[str] = Counter()
     line = [_element(element, ring, left_out) for element in ring.elements]
     name = Path(ring.name).stem
-    particle = at.Particle("relativistic")
-    if not ring.radiates:
-        particle = at.Particle("particle", rest_energy=ring.mass * 1e9, charge=1.0)
-    lattice = at.Lattice(
-        line, name=name, energy=ring.energy * 1e9, particle=particle, periodicity=1
-    )
+    with quiet_at():  # which warns of particles that are slower than light
+        particle = at.Particle("relativistic")
+        if not ring.radiates:
+            particle = at.Particle("particle", rest_energy=ring.mass * 1e9, charge=1.0)
+        lattice = at.Lattice(
+            line, name=name, energy=ring.energy * 1e9, particle=particle, periodicity=1
+        )
     return lattice, tuple(f"{what} ({count} elements)" for what, count in left_out.items())
 
 
