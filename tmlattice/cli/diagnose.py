@@ -153,6 +153,8 @@ def diagnose(
             options |= {"reference": before, "background": dict(background) or None}
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
         ring = open_ring(lattice, sequence, energy)
+        if lattice_out and lattice_out == repaired_out:
+            raise click.UsageError(f"--lattice-out and --repaired-out are both '{lattice_out}'")
         for option, path in (("lattice", lattice_out), ("repaired", repaired_out)):
             if path:
                 _check_out(ring, f"--{option}-out", path)
