@@ -93,13 +93,27 @@ def test_errors_that_a_format_has_no_place_for_are_told(small_ring, file, tmp_pa
     ]
     told = write_ring(apply(small_ring, causes), tmp_path / file)
     assert any("dx of QF::3" in sentence for sentence in told)
-    assert any("thin gradient in the middle of QD::5" in sentence for sentence in told)
+    assert any("thin gradients in the middle of QD::5" in sentence for sentence in told)
     back = load_ring(tmp_path / file)
     magnet = small_ring["QD::5"]
     name = "qd..5" if file.endswith((".madx", ".seq")) else "QD::5"
     assert back[name].k1 == pytest.approx(magnet.k1 + 4e-3 / magnet.length)
     assert write_ring(apply(small_ring, causes), tmp_path / "own.json") == ()
     assert load_ring(tmp_path / "own.json")["QF::3"].errors.dx == 1e-4
+
+
+def test_skew_gradient_of_a_quadrupole_is_written_as_its_tilt(small_ring, tmp_path):
+    """In magnets that stand upright, in one that is tilted, and in one that has no field."""
+    ring = small_ring.with_changed("QF::7", tilt=0.3).with_changed("QD::9", k1=0.0)
+    causes = [Cause("skew_gradient", name, 1e-4) for name in ("QF::3", "QD::5", "QF::7", "QD::9")]
+    causes.append(Cause("gradient_absolute", "QF::7", 2e-4))
+    faulty = apply(ring, causes)
+    (told,) = write_ring(faulty, tmp_path / "ring.at.json")
+    assert "QF::3, QD::5, QF::7, QD::9 are written as fields of their bodies" in told
+    back = load_ring(tmp_path / "ring.at.json")
+    turns = [Chain.from_ring(r).one_turn_map()[1] for r in (ring, faulty, back)]
+    # thin and thick differ to second order in the length of a magnet
+    assert np.abs(turns[2] - turns[1]).max() < 0.1 * np.abs(turns[1] - turns[0]).max()
 
 
 def test_name_of_no_format_is_refused_before_anything_is_written(small_ring, tmp_path):

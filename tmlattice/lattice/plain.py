@@ -1,8 +1,8 @@
 """A ring with errors as a ring of plain elements, for formats that know none.
 
 What a magnet's errors do is written into what every format has: a roll is a tilt, a kick of a
-corrector its angle, a thin gradient in a quadrupole its k1, in a matrix element its matrix. What
-has no place there is told.
+corrector its angle, thin gradients in a quadrupole its k1 and tilt, in a matrix element its matrix.
+What has no place there is told.
 """
 
 import copy
@@ -16,47 +16,72 @@ from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
 
 Array = NDArray[np.float64]
 
-_TURNS = ("quadrupole", "sextupole", "octupole", "hcorrector", "vcorrector")
+_TURNS = ("quadrupole", "sextupole", "octupole")
+
+
+NAMED = 4
+"""Elements that a sentence names."""
 
 
 def plain(ring: Ring) -> tuple[Ring, tuple[str, ...]]:
     """The ring without errors that acts most like it, and what it lacks, a sentence each."""
     changed: dict[int, Element] = {}
-    told: list[str] = []
+    told: dict[str, list[str]] = {}
     for place, element in enumerate(ring.elements):
         if element.errors != NO_ERRORS:
             changed[place], lacks = _plain(element)
-            told += lacks
-    return ring.with_elements(changed), tuple(told)
+            for what in lacks:
+                told.setdefault(what, []).append(element.name)
+    return ring.with_elements(changed), tuple(w.replace("{}", _some(n)) for w, n in told.items())
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _plain(element: Element) -> tuple[Element, list[str]]:
+    """The element without errors, and sentences about what that lacks, its name as {}."""
+    errors = element.errors
     left: dict[str, Any] = {
-        name: value
-        for name, value in vars(element.errors).items()
-        if value != getattr(NO_ERRORS, name)
+        name: value for name, value in vars(errors).items() if value != getattr(NO_ERRORS, name)
     }
     told = []
     bare = replace(element, errors=NO_ERRORS, source=element.data or element.source)
     if element.kind in ("hcorrector", "vcorrector"):
-        bare = _corrector(bare, element.errors)
+        bare = _corrector(bare, errors)
         for name in ("kick_x", "kick_y", "roll"):
             left.pop(name, None)
-    elif element.kind in _TURNS and "roll" in left:
+    if element.kind == "quadrupole" and element.length and (errors.k1l or errors.k1sl):
+        bare = _quadrupole(bare, errors)
+        told.append("thin gradients in the middle of {} are written as fields of their bodies")
+        for name in ("k1l", "k1sl"):
+            left.pop(name, None)
+    if element.kind in _TURNS and "roll" in left:
         bare = bare.changed(tilt=bare.tilt + left.pop("roll"))
-    if element.kind == "quadrupole" and element.length and "k1l" in left:
-        bare = bare.changed(k1=bare.k1 + left.pop("k1l") / element.length)
-        told.append(f"the thin gradient in the middle of {element.name} is written as its k1")
     if type(bare.source).__name__ in ("Matrix", "Marker"):
-        bare = _matrix(bare, element.errors)
+        bare = _matrix(bare, errors)
         for name in ("k1l", "k1sl", "entrance_k1l", "entrance", "middle"):
             left.pop(name, None)
-    if left:
-        told.append(
-            f"{', '.join(left)} of {element.name} cannot be written; the package's own JSON holds "
-            "them"
-        )
+    told += [f"{name} of {{}} cannot be written; the package's own JSON holds it" for name in left]
     return bare, told
+
+
+def _quadrupole(element: Element, errors: Errors) -> Element:
+    """Its gradient with thin ones, normal and skew, spread over its length, as k1 and a tilt.
+
+    Tilted by t it has the normal part k1 cos 2t and the skew one k1s = -k1 sin 2t.
+    """
+    double = 2 * element.tilt
+    normal = element.k1 * np.cos(double) + errors.k1l / element.length
+    skew = element.k1 * np.sin(double) - errors.k1sl / element.length
+    along = normal * np.cos(double) + skew * np.sin(double)
+    across = skew * np.cos(double) - normal * np.sin(double)
+    if abs(across) < 1e-12 * abs(along):
+        return element.changed(k1=float(along))
+    size = float(np.hypot(along, across)) * (1 if along >= 0 else -1)
+    turn = float(np.arctan2(across * np.sign(size), abs(along))) / 2
+    return element.changed(k1=size, tilt=element.tilt + turn)
 
 
 def _corrector(element: Element, errors: Errors) -> Element:

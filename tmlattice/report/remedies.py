@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from tmlattice.diagnosis.consequences import Beam, Consequences
-from tmlattice.diagnosis.remedies import Remedy, remedy_of
+from tmlattice.diagnosis.remedies import Remedy, leading, pieces_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.lattice import Ring
@@ -77,17 +77,25 @@ def or_text(finding: Finding, most: int) -> str:
     return "\n".join(shown)
 
 
-SAID = 6
-"""Things to be done by hand that a sentence names."""
+SAID = 4
+"""Places that a sentence names."""
 
 
 def by_hand_text(ring: Ring, causes: Sequence[Cause]) -> str:
     """What no setting mends, in a sentence; empty where nothing is left."""
-    todo = list(dict.fromkeys(remedy_of(ring, cause) for cause in causes))
+    todo: dict[str, list[str]] = {}  # what to do -> where
+    for cause in causes:
+        lead = leading(ring, cause)
+        place = " + ".join(pieces_of(ring, lead.element)) or "the ring"
+        places = todo.setdefault(find(lead.effect).remedy, [])
+        places += [place] * (place not in places)
     if not todo:
         return ""
-    more = f"; and {len(todo) - SAID} more" if len(todo) > SAID else ""
-    return f"no setting in it mends what is left to do: {'; '.join(todo[:SAID])}{more}"
+    said = []
+    for remedy, places in todo.items():
+        more = f" and {len(places) - SAID} more" if len(places) > SAID else ""
+        said.append(remedy.replace("{}", ", ".join(places[:SAID]) + more))
+    return f"no setting in it mends what is left to do: {'; '.join(said)}"
 
 
 # --- what it does to the stored beam --------------------------------------------------------------
