@@ -107,7 +107,8 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
 def column(result: Mapping[str, Any], cause: Cause) -> str:
     """The column of the confusion table."""
     if not result["findings"]:
-        return "unknown" if result["verdict"] == "distributed" else "nothing"
+        refused = result["verdict"] == "distributed" and not result.get("priors")
+        return "unknown" if refused else "nothing"
     finding = result["findings"][0]
     if finding["effect"] is None:
         return "unknown"

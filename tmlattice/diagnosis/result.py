@@ -170,7 +170,7 @@ class Diagnosis:
         steps: of a dense fit, those kept; the first is the design's, the last the result's.
         refused: those that did not help.
         bad_monitors: names of those left out.
-        priors: rms of the families' priors, as the data have them, by name.
+        priors: rms of small errors, as the data have them or as they were told, by family.
         degenerate: what the data alone do not settle, in words.
         hypotheses: effects that may be missing, weighed; None: not asked.
     """
@@ -245,7 +245,11 @@ class Diagnosis:
 
     @property
     def gap(self) -> dict[str, Any]:
-        """Before and after on the fit's readings and on held-out ones."""
+        """Before and after on the fit's readings and on held-out ones.
+
+        Where there are small errors and findings, before is with the small errors alone; the
+        design's own is the first of the steps.
+        """
 
         def both(before: Misfit, after: Misfit) -> dict[str, Any]:
             return {"before": dict(vars(before)), "after": dict(vars(after))}
@@ -254,7 +258,7 @@ class Diagnosis:
         heldout = None
         if gap is not None:
             heldout = {
-                **both(gap.misfits[0], gap.misfits[-1]),
+                **both(gap.misfits[gap.since], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
                 "monitors": "odd" if self.kind == "trajectory" else "half",
                 "steps": [dict(vars(m)) for m in gap.misfits],
