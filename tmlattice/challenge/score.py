@@ -177,7 +177,7 @@ def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
 def _refused(result: Mapping[str, Any]) -> bool:
     """Whether something is there and the catalogue is said not to hold it."""
     unnamed = any(finding["effect"] is None for finding in result["findings"])
-    if result["priors"] and not result["findings"]:
+    if result.get("priors") and not result["findings"]:
         return False
     return result["verdict"] in REFUSED or unnamed
 

@@ -80,7 +80,7 @@ def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[...
         type=BackgroundText(),
         multiple=True,
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
-        "one.",
+        "one, or `none`.",
     )
 
 

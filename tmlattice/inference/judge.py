@@ -177,7 +177,7 @@ def _closed(
         shared += 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
     if bottom < 5 * np.sqrt(spread_bottom):
         return None, None
-    left = top / bottom
+    left = max(top, 0.0) / bottom
     variance = (spread_top + left**2 * spread_bottom - 2 * left * shared) / bottom**2
     width = 1.96 * float(np.sqrt(max(variance, 0.0)))
     closed = 1 - left
