@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="A measurement of the same machine before the fault: static errors cancel.",
 )
-@background_option("Small errors that the machine has everywhere; where it is not given the data say")
+@background_option("Small errors everywhere (not given: the data say)")
 @click.option(
     "--max-effects",
     type=click.IntRange(1),
