@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.effects import find
+from tmlattice.effects import CATALOGUE, find
 from tmlattice.report.amounts import amount_text, least_text, probability_text, words
 from tmlattice.report.remedies import (
     consequence_text,
