@@ -9,11 +9,13 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
     NameList,
     background_option,
     console,
     json_option,
     lattice_options,
+    open_ring,
     quiet_option,
     trajectories,
 )
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from tmlattice.measurement import Measurement
 
 
-@click.command("diagnose")
+@click.command("diagnose", cls=Careful)
 @click.argument("lattice")
 @click.argument("measurement", type=FILE)
 @lattice_options
@@ -121,7 +123,6 @@ def diagnose(
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
         from tmlattice.effects import background_rms, names
-        from tmlattice.lattice import load_ring
 
         if effects is not None:
             names(effects)  # a wrong name is known before the work
@@ -141,7 +142,7 @@ def diagnose(
             before = None if reference is None else trajectories(reference, "; give first turns")
             options |= {"reference": before, "background": dict(background) or None}
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
-        ring = load_ring(lattice, sequence, energy)
+        ring = open_ring(lattice, sequence, energy)
         if lattice_out:
             _check_lattice_out(ring, lattice_out)
         with _progress(quiet) as progress:

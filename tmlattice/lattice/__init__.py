@@ -9,6 +9,7 @@
 from tmlattice.lattice.default_magnet import middle_of_first_arc
 from tmlattice.lattice.json_file import save_ring
 from tmlattice.lattice.load import builtin_lattices, load_ring
+from tmlattice.lattice.marked import marked
 from tmlattice.lattice.ring import Element, Kind, Ring
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "Ring",
     "builtin_lattices",
     "load_ring",
+    "marked",
     "middle_of_first_arc",
     "save_ring",
 ]
