@@ -1,0 +1,68 @@
+"""`tmlattice import`: measurements of other programs as a measurement folder."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tmlattice.cli.options import FILE, console, quiet_option
+
+if TYPE_CHECKING:
+    from tmlattice.importers import Imported
+
+
+@click.command("import")
+@click.argument("files", nargs=-1, required=True, type=FILE)
+@click.option(
+    "--out",
+    type=FILE,
+    required=True,
+    metavar="FOLDER",
+    help="The measurement folder, with lattice.json in it where the files hold one.",
+)
+@click.option(
+    "--iteration",
+    type=click.Choice(["first", "last"]),
+    default="last",
+    show_default=True,
+    help="Of a LOCO fit: its lattice as the file has it, with the parameters of the last "
+    "iteration; or with those of the first, the model before the fit.",
+)
+@click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
+@click.option("--force", is_flag=True, help="Replace a measurement that is there.")
+@quiet_option
+def import_files(
+    files: tuple[Path, ...], out: Path, iteration: str, keep_bad: bool, force: bool, quiet: bool
+) -> None:
+    """Bring measured data in: a measurement folder of FILES of other programs.
+
+    FILES are a MATLAB LOCO file (.mat). What was assumed (units, signs, steps) is printed, and
+    what the data contradict: nothing is mended silently.
+    """
+    from tmlattice.errors import MeasurementError
+    from tmlattice.importers import bring_in, write_imported
+
+    if not force and any((out / name).exists() for name in ("measurement.json", "lattice.json")):
+        raise MeasurementError(
+            f"'{out}' holds a measurement already; name another folder, or replace it with --force"
+        )
+    brought = bring_in(files, iteration=iteration, keep_bad=keep_bad)  # type: ignore[arg-type]
+    write_imported(brought, out)
+    if not quiet:
+        _print(brought, out)
+
+
+def _print(brought: "Imported", out: Path) -> None:
+    from tmlattice.importers import described
+
+    screen = console()
+    screen.print(described(brought))
+    for sentence in brought.assumed:
+        screen.print(f"- {sentence}")
+    if brought.doubts:
+        screen.print("the data contradict:")
+        for sentence in brought.doubts:
+            screen.print(f"! {sentence}")
+    screen.print(f"written: {out}")
+    if brought.ring is not None:
+        screen.print(f"next: tmlattice diagnose {out / 'lattice.json'} {out}")
