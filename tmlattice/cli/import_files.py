@@ -1,7 +1,7 @@
 """`tmlattice import`: measurements of other programs as a measurement folder."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -28,11 +28,18 @@ if TYPE_CHECKING:
     help="Of a LOCO fit: its lattice as the file has it, with the parameters of the last "
     "iteration; or with those of the first, the model before the fit.",
 )
+@click.option("--sequence", metavar="NAME", help="The MATLAB variable that is the lattice.")
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
 @quiet_option
 def import_files(
-    files: tuple[Path, ...], out: Path, iteration: str, keep_bad: bool, force: bool, quiet: bool
+    files: tuple[Path, ...],
+    out: Path,
+    iteration: Literal["first", "last"],
+    sequence: str | None,
+    keep_bad: bool,
+    force: bool,
+    quiet: bool,
 ) -> None:
     """Bring measured data in: a measurement folder of FILES of other programs.
 
@@ -40,13 +47,13 @@ def import_files(
     what the data contradict: nothing is mended silently.
     """
     from tmlattice.errors import MeasurementError
-    from tmlattice.importers import bring_in, write_imported
+    from tmlattice.importers import Options, bring_in, write_imported
 
     if not force and any((out / name).exists() for name in ("measurement.json", "lattice.json")):
         raise MeasurementError(
             f"'{out}' holds a measurement already; name another folder, or replace it with --force"
         )
-    brought = bring_in(files, iteration=iteration, keep_bad=keep_bad)  # type: ignore[arg-type]
+    brought = bring_in(files, Options(iteration, keep_bad, sequence))
     write_imported(brought, out)
     if not quiet:
         _print(brought, out)

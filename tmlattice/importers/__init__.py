@@ -5,7 +5,7 @@
 >>> print("\\n".join(brought.assumed))          # units, signs, steps: what the files do not prove
 """
 
-from tmlattice.importers.bring_in import bring_in
+from tmlattice.importers.bring_in import Options, bring_in
 from tmlattice.importers.imported import Imported, described, write_imported
 
-__all__ = ["Imported", "bring_in", "described", "write_imported"]
+__all__ = ["Imported", "Options", "bring_in", "described", "write_imported"]

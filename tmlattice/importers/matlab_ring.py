@@ -7,8 +7,8 @@ corrector whatever its class says, and keeps its name:
 - a corrector of one plane stays one element;
 - where one place kicks in both planes, all of its family become two thin correctors in the middle
   of it, `name_h` and `name_v`: to first order a thick corrector is no other;
-- a magnet that kicks (a corrector inside a sextupole) becomes two halves of the same name with the
-  thin correctors in its middle.
+- a magnet that kicks (a corrector inside a sextupole) becomes two halves, `name` and `name_2`, with
+  the thin correctors in its middle.
 
 A pass method of the file chooses nothing that is loaded: one that AT does not ship is a drift.
 """
@@ -16,7 +16,7 @@ A pass method of the file chooses nothing that is loaded: one that AT does not s
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -39,10 +39,12 @@ class Roles:
     Attributes:
         monitors: places, from 0.
         kicks: planes in which a place kicks, by place.
+        names: of thin correctors, by place and plane, where they have names of their own.
     """
 
     monitors: tuple[int, ...]
     kicks: Mapping[int, frozenset[str]]
+    names: Mapping[tuple[int, str], str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ def ring_of_elements(
         for k, part in enumerate(parts):
             if plane := getattr(part, "Plane", ""):
                 where[i, plane] = len(sequence) + k
+                part.FamName = roles.names.get((i, plane), part.FamName)
         sequence += parts
     lattice = at.Lattice(sequence, name=name, energy=energy * 1e9, periodicity=1)
     with warnings.catch_warnings(record=True) as told:
@@ -256,4 +259,5 @@ def _magnet(element: Any, planes: frozenset[str]) -> list[Any]:
     if not float(getattr(element, "Length", 0.0)):
         return [element, *thin]
     first, second = element.divide([0.5, 0.5])
+    second.FamName = f"{_family(element)}_2"
     return [first, *thin, second]
