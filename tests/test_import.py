@@ -1,11 +1,13 @@
 """`tmlattice import`: measurements of other programs, against AT, LOCO's own model and README."""
 
+import json
 import os
 import re
 from pathlib import Path
 
 import at
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 from at.load.utils import element_from_dict
@@ -16,6 +18,7 @@ from tmlattice import load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import LatticeError, TmlatticeError
 from tmlattice.importers import Options, bring_in
+from tmlattice.lattice import save_ring
 from tmlattice.lattice.mat_file import read_mat
 
 DATA = Path(os.environ.get("TMLATTICE_DATA", ""), "real_rings")
@@ -24,7 +27,7 @@ real = pytest.mark.skipif(
     reason="TMLATTICE_DATA names no folder with real_rings in it",
 )
 
-ENERGY, CELLS, HARMONIC = 1.5, 8, 64
+ENERGY, CELLS, HARMONIC = 1.5, 8, 88
 POLE = {"MaxOrder": 2.0, "NumIntSteps": 20.0, "PassMethod": "StrMPoleSymplectic4Pass"}
 
 
@@ -127,6 +130,14 @@ def changed(variables, **fields):
     return new
 
 
+def design(found):
+    """The model's orbit changes, [column, monitor, 2], and the RF's."""
+    data, model = found.measurement, ResponseModel(found.ring)
+    at_monitor = [model.monitors.index(name) for name in data.monitors]
+    columns = model.response(data.correctors)[:, at_monitor] * data.kicks[:, None, None]
+    return columns, model.rf_change(data.rf.step / data.rf.frequency)[at_monitor]
+
+
 @pytest.fixture
 def brought(tmp_path):
     def bring(variables, **options):
@@ -160,11 +171,8 @@ def test_ring_answers_as_at_does(simulated, brought):
     thick symplectic elements, which is what two halves around a thin kick leave (1e-4) and the
     bends' edges (4e-4)."""
     found = brought(simulated)
-    data, model = found.measurement, ResponseModel(found.ring)
-    at_monitor = [model.monitors.index(name) for name in data.monitors]
-    expected = model.response(data.correctors)[:, at_monitor] * data.kicks[:, None, None]
+    data, (expected, rf) = found.measurement, design(found)
     assert_allclose(data.response, expected, atol=1e-3 * np.abs(expected).max())
-    rf = model.rf_change(data.rf.step / data.rf.frequency)[at_monitor]
     assert_allclose(data.rf.orbit, rf, atol=1e-3 * np.abs(rf).max())
 
 
@@ -317,6 +325,230 @@ def test_damaged_mat_files_are_a_sentence(simulated, tmp_path):
         read_mat(path)
 
 
+# --- other files ----------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def esrf(simulated, tmp_path_factory):
+    """The same response as the ESRF's files: inputs by name, kicks inside sextupoles."""
+    import h5py
+
+    place = tmp_path_factory.mktemp("esrf")
+    data, correctors = simulated["LocoMeasData"], simulated["CMData"]
+    places = [*correctors["HCMIndex"].astype(int) - 1, *correctors["VCMIndex"].astype(int) - 1]
+    names = [f"sr/{'hv'[i >= 16]}st/{i}" for i in range(len(places))]
+    M = 1e-3 * data["M"]
+    with h5py.File(place / "orm.h5", "w") as file:
+        file["matrix"] = M / 1e-4
+        file["inputs_delta"] = np.full(32, 1e-4)
+        file["input_names"] = names
+        file["raw_up"], file["raw_down"] = 3e-4 + M / 2, 3e-4 - M / 2
+        file["bipolar"] = True
+    with h5py.File(place / "eta.h5", "w") as file:
+        x, y = 1e-3 * data["Eta"].reshape(2, -1)
+        file["measured_eta_x"], file["measured_eta_y"] = x, y
+        file.attrs["rf_full_step"] = 200
+    with h5py.File(place / "noise.h5", "w") as file:
+        for plane in "xy":
+            file[f"Noise_BPM{plane}"] = np.full(16, 3e-7)
+    mapping = {
+        f"{i}/{'BA'[k >= 16]}1L": name
+        for k, (i, name) in enumerate(zip(places, names, strict=True))
+    }
+    (place / "names.json").write_text(json.dumps({**mapping, "3/B3L": "sr/m-sf/1"}))
+    fields = elements()
+    for element in fields:
+        if element["FamName"] == "BPM":
+            element["Class"] = "Monitor"
+        if element["FamName"] == "CAV":
+            element["Frequency"] = data["RF"]
+    head = {"FamName": "sr", "Class": "RingParam", "PassMethod": "IdentityPass", "Length": 0.0,
+            "Energy": ENERGY * 1e9}  # fmt: skip
+    scipy.io.savemat(place / "ring.mat", {"ring": np.array([head, *fields], dtype=object)})
+    return place
+
+
+def test_hdf5_files_of_the_esrf(simulated, esrf):
+    parts = ("orm.h5", "eta.h5", "noise.h5", "names.json", "ring.mat")
+    found = bring_in([esrf / name for name in parts])
+    data, M = found.measurement, 1e-3 * simulated["LocoMeasData"]["M"]
+    assert data.correctors[:2] == ("sr/hst/0", "sr/hst/1")
+    assert data.planes == ("x",) * 16 + ("y",) * 16
+    assert_allclose(data.response[:, :, 0].T, M[:16], atol=1e-15)
+    assert_allclose(data.kicks, 1e-4)
+    assert_allclose(data.noise, np.sqrt(2) * 3e-7)  # of an orbit; two make a change
+    assert data.rf.step == 200
+    assert not found.doubts
+    columns, rf = design(found)
+    assert_allclose(data.response, columns, atol=1e-3 * np.abs(columns).max())
+    assert_allclose(data.rf.orbit, rf, atol=1e-3 * np.abs(rf).max())
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        (("orm.h5",), "give the lattice"),
+        (("eta.h5", "names.json", "ring.mat"), "holds no 'matrix'"),
+        (("names.json",), "no measurement that is known"),
+        (("ring.mat",), "no measurement that is known"),
+        (("orm.h5", "names.json", "nothing.mat"), "no file"),
+    ],
+)
+def test_parts_that_are_missing_are_named(esrf, parts, told):
+    with pytest.raises(TmlatticeError, match=told):
+        bring_in([esrf / name for name in parts])
+
+
+def test_damaged_hdf5_is_a_sentence(esrf, tmp_path):
+    (tmp_path / "orm.h5").write_bytes((esrf / "orm.h5").read_bytes()[:900])
+    with pytest.raises(TmlatticeError, match="cannot be read as HDF5"):
+        bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
+
+
+def middle_layer(variables):
+    """Response, dispersion and noise of the same numbers, devices in another order."""
+    data = variables["LocoMeasData"]
+    monitors, hcm, vcm = (np.stack([np.arange(n) + 1, np.ones(n)], 1) for n in (16, 16, 16))
+    loco = changed(
+        variables,
+        LocoMeasData_HBPM={"DeviceList": monitors}, LocoMeasData_VBPM={"DeviceList": monitors},
+        LocoMeasData_HCM={"DeviceList": hcm}, LocoMeasData_VCM={"DeviceList": vcm},
+        LocoMeasData_DeltaHCMHardware=np.full(16, 2.0),
+        LocoMeasData_DeltaVCMHardware=np.full(16, 4.0),
+    )  # fmt: skip
+    order = np.arange(16)[::-1]
+    M = data["M"].reshape(2, 16, 2, 16)
+    ampere = (1.0, 2.0)  # half of LOCO's step in each plane
+
+    def block(r, p):
+        return {
+            "Data": M[r][:, p][order][:, order] / 2 / ampere[p], "UnitsString": "mm/Ampere",
+            "ActuatorDelta": np.full(16, ampere[p]),
+            "Monitor": {"DeviceList": monitors[order]}, "Actuator": {"DeviceList": hcm[order]},
+        }  # fmt: skip
+
+    Rmat = np.empty((2, 2), dtype=object)
+    for r in range(2):
+        for p in range(2):
+            Rmat[r, p] = block(r, p)
+    eta = data["Eta"].reshape(2, 16)
+    beside = {}
+    for p, plane in enumerate("xy"):
+        beside[f"BPM{plane}Disp"] = {
+            "Data": eta[p][order] / 1e-3 * 1e-3, "UnitsString": "meter/(dp/p)", "dp": 1e-3,
+            "ActuatorDelta": 200.0, "Monitor": {"DeviceList": monitors[order]},
+            "Actuator": {"UnitsString": "Hz"},
+        }  # fmt: skip
+        beside[f"BPM{plane}Data"] = {
+            "Sigma": np.full(16, 2e-4),
+            "UnitsString": "mm",
+            "DeviceList": monitors,
+        }
+    return loco, {"Rmat": Rmat}, beside
+
+
+def test_middle_layers_files_are_read_by_the_loco_file(simulated, tmp_path):
+    """Its devices in another order, half the step: half the orbit change, half the kick."""
+    paths = []
+    for name, variables in zip("abc", middle_layer(simulated), strict=True):
+        paths.append(tmp_path / f"{name}.mat")
+        scipy.io.savemat(paths[-1], variables)
+    found, loco = bring_in(paths), bring_in(paths[:1])
+    data, same = found.measurement, loco.measurement.select(correctors=found.measurement.correctors)
+    assert data.correctors[:2] == ("cor_h::7", "sf_h::7")
+    assert_allclose(data.response, same.response / 2, atol=1e-15)
+    assert_allclose(data.kicks, same.kicks / 2)
+    assert_allclose(data.noise, np.sqrt(2) * 2e-7)
+    assert_allclose(data.rf.orbit, same.rf.orbit, atol=1e-15)
+    assert data.rf.step == 200.0
+    assert not found.doubts
+    with pytest.raises(TmlatticeError, match="LOCO file with it"):
+        bring_in(paths[1:])
+
+
+@pytest.fixture(scope="module")
+def lattice(simulated, tmp_path_factory):
+    place = tmp_path_factory.mktemp("lattice")
+    scipy.io.savemat(place / "a.loco.mat", simulated)
+    found = bring_in([place / "a.loco.mat"])
+    save_ring(found.ring, place / "ring.json")
+    return str(place / "ring.json"), found.measurement
+
+
+def test_long_table_with_units(lattice, tmp_path):
+    path, data = lattice
+    lines = ["Corrector,monitor,x [mm],y (um),kick [mrad]"]
+    for name, kick, orbit in zip(data.correctors, data.kicks.tolist(), data.response, strict=True):
+        lines += [f"{name},{m},{1e3 * x!r},{1e6 * y!r},{1e3 * kick!r}"
+                  for m, (x, y) in zip(data.monitors, orbit.tolist(), strict=True)]  # fmt: skip
+    lines += [f"RF,{m},{1e3 * x!r},,200"
+              for m, (x, _) in zip(data.monitors, data.rf.orbit.tolist(), strict=True)]  # fmt: skip
+    table = tmp_path / "response.csv"
+    table.write_text("\n".join(lines))
+    with pytest.raises(TmlatticeError, match="--lattice"):
+        bring_in([table])
+    found = bring_in([table], Options(lattice=path))
+    again = found.measurement
+    assert (again.correctors, again.planes) == (data.correctors, data.planes)
+    assert_allclose(again.response, data.response, atol=1e-15)
+    assert_allclose(again.kicks, data.kicks)
+    assert again.rf.harmonic == data.rf.harmonic
+    assert again.rf.step == 200
+    assert not found.doubts
+
+
+def test_wide_table(lattice, tmp_path):
+    path, data = lattice
+    names = data.correctors[::3]
+    part = data.select(correctors=names)
+    lines = ["monitor,plane," + ",".join(f"{name} [mm/mrad]" for name in names)]
+    for i, monitor in enumerate(data.monitors):
+        for p, plane in enumerate("xy"):
+            values = part.response[:, i, p] / part.kicks
+            lines.append(f"{monitor},{plane}," + ",".join(map(repr, values.tolist())))
+    table = tmp_path / "wide.csv"
+    table.write_text("\n".join(lines))
+    found = bring_in([table], Options(lattice=path))
+    assert_allclose(found.measurement.response, part.response, atol=1e-15)
+    assert any("1e-04" in s or "0.0001" in s for s in found.assumed)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("corrector,monitor,x,y\ncor_h::0,bpm::0,1e-4,0", "no column 'kick'"),
+        ("corrector,monitor,x [furlong],y,kick\ncor_h::0,bpm::0,1e-4,0,1e-4", "furlong"),
+        ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,much,0,1e-4", "row 2: 'much' is no number"),
+        ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,1e-4,0", "row 2: 4 fields"),
+        ("corrector,monitor,x,y,kick\nqf::0,bpm::0,1e-4,0,1e-4", "no corrector"),
+        ("corrector,monitor,x,y,kick\ncor_h::0,bpm::77,1e-4,0,1e-4", "bpm::77"),
+        ("monitor,plane,cor_h::0\nbpm::0,z,1.0", "plane 'z'"),
+        ("", "no rows"),
+    ],
+)
+def test_damaged_tables_are_a_sentence(lattice, tmp_path, text, told):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(TmlatticeError, match=re.escape(told)):
+        bring_in([tmp_path / "a.csv"], Options(lattice=lattice[0]))
+
+
+def test_turns_of_the_beam(lattice, tmp_path, rng):
+    import turn_by_turn as tbt
+
+    turns = rng.standard_normal((20, 3, 2))
+    names = ["bpm::0", "bpm::5", "bpm::6"]
+    x, y = (pd.DataFrame(turns[..., p].T, index=names) for p in range(2))
+    tbt.write(tmp_path / "a.sdds", tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 20), datatype="lhc")
+    done = tmlattice("import", "a.sdds", "--lattice", lattice[0], "--out", "m", cwd=tmp_path,
+                     check=0)  # fmt: skip
+    assert "readings are in mm" in done.stdout
+    data = read_measurement(tmp_path / "m")
+    assert data.monitors == tuple(names)
+    assert_allclose(data.readings[0], 1e-3 * turns, rtol=1e-6)
+    assert np.isinf(data.launch_sigma[0, :4]).all()
+    (tmp_path / "b.sdds").write_text("nothing")
+    with pytest.raises(TmlatticeError, match="cannot be read as 'lhc'"):
+        bring_in([tmp_path / "b.sdds"])
+
+
 # --- the files of real rings ----------------------------------------------------------------------
 # file: monitors x, y; correctors H, V; noise of an orbit; measured in-plane rms; what the lattice
 # in the file leaves, all in micrometres: the table of the folder's README
@@ -338,14 +570,6 @@ def in_plane(values, planes):
 
 def rms(values):
     return 1e6 * np.sqrt(np.nanmean(values**2))
-
-
-def design(found):
-    """The model's orbit changes, [column, monitor, 2], and the RF's."""
-    data, model = found.measurement, ResponseModel(found.ring)
-    at_monitor = [model.monitors.index(name) for name in data.monitors]
-    columns = model.response(data.correctors)[:, at_monitor] * data.kicks[:, None, None]
-    return columns, model.rf_change(data.rf.step / data.rf.frequency)[at_monitor]
 
 
 @real
@@ -388,3 +612,48 @@ def test_computed_dispersion_of_a_real_ring_is_told():
     computed = {name for name, said in doubts.items() if any("computed" in s for s in said)}
     assert computed == {"siam_2007-09-25"}
     assert not any("other sign" in s or "exchanged" in s for said in doubts.values() for s in said)
+
+
+@real
+def test_noise_of_a_loco_file_is_that_of_two_orbits():
+    """The Middle Layer's own file of the same day has the scatter of one orbit."""
+    name = "lnls_2014-07-17_before"
+    loco = read_mat(DATA / f"{name}.loco.mat", ["LocoMeasData"])["LocoMeasData"]
+    orbit = read_mat(DATA / f"{name}.bpm.mat")
+    one = np.concatenate([orbit["BPMxData"]["Sigma"], orbit["BPMyData"]["Sigma"]])
+    assert_allclose(loco["BPMSTD"], np.sqrt(2) * one, rtol=1e-9)
+
+
+@real
+def test_middle_layers_files_of_a_real_ring_are_its_loco_file():
+    parts = ("loco", "response", "dispersion", "bpm")
+    paths = [DATA / f"lnls_2014-07-17_before.{part}.mat" for part in parts]
+    found, loco = bring_in(paths).measurement, bring_in(paths[:1]).measurement
+    assert found.correctors == loco.correctors
+    assert_allclose(found.response, loco.response, atol=1e-15)
+    assert_allclose(found.kicks, loco.kicks, rtol=1e-3)  # its calibration is not quite straight
+    assert_allclose(found.noise, loco.noise)
+    assert_allclose(found.rf.orbit, loco.rf.orbit, atol=1e-15)
+
+
+@real
+def test_esrf_ebs():
+    place = DATA / "esrf_ebs"
+    found = bring_in([*place.glob("*.h5"), place / "name_mapping.json", place / "betamodel.mat"])
+    data, (columns, rf) = found.measurement, design(found)
+    assert len(data.monitors) == 320
+    assert [data.planes.count(plane) for plane in "xy"] == [32, 32]
+    assert 1e6 * np.median(data.noise[:, 0]) / np.sqrt(2) == pytest.approx(0.46, abs=0.005)
+    assert found.ring.length == pytest.approx(843.977, abs=1e-3)
+    assert rms(in_plane(data.response - columns, data.planes)) < 0.1 * rms(
+        in_plane(data.response, data.planes)
+    )
+    assert rms((data.rf.orbit - rf)[:, 0]) < 0.1 * rms(rf[:, 0])
+    assert not found.doubts
+
+
+@real
+def test_turns_of_the_sps():
+    found = bring_in([DATA / "sps" / "sps_200turns.sdds"])
+    assert found.measurement.readings.shape[1] == 201
+    assert "201 of one plane" in " ".join(found.assumed)

@@ -118,8 +118,8 @@ def bring_hdf5(
     noise, of_noise = _noise(parts, data, len(monitors))
     rf, of_rf = _rf(parts, lattice, len(monitors))
     measured = OrbitResponse(
-        correctors=[placed.correctors[mapping[name]] for name in names],
-        planes=[mapping[name][1] for name in names],
+        correctors=tuple(placed.correctors[mapping[name]] for name in names),
+        planes=tuple(mapping[name][1] for name in names),
         kicks=steps,
         monitors=placed.monitors,
         response=np.stack([change[: rows // 2].T, change[rows // 2 :].T], axis=2),
@@ -158,7 +158,8 @@ def _texts(value: Any) -> list[str]:
 def _orbits(data: Mapping[str, Any], steps: Array, rows: int) -> tuple[Array, str]:
     """Orbit changes, m, [row, column]."""
     shape = rows, len(steps)
-    if np.size(data.get("raw_up")) == np.size(data.get("raw_down")) == rows * len(steps):
+    sizes = [np.size(data.get(name, ())) for name in ("raw_up", "raw_down")]
+    if sizes == [rows * len(steps)] * 2:
         up, down = (numbers(data[name], name, shape) for name in ("raw_up", "raw_down"))
         two = bool(data.get("bipolar", True))
         sides = "two-sided" if two else "one-sided; the diagnosis takes them as two-sided"

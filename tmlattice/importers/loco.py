@@ -94,7 +94,7 @@ def bring_loco(
     return Imported(
         measured,
         placed.ring,
-        assumed=(*_conventions(flags, measured), *of_lists, of_lattice, *placed.said),
+        assumed=(*conventions(flags, measured), *of_lists, of_lattice, *placed.said),
         doubts=tuple(_computed(data, content.get("LocoModel"), good)),
     )
 
@@ -338,7 +338,8 @@ def _computed(data: Fields, models: Any, good: Mapping[str, NDArray[np.bool_]]) 
     ]
 
 
-def _conventions(flags: Fields, measured: OrbitResponse) -> list[str]:
+def conventions(flags: Fields, measured: OrbitResponse) -> list[str]:
+    """How the numbers of a LOCO file are taken; a sentence each."""
     two = str(flags.get("ResponseMatrixMeasurement", "BiDirectional")).lower() == "bidirectional"
     said = [
         "M and Eta are in mm, HCMKicks and VCMKicks in mrad from one side of the step to the other",
