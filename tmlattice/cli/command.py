@@ -11,6 +11,7 @@ from tmlattice import __version__
 from tmlattice.cli.challenge import challenge
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
+from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
 from tmlattice.cli.predict import predict
 from tmlattice.cli.reproduce import reproduce
@@ -38,6 +39,7 @@ def tmlattice() -> None:
 tmlattice.add_command(tune_fit)
 tmlattice.add_command(info)
 tmlattice.add_command(study)
+tmlattice.add_command(import_files)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
 tmlattice.add_command(diagnose)
