@@ -154,7 +154,7 @@ def test_data_of_another_ring_are_recognised(petra3):
     data = measured(petra3, [])
     order = np.random.default_rng(1).permutation(len(data.monitors))
     mixed = data.__class__(**{**vars(data), "readings": data.readings[:, :, order]})
-    with pytest.raises(MeasurementError, match="do not follow from 'petra3'"):
+    with pytest.raises(MeasurementError, match="follow no trajectory of 'petra3'"):
         diagnose(petra3, mixed)
 
 

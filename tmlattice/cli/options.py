@@ -209,6 +209,15 @@ def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
+def assume_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """--assume NAME, repeated."""
+    return click.option(
+        "--assume", "assumed", multiple=True, metavar="NAME",
+        help="What is written down wrongly everywhere, such as x-reversed or launches-in-mm; it is "
+        "undone first. Repeat for more (docs: check).",
+    )(function)  # fmt: skip
+
+
 def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """--json FILE."""
     return click.option("--json", "json_file", type=FILE, metavar="FILE",

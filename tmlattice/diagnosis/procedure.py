@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.background import SmallErrors
+from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     credible,
     findings_of,
@@ -59,6 +60,7 @@ def diagnose(
     max_effects: int = 8,
     radiation: bool = False,
     false_alarm: float = DEFAULT.false_alarm,
+    assume: Sequence[str] = (),
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
@@ -77,11 +79,14 @@ def diagnose(
         max_effects: findings at most.
         radiation: the model radiates as expected.
         false_alarm: share of faultless data sets in which something may be found.
+        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone in
+            all shots first.
         seed: of the split, the threshold's simulation and the bootstrap.
         progress: told what is being done.
 
     Raises:
-        MeasurementError: data that cannot be used, or that are of another lattice.
+        MeasurementError: data that cannot be used, that have a wrong sign, unit or order
+            everywhere, or that are of another lattice.
         BeamLostError: launches that are lost in the design.
         EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor or an effect that does not exist.
@@ -95,9 +100,13 @@ def diagnose(
         "max_effects": max_effects,
         "radiation": radiation,
         "false_alarm": false_alarm,
+        **({"assume": list(assume)} if assume else {}),
     }
     judgement = Judgement(false_alarm=false_alarm)
-    said: list[str] = []
+    progress("data")
+    measurement = mended(ring, measurement, assume)
+    reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
+    said = consulted(ring, measurement, radiation)
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
