@@ -1,4 +1,4 @@
-"""Measured responses of real rings: `TMLATTICE_DATA=... python benchmarks/real_rings.py [NAME ...]`.
+"""Measured responses of real rings: `python benchmarks/real_rings.py [NAME ...]`.
 
 Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed by the
 commands, with default options, one after another; PETRA III's folder is diagnosed as it is. Told
