@@ -8,7 +8,7 @@ prior still stands about zero.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ class SmallErrors:
         plain: without them, with the noise as learnt.
         hypotheses, rms: of every error.
         sizes: rms by effect.
+        open: relative error of each size that was learnt; large where the readings hardly see it.
         evidence: log evidence that the sizes learnt have over no small errors; None: they were
             told.
     """
@@ -53,6 +54,7 @@ class SmallErrors:
     hypotheses: tuple[Hypothesis, ...]
     rms: Array
     sizes: Mapping[str, float]
+    open: Mapping[str, float] = field(default_factory=dict)
     evidence: float | None = None
 
     def estimate(self, explained: Fit, whitening: Whitening) -> list[Cause]:
@@ -145,7 +147,8 @@ def small_errors(
         learn: the sizes are learnt from the data; `rms` is where that starts.
         noisy: so is the noise, which is a guess.
     """
-    fixed, data, evidence = tuple(causes), plain.data, None
+    fixed, data = tuple(causes), plain.data
+    evidence, errors = None, dict[str, float]()
     for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
         alone = fit(replace(plain, model=model, fixed=fixed), (), launches)
@@ -158,6 +161,7 @@ def small_errors(
             found, names = _sizes(shifted, alone, hypotheses, spread, noisy)
             if evidence is None:
                 evidence = found.log_evidence
+            errors = dict(zip(names, found.error.tolist(), strict=True))
             factor = dict(zip(names, found.scale, strict=True))
             each = np.array([factor[name] for name, _ in hypotheses])
             rms = {name: float(size * factor.get(name, 1.0)) for name, size in rms.items()}
@@ -172,7 +176,7 @@ def small_errors(
         problem = replace(problem, fixed=())
         small = SmallErrors(
             problem, explained, replace(plain, data=data, white=None), tuple(hypotheses), scale,
-            rms, evidence,
+            rms, errors, evidence,
         )  # fmt: skip
         estimate = small.estimate(explained, problem.whitening)
     if fixed:

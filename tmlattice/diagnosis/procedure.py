@@ -151,6 +151,7 @@ def diagnose(
         causes=told.causes,
         errors=_errors(explanation)[: len(told.causes)],
         priors={} if small is None else small.sizes,
+        prior_errors={} if small is None else small.open,
         view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
     )
 

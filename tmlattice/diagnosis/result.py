@@ -195,6 +195,8 @@ class Diagnosis:
         refused: those that did not help.
         bad_monitors: names of those left out.
         priors: rms of small errors, as the data have them or as they were told, by family.
+        prior_errors: relative error of those that were learnt; above one half the readings hardly
+            see the family.
         degenerate: what the data alone do not settle, in words.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
@@ -224,6 +226,7 @@ class Diagnosis:
     refused: "tuple[Step, ...]" = ()
     bad_monitors: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
+    prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
@@ -315,6 +318,7 @@ class Diagnosis:
             "bad_monitors": list(self.bad_monitors),
             "degenerate": list(self.degenerate),
             "priors": dict(self.priors),
+            "prior_errors": dict(self.prior_errors),
             "errors": [
                 {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
                 for c, s in zip(self.causes, self.errors, strict=True)

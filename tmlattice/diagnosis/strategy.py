@@ -146,7 +146,7 @@ def _settled(
     if not again.good:
         return explanation, small
     settled = replace(explanation, problem=problem, fit=again, before=about.before)
-    return settled, replace(about, evidence=small.evidence)
+    return settled, replace(about, open=small.open, evidence=small.evidence)
 
 
 def _strongest(explanation: Explanation) -> Cause:

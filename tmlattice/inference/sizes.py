@@ -28,6 +28,8 @@ NOISE = 2.0
 
 STEPS = 20
 LARGEST = 1.5  # of a step, in the logarithm
+SETTLED = 0.5
+"""Log likelihood gained by a step after which none is made: steps converge quadratically."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +87,12 @@ def learn_sizes(
         step *= min(1.0, LARGEST / np.abs(step).max(initial=1e-300))
         trial = _state(clean, base, parts, size + step, precision)
         if trial.value <= now.value + 1e-9:
-            if np.abs(step).max(initial=0.0) < 0.02:
+            if damping > 1e3 or np.abs(step).max(initial=0.0) < 0.02:
                 break
             damping = max(10 * damping, 0.1)
             continue
         gained, size, now, damping = trial.value - now.value, size + step, trial, damping / 5
-        if gained < 0.02:
+        if gained < SETTLED:
             break
     covariance = np.linalg.inv(now.information)
     none = -0.5 * float(clean @ clean)

@@ -66,14 +66,20 @@ def closed_text(diagnosis: Diagnosis) -> str:
     return text
 
 
+HARDLY = 0.5
+"""Relative error of a size of small errors from which on it is more a guess."""
+
+
 def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Small errors everywhere: (effect, rms and how many times the usual one)."""
     rows = []
     for name, rms in diagnosis.priors.items():
         if name in CATALOGUE and diagnosis.kind == "trajectory":
             usual = CATALOGUE[name].background
-            times = f" ({rms / usual:.2g} times the usual one)" if usual else ""
-            rows.append((words(name), f"{amount_text(name, rms)} rms{times}"))
+            times = f", {rms / usual:.2g} times the usual one" if usual else ""
+            error = diagnosis.prior_errors.get(name, 0.0)
+            hardly = "; these readings hardly see it" if error > HARDLY else ""
+            rows.append((words(name), f"{amount_text(name, rms)} rms{times}{hardly}"))
     return rows
 
 
