@@ -32,6 +32,9 @@ CROWDED = 1.5
 """Median of what neighbouring monitors leave of one another, in noise (0.67 for noise alone), above
 which few causes are not tried: a few leave most gaps between monitors as the design has them."""
 
+DOUBT = 8.0
+"""Statistic of the likeliest fault from which on it is weighed with sizes learnt without it."""
+
 CLEAR = 10.0
 """Log evidence above which small errors are there."""
 
@@ -113,18 +116,20 @@ def _among(
     narrow = replace(search, most=few, names_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(ready.problem.judgement.retaken):
-        if not _misled(explanation):
+        tried = _beside(explanation, doubted=learn)
+        if tried is None:
             break
         search.progress("background with what was found")
-        found = explanation.fit
-        errors = small.estimate(found, turns_of(explanation).whitening)
-        # the others may be the background's
-        strongest = [_strongest(explanation)] if explanation.named else []
-        small = small_errors(
-            ring, small.plain, ready.known, small.sizes, found.nuisances, strongest, errors,
+        beside, causes = tried
+        errors = small.estimate(beside, turns_of(explanation).whitening)
+        again = small_errors(
+            ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
             learn=learn, noisy=learn and ready.estimated,
         )  # fmt: skip
-        explanation = explain(replace(narrow, problem=small.problem), small.before)
+        other = explain(replace(narrow, problem=again.problem), again.before)
+        if not explanation.count and not other.count:
+            break  # it was a small error after all
+        small, explanation = again, other
     if explanation.full and search.most > few:
         explanation = explain(replace(search, problem=small.problem), small.before)
     if explanation.fit.causes and not explanation.fit.kicks:
@@ -154,15 +159,31 @@ def _strongest(explanation: Explanation) -> Cause:
     return explanation.fit.causes[int(np.argmax(clear))]
 
 
-def _misled(explanation: Explanation) -> bool:
-    """Whether a fault is so strong that small errors along its orbit look like further faults, or
-    that the errors of its own monitor have taken it up as far as they could."""
-    if explanation.monitors:
-        return True
-    if not explanation.fit.causes:
-        return False
-    left = chi2.sf(explanation.fit.chi2, freedom(turns_of(explanation).data, explanation.fit))
-    return explanation.count > 1 or bool(left < 0.01)
+def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Cause, ...]] | None:
+    """Beside which fit, and with which causes, small errors have to be taken again; None: they
+    stand.
+
+    A strong fault's orbit makes small errors look like further faults, so the strongest finding is
+    taken along. A monitor that was set aside has errors of its own that took up what they could: it
+    starts anew. And sizes that were learnt with a fault among them are too large, so that it passes
+    for a small error: where nothing was found the likeliest fault has to be weighed without it.
+    """
+    if not explanation.count:
+        scan = explanation.first
+        top = int(np.argmax(scan.statistic)) if doubted and len(scan.statistic) else -1
+        if top < 0 or scan.statistic[top] < DOUBT:
+            return None
+        name, place = scan.hypotheses[top]
+        amount = np.copysign(abs(scan.amount[top]) ** (1 / find(name).power), scan.amount[top])
+        cause = Cause(name, place, float(amount))
+        tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
+        return (tried, tried.causes) if tried.good else None
+    found = explanation.fit
+    left = chi2.sf(found.chi2, freedom(turns_of(explanation).data, found))
+    if not (explanation.monitors or (found.causes and (explanation.count > 1 or left < 0.01))):
+        return None
+    # the others may be the background's
+    return found, (_strongest(explanation),) if explanation.named else ()
 
 
 def freedom(data: Data, result: Fit) -> int:
