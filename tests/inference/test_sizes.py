@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
+from tmlattice.inference import chi2
 from tmlattice.inference.sizes import learn_sizes
 
 ROWS, LAUNCHES = 240, 8
@@ -61,3 +63,11 @@ def test_the_noise_of_each_part_is_learnt_beside_them(families, launches, rng):
     found = learn_sizes(rows, launches, families, [first, ~first])
     # (0.2, sqrt(0.04 + 0.64)) to twice the error of a width from 120 values
     assert found.noise == pytest.approx([0.2, 0.825], rel=0.3)
+
+
+def test_a_square_over_an_estimated_variance_is_as_rare_as_student_says():
+    for freedom in (5.0, 30.0):
+        square = stats.t.isf(1e-6, freedom) ** 2
+        assert stats.chi2.sf(chi2.known(square, freedom), 1) == pytest.approx(2e-6, rel=1e-6)
+        assert chi2.estimated(chi2.known(square, freedom), freedom) == pytest.approx(square)
+    assert chi2.known(30.0, np.inf) == chi2.estimated(30.0, np.inf) == 30.0

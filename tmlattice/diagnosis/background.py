@@ -148,7 +148,7 @@ def small_errors(
         noisy: so is the noise, which is a guess.
     """
     fixed, data = tuple(causes), plain.data
-    evidence, errors = None, dict[str, float]()
+    evidence, errors, opened = None, dict[str, float](), plain.open
     for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
         alone = fit(replace(plain, model=model, fixed=fixed), (), launches)
@@ -170,12 +170,16 @@ def small_errors(
                 data, shifted = (
                     replace(some, sigma=some.sigma * found.noise) for some in (data, shifted)
                 )
-        problem = replace(plain, model=model, data=shifted, fixed=fixed, spread=spread, white=None)
+            opened = (np.array([names.index(name) for name, _ in hypotheses]), found.covariance)
+        problem = replace(
+            plain, model=model, data=shifted, fixed=fixed, spread=spread, white=None, open=opened
+        )
         explained = fit(problem, (), alone.nuisances)
         launches = explained.nuisances
         problem = replace(problem, fixed=())
         small = SmallErrors(
-            problem, explained, replace(plain, data=data, white=None), tuple(hypotheses), scale,
+            problem, explained, replace(plain, data=data, white=None, open=opened),
+            tuple(hypotheses), scale,
             rms, errors, evidence,
         )  # fmt: skip
         estimate = small.estimate(explained, problem.whitening)

@@ -38,15 +38,20 @@ class Sizes:
 
     Attributes:
         scale: of each family, over its usual size, [family].
-        error: of the logarithm of each, [family].
+        covariance: of their logarithms, [family, family].
         noise: scale of each part of the noise, over its first guess, [part].
         log_evidence: over that of no small errors and the noise as guessed.
     """
 
     scale: Array
-    error: Array
+    covariance: Array
     noise: Array
     log_evidence: float
+
+    @property
+    def error(self) -> Array:
+        """Of the logarithm of each, [family]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def learn_sizes(
@@ -100,7 +105,7 @@ def learn_sizes(
     count = len(families)
     return Sizes(
         np.exp(size[:count]),
-        np.sqrt(np.diag(covariance))[:count],
+        np.asarray(covariance[:count, :count], dtype=float),
         np.exp(size[count:]),
         float(now.value + occam - none),
     )

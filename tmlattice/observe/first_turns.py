@@ -37,12 +37,15 @@ class FirstTurns(Problem):
         data: readings.
         spread: rms times signature of small errors everywhere, [error, shot, reading, 2], m, or
             None.
+        open: of which family each small error is, [error], and the covariance of the logarithms of
+            their sizes, [family, family], where those were learnt from these data; or None.
         white: the whitening where it is known already: a dense one costs a factorisation.
     """
 
     model: Model = field(repr=False)
     data: Data = field(repr=False)
     spread: Array | None = field(default=None, repr=False)
+    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
     white: Whitening | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -101,6 +104,19 @@ class FirstTurns(Problem):
             self.model, point.view, point.nuisances, self.whitening, point.projection,
             self.data.active,
         )  # fmt: skip
+
+    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
+        """By how the variance along it changes with the sizes of small errors."""
+        if self.open is None or self.spread is None or point.projection is None:
+            return np.inf
+        family, covariance = self.open
+        active = self.data.active[:, None, None]
+        seen = self.model.signatures(point.view, [hypothesis], point.nuisances)[0]
+        row = point.projection.out(self.whitening.signature(np.nan_to_num(seen) * active))
+        back = self.whitening.back(row.reshape(self.data.shots, -1)[None, :, :-5])[0]
+        squares = np.einsum("esrp,srp->e", self.spread, back, optimize=True) ** 2
+        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
+        return 2 / max(float(slope @ covariance @ slope), 1e-9)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those that sit between the same monitors as a magnet."""
