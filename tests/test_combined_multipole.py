@@ -194,7 +194,7 @@ def test_real_sextupoles_with_coils_make_the_chromaticity(name, energy, count, d
     )
     for element in lattice:
         if isinstance(element, at.Multipole) and not isinstance(element, at.Dipole):
-            element.PolynomB = np.array([*element.PolynomB[:2], 0.0])
+            element.PolynomB = np.concatenate([element.PolynomB[:2], np.zeros(6)])
     assert np.abs(ours - at.get_chrom(lattice)[:2]).min() > dropped
 
 
