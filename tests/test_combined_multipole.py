@@ -14,6 +14,7 @@ from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.ocelot_engine import OcelotEngine
+from tmlattice.maps.magnets import way_map
 from tmlattice.maps.quadratic import parts_of
 from tmlattice.optics import off_momentum, one_turn_optics
 
@@ -79,6 +80,30 @@ def test_first_turn_of_both_engines_is_that_of_the_file(lattice, ring):
         found = engine(ring).track(launches)[:, 0]
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-8, err_msg=engine.name
                                    if hasattr(engine, "name") else "at")  # fmt: skip
+
+
+def test_a_bend_with_other_fields_keeps_them_in_its_middle():
+    form = {"EntranceAngle": 0.05, "ExitAngle": 0.05, "NumIntSteps": 100}
+    others = {"PolynomA": [3e-4, 0.05, 4.0], "PolynomB": [-2e-4, 0.4, 6.0]}
+    starts = 1e-3 * np.vstack([np.zeros(4), np.eye(4)[[0, 2]]])
+    moved, tracked = [], []
+    for fields in (others, {"PolynomB": [0, 0.4, 6.0]}):
+        element = at.Dipole("B", 0.3, 0.1, 0.0, **form, **fields)
+        lattice = at.Lattice([element], energy=ENERGY * 1e9, periodicity=1)
+        found = ring_from_at(lattice, "x")
+        moved.append([way_map(found.elements, ENERGY)(start) for start in starts])
+        six = np.zeros((6, 3), order="F")
+        six[:4] = starts.T
+        tracked.append(lattice.track(six)[0][:4, :, 0, 0].T)
+        if fields is others:
+            assert [e.name for e in found.elements] == ["b", "b_coil", "b_2"]
+            assert found.pieces("b") == ("b", "b_2")
+    # what the other fields do: thin in the middle here, spread over 0.3 m there
+    effect, ours = np.subtract(*tracked), np.subtract(*moved)
+    assert np.abs(effect).max(axis=0).min() > 1e-6
+    np.testing.assert_allclose(
+        ours, effect, rtol=0.02, atol=0.02 * np.abs(effect).max(axis=0).min()
+    )
 
 
 def test_half_and_half_is_the_whole(ring):
