@@ -53,6 +53,7 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "length": ring.length,
         "counts": dict(sorted(ring.counts().items())),
         "layers": len(ring.magnets),
+        "magnets_in_pieces": len(ring.slices),
         "bend_angle": sum(e.angle for e in ring.elements if e.kind == "bend"),
         "tunes": None,
         "chromaticity": None,
@@ -86,6 +87,8 @@ def _print(facts: dict[str, Any]) -> None:
     for kind, count in facts["counts"].items():
         counts.add_row(kind, str(count))
     screen.print(counts)
+    if facts["magnets_in_pieces"]:
+        screen.print(f"{facts['magnets_in_pieces']} magnets stand in two pieces or more")
     if facts["tunes"] is not None:
         optics = table("optics", "x", "y")
         rows = [

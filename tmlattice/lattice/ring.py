@@ -279,6 +279,27 @@ class Ring:
     def __getitem__(self, name: str) -> Element:
         return self.elements[self.index(name)]
 
+    @cached_property
+    def slices(self) -> dict[int, tuple[int, ...]]:
+        """Magnets that stand in pieces: the place of the longest, and those of all; see
+        `lattice.slices`."""
+        from tmlattice.lattice.slices import slices_of
+
+        return slices_of(self.elements)
+
+    @cached_property
+    def _whole(self) -> dict[int, tuple[int, ...]]:
+        return {i: pieces for pieces in self.slices.values() for i in pieces}
+
+    def pieces(self, name: str) -> tuple[str, ...]:
+        """Names of all pieces of the magnet that an element is a piece of; else its own.
+
+        Raises:
+            UnknownNameError: no such element.
+        """
+        place = self.index(name)
+        return tuple(self.elements[i].name for i in self._whole.get(place, (place,)))
+
     def counts(self) -> dict[str, int]:
         """Number of elements by kind."""
         return dict(Counter(element.kind for element in self.elements))
