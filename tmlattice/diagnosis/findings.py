@@ -11,7 +11,7 @@ from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.remedies import credible as credible_remedies
 from tmlattice.diagnosis.remedies import remedies_of, remedy_of
-from tmlattice.diagnosis.result import VERDICTS, Finding, Member
+from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis
@@ -126,9 +126,9 @@ def with_consequences(
     """
     if not findings:
         return ()
-    told = consequences(ring, causes)
+    told = consequences(ring, faults_of(findings, causes))
     return tuple(
-        replace(f, consequences=told.get((f.effect, f.element)) if f.effect else None)
+        replace(f, consequences=told.get((f.remedy.effect, f.remedy.element)) if f.remedy else None)
         for f in findings
     )
 

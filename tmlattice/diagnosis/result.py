@@ -1,7 +1,7 @@
 """What a diagnosis says, whatever was measured: findings with what else each could be, amounts with
 errors, the gap, and the file format."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.remedies import Remedy
-from tmlattice.effects import Cause
+from tmlattice.diagnosis.remedies import Remedy, undone
+from tmlattice.effects import Cause, apply
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
@@ -133,6 +133,12 @@ class Finding:
         }
 
 
+def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """The causes, those of findings as their remedies name them."""
+    named = {(f.effect, f.element): f.remedy.cause for f in findings if f.remedy is not None}
+    return tuple(named.get((cause.effect, cause.element), cause) for cause in causes)
+
+
 @dataclass(frozen=True, eq=False)
 class TrajectoryView:
     """What only trajectories have, for plots.
@@ -186,8 +192,8 @@ class Diagnosis:
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options as used, seed, seconds.
         ring: the design.
-        repaired: the ring with the named causes in it; monitors and correctors are in
-            `calibration`.
+        repaired: the model repaired, which is the ring as found: the design with the named causes
+            in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
         view: what figures need; it says what was measured.
@@ -271,6 +277,26 @@ class Diagnosis:
             if (cause.effect, cause.element) == (effect, element):
                 return cause.amount, sigma
         raise KeyError((effect, element))
+
+    @property
+    def faults(self) -> tuple[Cause, ...]:
+        """The causes, those of findings as their remedies name them: a thin gradient that explains
+        a quadrupole's is the quadrupole's own."""
+        return faults_of(self.findings, self.causes)
+
+    @property
+    def as_found(self) -> Ring:
+        """The design with the faults in it: the machine as it is."""
+        faults = self.faults
+        return self.repaired if faults == self.causes else apply(self.ring, faults)
+
+    def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
+        """The design with the settings that take the faults away, and what settings do not mend.
+
+        Loaded into the machine as it was found, these settings make it the design again: see
+        `remedies.undone`.
+        """
+        return undone(self.ring, self.faults)
 
     @property
     def gap(self) -> dict[str, Any]:
