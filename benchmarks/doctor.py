@@ -62,7 +62,7 @@ def wrong(data, ring):
     places = np.arange(count)
     yield "x of wrong sign", scaled(data, [-1, 1]), {"x-reversed"}
     yield "y of wrong sign", scaled(data, [1, -1]), {"y-reversed"}
-    yield "x and y of wrong sign", scaled(data, -1), {"x-reversed", "y-reversed"}
+    yield "x and y of wrong sign", scaled(data, -1), {"readings-reversed"}
     swapped = replace(data, readings=data.readings[..., ::-1], noise=data.noise[:, ::-1])
     yield "planes exchanged", swapped, {"planes-exchanged"}
     yield "readings in mm", scaled(data, 1e3), {"readings-in-mm"}

@@ -32,7 +32,7 @@ ENERGY = 0.02
 ALIEN = 0.85
 """Share of the orbit that no trajectory of a section explains, of which noise or readings in no
 order leave all and strong errors everywhere 0.7: the data are of another ring."""
-FAR = 25.0
+FAR = 100.0
 """Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first monitors spoil them by."""
@@ -136,7 +136,7 @@ def _stated(ring: Ring, data: Measurement | OrbitResponse) -> Check:
 # --- first turns ----------------------------------------------------------------------------------
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
     flat = data.readings.reshape(-1, len(data.monitors), 2)
-    checks = [*signals.monitors(data.monitors, flat), *signals.first_turns(ring, data)]
+    checks = [*signals.monitors(ring, data.monitors, flat), *signals.first_turns(ring, data)]
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
     judge = Judge(ring, data, known)
@@ -280,7 +280,7 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
 
 # --- an orbit response ----------------------------------------------------------------------------
 def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
-    checks = signals.monitors(data.monitors, data.response)
+    checks = signals.monitors(ring, data.monitors, data.response)
     judge = ResponseJudge(ring, data)
     verdicts = judge.verdicts()
     for verdict in verdicts:

@@ -17,6 +17,8 @@ NAMED = 3
 """Names of monitors that a sentence has at most."""
 CUT = 3
 """Monitors without a reading, the last ones of a shot, from which the beam is said to be lost."""
+SAME_PLACE = 1e-6
+"""m."""
 STRAY = 0.02
 """Share of a turn's readings below which a turn far behind the others is a slip of the pen."""
 
@@ -27,10 +29,11 @@ def some(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
-def monitors(names: Sequence[str], values: Array) -> list[Check]:
+def monitors(ring: Ring, names: Sequence[str], values: Array) -> list[Check]:
     """Silent, frozen and copied monitors.
 
     Args:
+        ring: that they are of.
         names: of the monitors.
         values: readings, [reading, monitor, 2], m; NaN where missing.
     """
@@ -62,7 +65,7 @@ def monitors(names: Sequence[str], values: Array) -> list[Check]:
         checks.append(note("frozen monitors", said))
     else:
         checks.append(fine("frozen monitors", "no monitor always reads the same"))
-    copies = _copies(names, values, stuck)
+    copies = _copies(ring, names, values, stuck)
     if copies:
         said = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
         checks.append(note("copied monitors", said))
@@ -71,9 +74,10 @@ def monitors(names: Sequence[str], values: Array) -> list[Check]:
     return checks
 
 
-def _copies(names: Sequence[str], values: Array, stuck: Flags) -> list[str]:
-    """Signals [monitor, plane] that are equal wherever they are, in pairs."""
-    seen: dict[bytes, str] = {}
+def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> list[str]:
+    """Signals [monitor, plane] that are equal wherever they are, in pairs; but for monitors in one
+    place, which read the same where there is no noise."""
+    seen: dict[bytes, tuple[str, float]] = {}
     found = []
     for m, name in enumerate(names):
         for plane in (0, 1):
@@ -82,10 +86,10 @@ def _copies(names: Sequence[str], values: Array, stuck: Flags) -> list[str]:
                 continue
             if np.isfinite(signal).sum() < 2:
                 continue
-            own = f"{name} in {'xy'[plane]}"
+            own = f"{name} in {'xy'[plane]}", ring[name].s
             other = seen.setdefault(signal.tobytes(), own)
-            if other != own:
-                found.append(f"{other} and {own}")
+            if other != own and abs(other[1] - own[1]) > SAME_PLACE:
+                found.append(f"{other[0]} and {own[0]}")
     return found
 
 

@@ -272,6 +272,9 @@ UNIT = "give {} in {}"
 ASSUMPTIONS: dict[str, Assumption] = {
     "x-reversed": _both("x has the wrong sign at every monitor", SIGN.format("x"), _sign, -1, 1),
     "y-reversed": _both("y has the wrong sign at every monitor", SIGN.format("y"), _sign, 1, -1),
+    "readings-reversed": _both(
+        "x and y have the wrong sign at every monitor", SIGN.format("x and y"), _sign, -1, -1
+    ),
     "planes-exchanged": _both(
         "x and y are exchanged at every monitor", "exchange the columns x and y", _exchanged
     ),

@@ -20,7 +20,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
-from tmlattice.observe.sections import Found, Passes, Sections, distance
+from tmlattice.observe.sections import Found, Passes, Sections, distance, openness
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
@@ -34,21 +34,26 @@ TRUSTED = 0.03
 the first section spoil it by as much."""
 NOISE_WIDTH = np.log(3.0)
 """A stated noise is right to a factor of three, one standard deviation."""
+ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
+"""m; first turns have an orbit of a millimetre, to a factor of ten, one standard deviation."""
 GAIN, CERTAIN = 9.0, 15.0
 """Log evidence from which a global error is told, and from which it is certain: no healthy
 measurement of `benchmarks/doctor.py` gains as much."""
 SHARE = 0.65
 """Of all that it changes, how much it has to change for the better: a fault's section may win much
 by chance, but then many others lose."""
-CLEAR, FINE = 3.0, 0.1
-"""Factor by which sections or launches agree better with what was wrong undone; and the share of
-the orbit that the sections leave from which they agree anyhow, where curvature alone may tell."""
+CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
+"""Factors by which chi-square of sections or launches falls with what was wrong undone: at least;
+with a unit undone; of sections where launches say the contrary. Units are powers of a thousand."""
+RIGHT = 9.0
+"""Chi-square of launches that are right then."""
+FINE = 0.1
+"""Share of the orbit that sections leave from which they agree anyhow."""
 ALIKE = 3.0
 """Log evidence below which two assumptions explain the data alike."""
 _LAST = ("noise-from-data", "launches-unknown")  # of these others decide
 BEAM = 4
 """Assumptions, the best ones, that are tried together with every other."""
-_PAIRS: tuple[Names, ...] = (("x-reversed", "y-reversed"),)
 _TURNED = np.array([1.0, -1.0, 1.0, -1.0])
 
 
@@ -62,7 +67,10 @@ class Terms:
         freedom: of the sections' terms.
         launch: mean squares of launches, each plane's own, in units of noise and stated rms, by
             the scale of the noise: see `Judge`.
-        noise: log of what the stated noise differs by, or 0 where it is not stated.
+        stated: log of what the stated noise differs by, or 0 where it is not stated; log of the
+            orbit over a usual one; each in standard deviations.
+        blur: log of how little the readings tell of launches and joints: with next to none of them
+            anything agrees.
         level, share: of the sections: see `Found`.
         unit: chi-square per reading of a mean square of 1: of the noise as it is stated, or where
             it is not, as the best assumption leaves it.
@@ -72,7 +80,8 @@ class Terms:
     joints: Array
     freedom: NDArray[np.int64]
     launch: Array
-    noise: float
+    stated: Array
+    blur: float
     level: float
     share: float
     unit: float
@@ -83,7 +92,7 @@ class Terms:
             self.freedom / 2 * _robust(self.local / square),
             2 * _robust(self.joints / square),
             np.log(np.maximum(self.launch, 1.0)),  # their information differs
-            [(self.noise / NOISE_WIDTH) ** 2 / 2],
+            self.stated**2 / 2,
         ])  # fmt: skip
 
 
@@ -198,25 +207,29 @@ class Judge:
         """
         data = self.assumed(names)
         passes, found = self.found(data)
-        joints = [found.joints().ravel()]
+        spreads = [found.covariance[:, 1:] + found.carried[:, :-1]]
+        joints = [distance(found.start[:, 1:] - found.end[:, :-1], spreads[0]).ravel()]
         follows = np.flatnonzero((np.diff(passes.shot) == 0) & (np.diff(passes.turn) == 1))
         if len(follows):
             miss = found.start[follows + 1, 0] - found.end[follows, -1]
-            joints.append(
-                distance(miss, found.covariance[follows + 1, 0] + found.carried[follows, -1])
-            )
+            spreads.append(found.covariance[follows + 1, 0] + found.carried[follows, -1])
+            joints.append(distance(miss, spreads[1]))
         noise, unit = 0.0, 1 / square
+        orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
         if data.noise is not None:
             ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
-            noise, unit = float(np.log(ratio * np.sqrt(square))), ratio**2
+            noise, unit = float(np.log(ratio * np.sqrt(square))) / NOISE_WIDTH, ratio**2
         backwards = "beam-backwards" in names
-        launch = self._launch(data, passes, found, square, backwards)
+        launch, blur = self._launch(data, passes, found, square, backwards)
+        times = _size(data) / self.scale
+        blur += sum(openness(own / times**2) for own in spreads)
         return Terms(
             found.misfit.ravel(),
             np.concatenate(joints),
             found.freedom.ravel(),
             launch,
-            noise,
+            np.array([noise, orbit]),
+            blur,
             found.level,
             found.share(passes),
             unit,
@@ -227,7 +240,7 @@ class Judge:
         of the sections that tell them, [shot]."""
         passes, found = self.found(self.measurement)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
-        own = self._launch(self.measurement, passes, found, square, False, trusted)
+        own, _ = self._launch(self.measurement, passes, found, square, False, trusted)
         return own.reshape(-1, 2), found.misfit[first, 0]
 
     def _launch(
@@ -238,8 +251,9 @@ class Judge:
         square: float,
         backwards: bool,
         trusted: float = TRUSTED,
-    ) -> Array:
-        """Mean squares of fitted less stated launches, each plane's own, [shot * 2]."""
+    ) -> tuple[Array, float]:
+        """Mean squares of fitted less stated launches, each plane's own, [shot * 2], and log of
+        what the readings leave open of them."""
         if backwards:  # where the last turn ends, against the launches as they were stated
             last = np.flatnonzero(np.append(np.diff(passes.shot) != 0, True))
             shot, fitted = passes.shot[last], found.end[last, -1] * _TURNED
@@ -250,19 +264,24 @@ class Judge:
             first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
             shot, fitted = passes.shot[first], found.start[first, 0]
             covariance = found.covariance[first, 0]
+            energy = found.energy[first, 0]
+            covariance = covariance + energy[:, :, None] * energy[:, None]
             stated, sigma = data.launches[shot], data.launch_sigma
             J = np.tile(np.eye(4), (len(first), 1, 1))
             if passes.turn[first].any():
                 stated, J = self._carried(data, passes, first)
         if sigma is None or np.isinf(sigma[shot, :4]).all():
-            return np.zeros(0)
+            return np.zeros(0), 0.0
         own = np.minimum(sigma[shot, :4], 1e3)
         width = trusted * np.sqrt(np.mean(fitted**2, axis=0))
         spread = square * covariance + (J * own[:, None] ** 2) @ np.swapaxes(J, 1, 2)
         spread = spread + np.diag(np.maximum(width, 1e-12) ** 2)
+        times = _size(data) / self.scale
+        open_ = square * covariance / (own**2 + np.maximum(width, 1e-12) ** 2)[:, None] / times**2
+        blur = openness(np.eye(4) + open_)
         miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=1e6), -1e6, 1e6)
         planes = [distance(miss[:, p], spread[:, p, p]) for p in (slice(0, 2), slice(2, 4))]
-        return np.stack(planes, axis=1).ravel()
+        return np.stack(planes, axis=1).ravel(), blur
 
     def _carried(
         self, data: Measurement, passes: Passes, first: NDArray[np.intp]
@@ -284,15 +303,15 @@ class Judge:
         names = [n for n, a in ASSUMPTIONS.items() if a.trajectory and n not in _LAST]
         without = []
         if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
-            without += ["launches", "slopes", "positions", "beam"]
+            without += ["launches", "slopes", "positions", "beam", "readings-doubled"]
+            without += ["readings-halved", "readings-in-km"]  # only curvature would tell
         if not data.launches[:, 4].any():
             without += ["energies"]
         if not any("kick" in own for shot in data.settings for own in shot.values()):
             without += ["settings"]
         if len(data.monitors) < 4:
             without += ["monitors"]
-        found: list[Names] = [(n,) for n in names if n.split("-")[0] not in without]
-        found += _PAIRS
+        found: list[Names] = [(n,) for n in names if not {n, n.split("-")[0]} & set(without)]
         return [own for own in found if self._possible(own)]
 
     def _possible(self, names: Names) -> bool:
@@ -316,7 +335,7 @@ class Judge:
         stated = self.terms((), square)
         found = [own for names in several if (own := self._judged(names, stated, square))]
         found.sort(key=_worth, reverse=True)
-        if not found or _worth(found[0]) < GAIN:
+        if not found or found[0].gain < GAIN:
             return None
         pairs = {
             tuple(sorted({*first.names, *second}, key=list(ASSUMPTIONS).index))
@@ -328,6 +347,9 @@ class Judge:
             own for names in sorted(pairs)
             if self._possible(names) and (own := self._judged(names, stated, square))
         ]  # fmt: skip
+        found = [own for own in found if _worth(own) > GAIN and _believable(own, stated.share)]
+        if not found:
+            return None
         best = max(map(_worth, found))
         alike = [own for own in found if _worth(own) > best - ALIKE]
         first = min(alike, key=lambda own: [list(ASSUMPTIONS).index(n) for n in own.names])
@@ -340,6 +362,7 @@ class Judge:
         if not _widely(stated, other, square):
             return None
         gain = float(stated.cost(square).sum() - other.cost(square).sum())
+        gain -= max(other.blur - stated.blur, 0.0)
         return Verdict(names, gain, _levels(stated), _levels(other))
 
     def verdicts(self, most: int = 3) -> list[Verdict]:
@@ -364,8 +387,8 @@ def certain(verdict: Verdict) -> bool:
 
 
 def _worth(verdict: Verdict) -> float:
-    """Log evidence; each assumption beyond the first has to gain as much as the first."""
-    return verdict.gain - GAIN * (len(verdict.names) - 1)
+    """Log evidence; each assumption beyond the first has to be certain by itself."""
+    return verdict.gain - CERTAIN * (len(verdict.names) - 1)
 
 
 def _widely(stated: Terms, other: Terms, square: float) -> bool:
@@ -373,20 +396,33 @@ def _widely(stated: Terms, other: Terms, square: float) -> bool:
     a, b = stated.cost(square), other.cost(square)
     if len(a) != len(b):
         return True
-    local, launch = (
-        b / max(a, 1e-12) for a, b in zip(_levels(other), _levels(stated), strict=True)
-    )
-    if not (local > CLEAR or launch > CLEAR or stated.share < FINE):
-        return False  # what was wrong stays wrong
     better, worse = np.maximum(a - b, 0).sum(), np.maximum(b - a, 0).sum()
     return bool(better > SHARE * (better + worse))
 
 
+def _believable(verdict: Verdict, share: float) -> bool:
+    """Whether what was wrong is right then, and not only a little less wrong.
+
+    Args:
+        verdict: what is believed.
+        share: of the orbit that the sections leave as stated.
+    """
+    (local, launch), (local_then, launch_then) = verdict.before, verdict.after
+    local_clears, launch_clears = local / max(local_then, 1e-12), launch / max(launch_then, 1e-12)
+    if launch_then > launch and local_clears < AGAINST:
+        return False
+    unit = any("-in-" in name for name in verdict.names)
+    clear = CLEAR_UNIT if unit else CLEAR
+    if local_clears > clear or (launch_clears > clear and launch_then < RIGHT):
+        return True
+    return share < FINE and not unit  # the sections agree anyhow: curvature tells
+
+
 def _levels(terms: Terms) -> tuple[float, float]:
-    """Chi-square per reading: of the sections, of the launches; medians."""
-    return terms.unit * terms.level, float(np.median(terms.launch)) if len(terms.launch) else float(
-        "nan"
-    )
+    """Chi-square per reading: of the sections; of the launches, the worse plane."""
+    launch = terms.launch.reshape(-1, 2)
+    worse = float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
+    return terms.unit * terms.level, worse
 
 
 def _kicks(settings: Sequence[Settings]) -> Array:

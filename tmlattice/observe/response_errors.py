@@ -104,7 +104,7 @@ class ResponseJudge:
         found: list[Names] = [(n,) for n, a in ASSUMPTIONS.items() if a.response]
         if self.measured.rf is None or self.measured.rf.orbit is None:
             found = [own for own in found if not own[0].startswith("rf")]
-        return [*found, ("x-reversed", "y-reversed")]
+        return found
 
     def verdict(self) -> ResponseVerdict | None:
         """The assumption that makes the data far better, if there is one."""
@@ -116,14 +116,14 @@ class ResponseJudge:
             moved = np.abs(np.nan_to_num(change)) > np.log(2.0)
             if moved.any() and (change[moved] < 0).mean() >= SHARE:
                 gain = -float(change[moved].sum())
-                if gain > GAIN * moved.sum() / np.sqrt(len(names)):
+                if gain > GAIN * moved.sum():
                     before, after = (float(np.median(own[moved])) for own in (stated, other))
                     found.append(ResponseVerdict(names, gain, before, after))
         if not found:
             return None
         best = max(own.gain for own in found)
         alike = [own for own in found if own.gain > best - ALIKE]
-        first = min(alike, key=lambda own: len(own.names))
+        first = alike[0]
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
 
     def verdicts(self, most: int = 4) -> list[ResponseVerdict]:

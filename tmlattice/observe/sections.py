@@ -34,6 +34,8 @@ WEAK = 1e-8
 """Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
 STEPS = 6
 """Of Newton's method: the maps are nearly linear."""
+FAR_OFF = 1e15
+"""Sigma that stand for a trajectory which cannot be followed."""
 SETTLED = 1e-2
 """Change of the typical reading, in units of its noise, behind which there is no further step."""
 ENERGY = 5e-3
@@ -128,7 +130,8 @@ class Found:
         misfit: chi-square over the freedom, [pass, section].
         delta: relative energy deviation, [pass].
         start: trajectories at the sections' starts, [pass, section, 4].
-        covariance: of these, [pass, section, 4, 4].
+        covariance: of these, [pass, section, 4, 4], at a known energy.
+        energy: what they change by an energy deviation's standard error, [pass, section, 4].
         end, carried: the trajectories and covariances at the sections' ends.
     """
 
@@ -141,6 +144,7 @@ class Found:
     delta: Array
     start: Array
     covariance: Array
+    energy: Array
     end: Array
     carried: Array
 
@@ -167,18 +171,22 @@ class Found:
         part = (left**2).sum(axis=2)[enough] / self.freedom[enough]
         return float(np.median(np.sqrt(part / np.maximum(whole, 1e-60))))
 
-    def joints(self) -> Array:
-        """Chi-square over its freedom of four of where one section ends and the next begins,
-        [pass, section - 1]."""
-        return distance(
-            self.start[:, 1:] - self.end[:, :-1], self.covariance[:, 1:] + self.carried[:, :-1]
-        )
-
 
 def distance(miss: Array, covariance: Array) -> Array:
     """Mean square of what is missed, in units of its covariance, [...]."""
-    solved = np.linalg.solve(covariance, miss[..., None])[..., 0]
+    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), 1e-60))
+    even = np.nan_to_num(covariance / size[..., None] / size[..., None, :], posinf=0, neginf=0)
+    miss = np.clip(np.nan_to_num(miss / size, nan=FAR_OFF), -FAR_OFF, FAR_OFF)
+    solved = np.linalg.solve(even + 1e-9 * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
     return np.asarray(np.einsum("...i,...i->...", miss, solved) / miss.shape[-1])
+
+
+def openness(covariance: Array) -> float:
+    """Sum of the logs of their determinants' roots: how little is known, [..., n, n]."""
+    covariance = np.nan_to_num(covariance, nan=1e30, posinf=1e30, neginf=-1e30)
+    sign, log = np.linalg.slogdet(covariance)
+    diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), 1e-60)).sum(axis=-1)
+    return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: one direction hides all
 
 
 class Sections:
@@ -276,7 +284,7 @@ class Sections:
         freedom = np.maximum(np.asarray(there.sum(axis=(2, 3)), dtype=np.int64) - 4, 0)
         x = np.zeros((P, W, 5))
         x[..., 4] = passes.delta[:, None]
-        moved = np.inf
+        moved, by_energy = np.inf, np.zeros((P, W, 4))
         with np.errstate(all="ignore"):
             for step in range(STEPS):
                 image, slope = maps(x[:, :, None])
@@ -291,7 +299,9 @@ class Sections:
                 fitted = (A @ step_4[..., None])[..., 0]
                 moved, clean = float(np.nanmedian(np.abs(fitted))), left - fitted
                 alone = own - (A @ (back @ own[..., None]))[..., 0]
-                change = _shared(clean, alone, freedom, passes.delta - x[:, 0, 4], passes.alone)
+                prior = passes.delta - x[:, 0, 4]
+                change, known = _shared(clean, alone, freedom, prior, passes.alone)
+                by_energy = -(back @ own[..., None])[..., 0] / np.sqrt(known)[:, None, None]
                 step_4 = step_4 - (back @ own[..., None])[..., 0] * change[:, None, None]
                 x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
                 x[..., 4] += change[:, None]
@@ -309,6 +319,7 @@ class Sections:
             delta=x[:, 0, 4],
             start=x[..., :4],
             covariance=covariance,
+            energy=np.nan_to_num(by_energy),
             end=end[..., :4],
             carried=J @ covariance @ np.swapaxes(J, -1, -2),
         )
@@ -327,8 +338,9 @@ class Sections:
 
 def _shared(
     left: Array, slope: Array, freedom: NDArray[np.int64], prior: Array, alone: bool
-) -> Array:
-    """What all sections of a pass, or of all passes, say together of the energy, [pass].
+) -> tuple[Array, Array]:
+    """What all sections of a pass, or of all passes, say together of the energy, [pass], and one
+    over its variance.
 
     Args:
         left, slope: of the readings, cleaned of their own trajectories, [pass, section, reading].
@@ -337,12 +349,15 @@ def _shared(
         alone: see `Passes`.
     """
     misfit = (left**2).sum(axis=2) / np.maximum(freedom, 1)
-    judged = np.where(freedom > 0, misfit, np.nan)
-    level = np.nan_to_num(np.nanmedian(judged, axis=1), nan=1.0)[:, None] + 1e-12
+    level = np.array([np.median(own[free > 0]) if free.any() else 1.0
+                      for own, free in zip(misfit, freedom, strict=True)])  # fmt: skip
+    level = np.nan_to_num(level, nan=1.0)[:, None] + 1e-12
     weight = (freedom > 0) / np.maximum(misfit, level)  # a spoilt section says little
     asked = np.nan_to_num((weight * (left * slope).sum(axis=2)).sum(axis=1)) + prior / ENERGY**2
     told = np.nan_to_num((weight * (slope**2).sum(axis=2)).sum(axis=1)) + 1 / ENERGY**2
-    return asked / told if alone else np.full(len(left), asked.sum() / told.sum())
+    if alone:
+        return asked / told, told
+    return np.full(len(left), asked.sum() / told.sum()), np.full(len(left), told.sum())
 
 
 def _held(curvature: Array) -> Array:
