@@ -1,4 +1,4 @@
-"""Measured responses of real rings: `TMLATTICE_DATA=... python benchmarks/real_rings.py [NAME ...]`.
+"""Measured responses of real rings: `TMLATTICE_DATA=... python benchmarks/real_rings.py [NAME]`.
 
 Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed by the
 commands, with default options, one after another; PETRA III's folder is diagnosed as it is. Told
@@ -84,7 +84,7 @@ def ring(name, files, data, place, options):
     done, seconds = command("diagnose", lattice, folder, "--json", result, "-q",
                             "--seed", options.seed)  # fmt: skip
     row = {"ring": name, "seconds": seconds, "contradicted": told}
-    if name.endswith(".loco") or (files and files[0].name.endswith(".loco.mat")):
+    if files and files[0].name.endswith(".loco.mat"):
         row["experts"] = experts(files[0])
     row["noise"] = MICRO * float(np.nanmedian(read_measurement(folder).noise))
     if done.returncode:

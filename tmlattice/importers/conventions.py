@@ -18,6 +18,10 @@ from tmlattice.measurement import OrbitResponse
 ALIKE = 0.6
 """Correlation of a column with the design's, above which its slope says something: on ten real
 rings the median is 0.93 or more, and of random columns of twenty monitors one in 200 has 0.6."""
+ODD = 0.4
+"""Correlation below which a single one resembles nothing where most have more than 0.9."""
+SURE = 0.95
+"""Correlation above which it is another's: neighbours a tenth of a wave apart have 0.8."""
 FACTORS = {
     0.5: "half", 2.0: "twice", 1e3: "a thousand times", 1e-3: "a thousandth of",
     1e6: "a million times", 1e-6: "a millionth of",
@@ -93,6 +97,9 @@ def doubts(ring: Ring, measured: OrbitResponse) -> list[str]:
             continue
         said += _of_size(f"orbit changes in {plane} by correctors of {plane}", own.typical)
         said += _single(plane, own, [measured.correctors[i] for i in columns], measured.monitors)
+        said += _exchanged(
+            measured.response[columns, :, p], design[columns, :, p], own, measured.monitors, plane
+        )
     if rf is not None:
         found["rf"] = rf
         if np.isnan(rf.typical):
@@ -157,6 +164,23 @@ def _signs(typical: dict[str, float]) -> list[str]:
     return said
 
 
+def _exchanged(
+    measured: Array, design: Array, own: Slopes, monitors: tuple[str, ...], plane: str
+) -> list[str]:
+    """Monitors that read what the design has at another one, which is as odd itself."""
+    m = np.where(np.isfinite(measured), measured, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.outer(*(np.sqrt((a**2).sum(axis=0)) for a in (m, design)))
+        alike = np.nan_to_num(m.T @ design / size) * np.sign(own.typical)
+    odd = np.flatnonzero((np.diagonal(alike) < ODD) & m.any(axis=0))
+    return [
+        f"monitors '{monitors[i]}' and '{monitors[k]}' read each other's {plane}"
+        for i in odd
+        for k in odd
+        if i < k and min(alike[i, k], alike[k, i]) > SURE
+    ]
+
+
 def _single(plane: str, own: Slopes, correctors: list[str], monitors: tuple[str, ...]) -> list[str]:
     """Single correctors and monitors that go against the others."""
     said = []
@@ -169,4 +193,8 @@ def _single(plane: str, own: Slopes, correctors: list[str], monitors: tuple[str,
         if wrong and len(wrong) < len(names) / 2:
             said.append(f"single {what} of {plane} have the sign against the others: "
                         f"{counted(wrong)}")  # fmt: skip
+        nothing = (np.abs(alike) < ODD) & (alike != 0)
+        odd = [name for name, n in zip(names, nothing.tolist(), strict=True) if n]
+        if odd and len(odd) < len(names) / 4 and np.median(np.abs(alike)) > 0.9:
+            said.append(f"single {what} of {plane} resemble nothing in the design: {counted(odd)}")
     return said
