@@ -18,7 +18,7 @@ from tmlattice.measurement import OrbitResponse
 ALIKE = 0.6
 """Correlation of a column with the design's, above which its slope says something: on ten real
 rings the median is 0.93 or more, and of random columns of twenty monitors one in 200 has 0.6."""
-ODD = 0.4
+ODD = 0.6
 """Correlation below which a single one resembles nothing where most have more than 0.9."""
 SURE = 0.95
 """Correlation above which it is another's: neighbours a tenth of a wave apart have 0.8."""
