@@ -14,7 +14,7 @@ from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import Truth, ring_of
 from tmlattice.challenge.figures import calibration, confusion, pulls, summary
 from tmlattice.challenge.oracle import Oracle, judge
-from tmlattice.challenge.record import Places, baseline_answer, exact
+from tmlattice.challenge.record import Places, baseline_answer, exact, one_remedy
 from tmlattice.challenge.score import row_of
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
@@ -287,6 +287,27 @@ def test_within_one_monitor_gap_counts_monitors_between(small_ring):
     assert places.between(m[0], m[1]) == 0  # monitors next to each other
     assert places.between(m[0] - 0.001, m[0] + 0.001) == 1
     assert places.between(m[2] + 0.001, m[0] - 0.001) == 3
+
+
+def test_one_remedy_by_hand(small_ring):
+    """A thin gradient in the quadrupole has the true remedy; its roll, a neighbour, a second
+    finding and an open verdict have not."""
+    true = Cause("quadrupole_gradient", "QD::5", 0.08)
+
+    def told(effect, element, verdict="named", more=0):
+        remedy = {"effect": effect, "element": element}
+        one = {**finding((effect, element, 1.0)), "remedy": remedy}
+        return one_remedy(result_of(*[one] * (1 + more), verdict=verdict), true, small_ring)
+
+    assert told("quadrupole_gradient", "QD::5")
+    assert not told("quadrupole_roll", "QD::5")
+    assert not told("quadrupole_gradient", "QD::6")
+    assert not told("quadrupole_gradient", "QD::5", more=1)
+    assert not told("quadrupole_gradient", "QD::5", verdict="equivalent")
+    thin = Cause("gradient_absolute", "QD::5", 0.01)
+    one = {**finding(("x", "QD::5", 1.0)),
+           "remedy": {"effect": "quadrupole_gradient", "element": "QD::5"}}  # fmt: skip
+    assert one_remedy(result_of(one), thin, small_ring)
 
 
 def test_several_causes_need_a_finding_each():

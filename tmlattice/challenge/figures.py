@@ -73,11 +73,20 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["clean_gap_closed"] = _closed(clear)
     strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
     out["clean_gap_closed_above_20"] = _closed(strong)
+    for name in ("one_remedy", "oracle_one_remedy"):
+        out[name] = _told(clear, name)
+        out[f"{name}_above_20"] = _told(strong, name)
     out["false_refusals"] = rate([row["refused"] for row in clear])
     out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
     out["relative_to_oracle"] = _relative(clear)
     out["classes"] = classes(rows)
     return out
+
+
+def _told(rows: Sequence[Row], name: str) -> dict[str, Any]:
+    """Share of the cases of which this flag is known."""
+    told = [row.get(name) for row in rows]
+    return rate([flag for flag in told if flag is not None])
 
 
 def _exact(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.diagnosis.remedies import leading, remedies_of
 from tmlattice.effects import Cause, find
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 
 Pair = tuple[str | None, str | None]
@@ -25,6 +27,7 @@ class Places:
     """Where elements, families and monitors stand."""
 
     def __init__(self, ring: Ring) -> None:
+        self.ring = ring
         self.monitors = sorted(monitor.s for monitor in ring.monitors)
         self.s: dict[str, list[float]] = {}
         for element in ring.elements:
@@ -102,6 +105,30 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
         "probability": finding.get("probability"),
         "pull": pull,
     }
+
+
+def one_remedy(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | None:
+    """Whether the answer is one finding, named, with the remedy that takes the true cause away;
+    None of a result from before there were remedies."""
+    if any("remedy" not in finding for finding in result["findings"]):
+        return None
+    if result["verdict"] != "named" or len(result["findings"]) != 1:
+        return False
+    told, true = result["findings"][0]["remedy"], leading(ring, cause)
+    return (told["effect"], told["element"]) == (true.effect, true.element)
+
+
+def oracle_one_remedy(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
+    """The same of the exact posterior: whether one remedy, the true one, holds the mass."""
+    (oracle,) = judged["oracles"]
+    members = [m for m in oracle["posterior"] if m["probability"]]
+    causes = [Cause(m["effect"], m["element"], m["amount"]) for m in members]
+    told = remedies_of(ring, causes, [m["probability"] for m in members])
+    first = max(told, key=lambda remedy: remedy.probability, default=None)
+    if not oracle["detected"] or first is None or first.probability < DEFAULT.mass:
+        return False
+    true = leading(ring, cause)
+    return (first.effect, first.element) == (true.effect, true.element)
 
 
 def column(result: Mapping[str, Any], cause: Cause) -> str:

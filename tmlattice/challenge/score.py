@@ -30,7 +30,9 @@ from tmlattice.challenge.record import (
     column,
     exact,
     finding_row,
+    one_remedy,
     oracle_answer,
+    oracle_one_remedy,
     stated,
 )
 from tmlattice.effects import Cause, find
@@ -151,6 +153,9 @@ def row_of(
     row["answers"] = {name: _answer(answer, truth, places) for name, answer in answers.items()}
     if len(causes) == 1:
         row["column"] = column(result, causes[0])
+        row["one_remedy"] = one_remedy(result, causes[0], places.ring)
+        if judged is not None and "error" not in judged:
+            row["oracle_one_remedy"] = oracle_one_remedy(judged, causes[0], places.ring)
     if len(causes) > 1:
         visible = [cause for cause in causes if find(cause.effect).modelled]
         row["exact"] = {

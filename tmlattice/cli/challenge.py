@@ -257,6 +257,13 @@ def _print_sets(screen: "Console", result: dict[str, Any]) -> None:
         f"the oracle's class in {_share(coverage['no_larger_than_oracle'])}"
     )
     screen.print(
+        "one named finding with the element and the remedy: "
+        f"{_share(result['one_remedy'])} (the exact posterior "
+        f"{_plain(result['oracle_one_remedy'])}), at signal to noise >= 20 "
+        f"{_share(result['one_remedy_above_20'])} "
+        f"({_plain(result['oracle_one_remedy_above_20'])})"
+    )
+    screen.print(
         f"pulls of {pulls['cases']} amounts: mean {_number(pulls['mean'], '{:+.2f}')}, width "
         f"{_number(pulls['width'], '{:.2f}')} (central 68 %: "
         f"{_number(pulls['robust_width'], '{:.2f}')})"

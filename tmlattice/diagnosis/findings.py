@@ -1,13 +1,18 @@
 """What a search found, as findings: each with what else it could be, where it sits, how sure."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.consequences import consequences
+from tmlattice.diagnosis.places import between
+from tmlattice.diagnosis.remedies import credible as credible_remedies
+from tmlattice.diagnosis.remedies import remedies_of, remedy_of
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member
-from tmlattice.effects import CATALOGUE, find
+from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Detection, Rival
@@ -16,8 +21,6 @@ from tmlattice.inference.search import Explanation, Named
 from tmlattice.lattice import Element, Ring
 
 Array = NDArray[np.float64]
-Span = tuple[tuple[float, float], tuple[str, ...]]
-"""From where to where, m, and the names of the monitors there."""
 
 
 def credible(rivals: Sequence[Rival], mass: float) -> tuple[list[Rival], Array]:
@@ -47,7 +50,9 @@ def findings_of(
 
 def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: float) -> Finding:
     cause = explanation.fit.causes[k]
+    sigma = float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0)))
     members, probability = credible(named.rivals, mass)
+    remedies = remedies_of(ring, [cause, *(m.cause for m in named.rivals[1:])], probability, sigma)
     positions = [s for m in members for s in _positions(ring, m.hypothesis)]
     where, near = between(ring, positions) if positions else (None, ())
     return Finding(
@@ -55,17 +60,17 @@ def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: flo
         element=cause.element,
         s=_middle(ring, cause.element),
         amount=cause.amount,
-        amount_sigma=float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0))),
+        amount_sigma=sigma,
         unit=find(cause.effect).unit,
-        probability=float(probability[0]),
+        probability=min(remedies[0].probability, 1.0),
         detection=named.detection,
         where=where,
         near=near,
         credible_set=tuple(
-            Member(*m.hypothesis, _middle(ring, m.hypothesis[1]), float(p), m.cause.amount)
-            for m, p in zip(members, probability, strict=False)
+            _member(ring, m.cause, float(p)) for m, p in zip(members, probability, strict=False)
         ),
         mass=float(probability[: len(members)].sum()),
+        remedies=credible_remedies(remedies, mass),
     )
 
 
@@ -91,7 +96,7 @@ def _located(ring: Ring, element: Element, detection: Detection) -> Finding:
 def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
     """A monitor whose readings say so themselves."""
     where, near = between(ring, [monitor.s])
-    member = Member("monitor_dead", monitor.name, monitor.s, 1.0, amount)
+    cause = Cause("monitor_dead", monitor.name, amount)
     return Finding(
         effect="monitor_dead",
         element=monitor.name,
@@ -103,8 +108,35 @@ def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
         detection=Detection(float("inf"), float("nan"), 0.0),
         where=where,
         near=near,
-        credible_set=(member,),
+        credible_set=(_member(ring, cause, 1.0),),
         mass=1.0,
+        remedies=remedies_of(ring, [cause], [1.0], 0.0),
+    )
+
+
+def with_consequences(
+    ring: Ring, findings: Sequence[Finding], causes: Sequence[Cause]
+) -> tuple[Finding, ...]:
+    """The findings, each with what it does to the stored beam of the design's settings.
+
+    Args:
+        ring: the design.
+        findings: those that stand.
+        causes: theirs.
+    """
+    if not findings:
+        return ()
+    told = consequences(ring, causes)
+    return tuple(
+        replace(f, consequences=told.get((f.effect, f.element)) if f.effect else None)
+        for f in findings
+    )
+
+
+def _member(ring: Ring, cause: Cause, probability: float) -> Member:
+    place = _middle(ring, cause.element)
+    return Member(
+        cause.effect, cause.element, place, probability, cause.amount, remedy_of(ring, cause)
     )
 
 
@@ -118,18 +150,6 @@ def _positions(ring: Ring, hypothesis: Hypothesis) -> list[float]:
     if place is not None:
         return [place]
     return [e.s for e in ring.elements if hypothesis[1] is not None and e.family == hypothesis[1]]
-
-
-def between(ring: Ring, positions: Sequence[float]) -> Span:
-    """From the last monitor before to the first one behind."""
-    s = np.array([monitor.s for monitor in ring.monitors])
-    low, high = min(positions), max(positions)
-    before = int(np.searchsorted(s, low, side="left")) - 1
-    behind = int(np.searchsorted(s, high, side="right"))
-    start = float(s[before]) if before >= 0 else 0.0
-    end = float(s[behind]) if behind < len(s) else ring.length
-    near = [ring.monitors[i].name for i in (before, behind) if 0 <= i < len(s)]
-    return (start, end), tuple(near)
 
 
 def verdict_of(

@@ -32,6 +32,12 @@ CHANGES = {
 }
 """What is changed of a magnet under suspicion."""
 
+LEAST = 2.0
+"""Standard deviations below which a shot is not worth its time: it would tell nothing."""
+
+AMPLITUDE = 1e-3
+"""Of the proposed launches where those measured are on the axis, m."""
+
 
 @dataclass(frozen=True)
 class NextMeasurement:
@@ -67,7 +73,7 @@ def next_measurement(
     known: Sequence[Cause] = (),
     seed: int = 0,
 ) -> NextMeasurement | None:
-    """The most telling shot between two rivals; None where no candidate parts them at all.
+    """The most telling shot between two rivals; None where no candidate parts them by `LEAST`.
 
     Args:
         ring: the design.
@@ -77,6 +83,8 @@ def next_measurement(
         seed: of the candidates' phases.
     """
     launches, settings = _candidates(ring, data, (first, second), seed)
+    if not settings:
+        return None
     model = Model(ring, settings, data.turns, known)
     count = len(launches)
     sigma = np.nanmedian(data.sigma.reshape(-1, 2), axis=0)
@@ -102,16 +110,16 @@ def next_measurement(
     separation = np.einsum("sr,sr->s", clean, clean)
     for rival in (first, second):
         separation -= _absorbed(model, whitening, projection, launches, rival, clean)
-    separation = np.maximum(separation, 0.0)
+    separation = np.sqrt(np.maximum(separation, 0.0))
     best = int(separation.argmax())
-    if separation[best] <= 0:
+    if not separation[best] >= LEAST:
         return None
     names = [" ".join(w for w in rival.hypothesis if w) for rival in (first, second)]
     return NextMeasurement(
         dict(zip(LAUNCH, map(float, launches[best]), strict=True)),
         settings[best],
         (names[0], names[1]),
-        float(np.sqrt(separation[best])),
+        float(separation[best]),
     )
 
 
@@ -144,12 +152,14 @@ def _absorbed(
 def _candidates(
     ring: Ring, data: Data, rivals: Sequence[Rival], seed: int
 ) -> tuple[Array, list[Settings]]:
+    """Launches [shot, 5] and settings; none of them starts on the axis."""
     measured = data.launches[data.active]
-    launches = list(measured[:2])
+    launches = [row for row in measured[:2] if np.any(row[:4])]
     try:
         modes = one_turn_optics(Chain.from_ring(ring)).modes
         random = np.random.default_rng([seed, 3])
         size = np.linalg.norm(measured[:, :4] / np.abs(modes).max(axis=1), axis=1).mean()
+        size = size or AMPLITUDE / float(np.abs(modes[[0, 2]]).max())
         for scale in (1.0, 2.0):
             for _ in range(PHASES):
                 turn = np.exp(2j * np.pi * random.uniform(size=2))
@@ -158,19 +168,20 @@ def _candidates(
                 launches.append(row)
     except UnstableRingError:
         pass
+    if not launches:
+        return np.zeros((0, 5)), []
+    usual = launches[0]
     for delta in (1e-3, -1e-3):
-        row = launches[0].copy()
+        row = usual.copy()
         row[4] += delta
         launches.append(row)
     settings: list[Settings] = [{} for _ in launches]
+    elements = {element.name: element for element in ring.elements}
     for rival in rivals:
-        name = rival.hypothesis[1]
-        elements = {element.name: element for element in ring.elements}
-        if name in elements and elements[name].kind in CHANGES:
-            element = elements[name]
-            if element.kind == "quadrupole" and element.k1 == 0:
-                continue
-            for row in launches[:1]:
-                launches.append(row.copy())
-                settings.append({element.name: CHANGES[element.kind]})
+        element = elements.get(rival.hypothesis[1] or "")
+        if element is None or element.kind not in CHANGES:
+            continue
+        if element.kind != "quadrupole" or element.k1 != 0:
+            launches.append(usual.copy())
+            settings.append({element.name: CHANGES[element.kind]})
     return np.array(launches), settings

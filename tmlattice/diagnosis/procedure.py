@@ -16,10 +16,19 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.background import SmallErrors, small_errors
-from tmlattice.diagnosis.findings import credible, findings_of, sensitivity, unexplained, verdict_of
+from tmlattice.diagnosis.findings import (
+    credible,
+    findings_of,
+    sensitivity,
+    unexplained,
+    verdict_of,
+    with_consequences,
+)
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, prepare, same_monitors
+from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
+from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
@@ -110,7 +119,7 @@ def diagnose(
     left_out = _left_out(ready.problem, explanation, measurement.shots)
     return Diagnosis(
         verdict=told.verdict,
-        findings=told.findings,
+        findings=with_consequences(ring, told.findings, told.causes),
         fit_before=misfit(told.residuals[0], told.problem.data.sigma),
         fit_after=misfit(told.residuals[-1], told.problem.data.sigma),
         heldout=gap,
@@ -120,6 +129,7 @@ def diagnose(
         next=_next(ring, ready, explanation, seed),
         sensitivity=sensitivity(explanation.first, judgement),
         warnings=_said(said, ready, told, left_out),
+        suspects=suspects(ring, explanation, judgement) if told.verdict == "distributed" else (),
         left_out=left_out,
         noise=ready.noise,
         noise_estimated=ready.estimated,
@@ -299,11 +309,13 @@ def _next(
     ring: Ring, ready: Prepared, explanation: Explanation, seed: int
 ) -> NextMeasurement | None:
     for named in explanation.named:
-        members, _ = credible(named.rivals, ready.problem.judgement.mass)
-        if len(members) > 1:
+        first, *others = credible(named.rivals, ready.problem.judgement.mass)[0]
+        done = remedy_of(ring, first.cause)
+        other = next((rival for rival in others if remedy_of(ring, rival.cause) != done), None)
+        if other is not None:  # which of two mechanisms with one remedy it is changes nothing
             data = ready.problem.data
             try:
-                return next_measurement(ring, data, members[0], members[1], ready.known, seed)
+                return next_measurement(ring, data, first, other, ready.known, seed)
             except TmlatticeError:
                 log.warning("no next measurement could be found", exc_info=True)
     return None

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.few import few_causes
+from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.effects import apply, find, names
@@ -89,6 +90,7 @@ def diagnose_response(
         verdict = few.verdict
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     repaired = apply(ring, fit.state.at.errors.ring)
+    causes = tuple(cause for cause, _ in found)
     good = fit.state.good
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
@@ -97,7 +99,7 @@ def diagnose_response(
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     return Diagnosis(
         verdict=verdict,
-        findings=() if few is None else few.findings,
+        findings=() if few is None else with_consequences(ring, few.findings, causes),
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
         heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
@@ -112,7 +114,7 @@ def diagnose_response(
         provenance=_provenance(ring, options, seed, begun),
         ring=ring,
         repaired=repaired,
-        causes=tuple(cause for cause, _ in found),
+        causes=causes,
         errors=tuple(sigma for _, sigma in found),
         view=_view(fit),
         steps=fit.steps,

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
+from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
+from tmlattice.diagnosis.remedies import Remedy
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judge import Gap, Misfit
@@ -25,6 +27,7 @@ from tmlattice.optics import matrix_tunes
 if TYPE_CHECKING:
     from tmlattice.diagnosis.dense import Step
     from tmlattice.diagnosis.missing import Weighed
+    from tmlattice.diagnosis.suspects import Suspect
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
@@ -32,13 +35,21 @@ VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 
 @dataclass(frozen=True)
 class Member:
-    """One explanation in a credible set."""
+    """One explanation in a credible set.
+
+    Attributes:
+        effect, element, amount: see `Cause`.
+        s: middle of the element, m.
+        probability: of this explanation alone.
+        remedy: what takes it away, in words.
+    """
 
     effect: str
     element: str | None
     s: float | None
     probability: float
     amount: float
+    remedy: str
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -55,12 +66,15 @@ class Finding:
         s: middle of the element, m from the start of the sequence.
         amount, amount_sigma: in the effect's unit.
         unit: of the amount.
-        probability: of this effect at this element, given that one of the catalogue is there.
+        probability: of its remedy, given that one of the catalogue is there.
         detection: how clearly it was seen.
         where: from the last monitor before to the first one behind all members of the set, m.
         near: the names of those monitors.
         credible_set: explanations that the data do not exclude, the first is this finding.
         mass: the sum of their probabilities.
+        remedies: what takes it away, then what else might, until they hold the mass of a credible
+            set; empty without an effect.
+        consequences: what it does to the stored beam, and what is left of that after the repair.
     """
 
     effect: str | None
@@ -75,13 +89,20 @@ class Finding:
     near: tuple[str, ...]
     credible_set: tuple[Member, ...]
     mass: float
+    remedies: tuple[Remedy, ...] = ()
+    consequences: Consequences | None = None
 
     @property
     def verdict(self) -> str:
-        """Of this finding alone."""
+        """Of this finding alone: `equivalent` where places or actions differ."""
         if self.effect is None:
             return "located"
-        return "named" if len(self.credible_set) == 1 else "equivalent"
+        return "named" if len(self.remedies) == 1 else "equivalent"
+
+    @property
+    def remedy(self) -> Remedy | None:
+        """What takes it away."""
+        return self.remedies[0] if self.remedies else None
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -106,6 +127,9 @@ class Finding:
             "near": list(self.near),
             "credible_set": [member.as_json() for member in self.credible_set],
             "mass": self.mass,
+            "remedy": None if self.remedy is None else self.remedy.as_json(),
+            "or_remedies": [remedy.as_json() for remedy in self.remedies[1:]],
+            "consequences": None if self.consequences is None else self.consequences.as_json(),
         }
 
 
@@ -173,6 +197,7 @@ class Diagnosis:
         priors: rms of the families' priors, as the data have them, by name.
         degenerate: what the data alone do not settle, in words.
         hypotheses: effects that may be missing, weighed; None: not asked.
+        suspects: of a `distributed` verdict on trajectories: where to look first.
     """
 
     verdict: str
@@ -201,6 +226,7 @@ class Diagnosis:
     priors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     hypotheses: "tuple[Weighed, ...] | None" = None
+    suspects: "tuple[Suspect, ...]" = ()
 
     @property
     def kind(self) -> str:
@@ -291,6 +317,7 @@ class Diagnosis:
             ],
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             "gap": self.gap,
+            "suspects": [suspect.as_json() for suspect in self.suspects],
             "unexplained": {"patterns": None, **self.unexplained},
             "tunes": self.tunes,
             "next_measurement": None if self.next is None else self.next.as_json(),

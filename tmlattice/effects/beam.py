@@ -23,6 +23,12 @@ class EnergyOffset(LaunchEffect):
     shifts = 5
     unit = "relative"
     sign = "p of the launch += amount, common to all shots"
+    quantity = "energy"
+    remedy = "match the energy of the beam to the ring"
+    to_check = (
+        "Compare the injector's energy with the field of the ring's bends, which all may be off by "
+        "as much the other way."
+    )
     largest = 5e-3
 
     def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
@@ -43,6 +49,9 @@ class EnergySpread(LaunchEffect):
     one_sign = True
     unit = "relative"
     sign = "rms of the particles' relative energy deviation"
+    quantity = "energy spread"
+    remedy = "reduce the energy spread of the beam, or take it into the model"
+    to_check = "Measure the injector's energy spread; look at its RF phases."
     largest = 3e-3
     power = 2
 

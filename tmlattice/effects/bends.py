@@ -27,6 +27,11 @@ class DipoleField(_OnBend):
     words = "wrong field of a bending magnet"
     unit = "relative"
     sign = "px -= angle x amount: a stronger field bends towards the inside"
+    quantity = "field"
+    remedy = "set or repair the field of {}"
+    to_check = (
+        "Read back the current of its supply and of its trim winding; look for a shorted turn."
+    )
     background = 5e-4
     largest = 5e-3
 
@@ -38,6 +43,10 @@ class DipoleField(_OnBend):
         """Another field."""
         it.scale *= 1 + amount
 
+    def undone(self, element: Element, amount: float) -> Element | None:
+        """The opposite kick: the design's geometry stays."""
+        return self.changed(element, -amount, 0.0)
+
 
 @register
 class DipoleRoll(_OnBend):
@@ -47,6 +56,9 @@ class DipoleRoll(_OnBend):
     words = "bending magnet rolled about the beam axis"
     unit = "rad"
     sign = "kick (amount^2 angle / 2, -amount angle)"
+    quantity = "roll"
+    remedy = "turn {} upright"
+    to_check = "Measure its roll with a level or the survey; look at its supports."
     background = 2e-4
     largest = 5e-3
 

@@ -1,7 +1,10 @@
 """What goes wrong with correctors: their design kick is zero, their setting is each shot's own."""
 
+import math
+from typing import ClassVar
+
 from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
-from tmlattice.lattice import Element
+from tmlattice.lattice import Element, Kind
 
 
 class _OnCorrector(RingEffect):
@@ -17,6 +20,19 @@ class _Kick(_OnCorrector):
     headline = True
     unit = "rad"
     largest = 2e-4
+    remedy = "take the kick of {} away"
+    to_check = (
+        "Read back its current at setting zero: an offset of the supply, a setting that was not "
+        "recorded, a stray field beside it, or a neighbour that bends wrongly."
+    )
+    own: ClassVar[Kind]
+
+    def undone(self, element: Element, amount: float) -> Element | None:
+        """The opposite setting, where it is its own plane and the corrector is upright."""
+        plane = 0.0 if self.own == "hcorrector" else math.pi / 2  # OCELOT tilts a vertical one
+        if element.kind != self.own or abs(element.tilt + element.errors.roll - plane) > 1e-9:
+            return None
+        return element.changed(angle=element.angle - amount)
 
 
 @register
@@ -27,6 +43,8 @@ class CorrectorKickX(_Kick, ErrorEffect):
     words = "corrector that kicks horizontally beyond its setting"
     error = "kick_x"
     sign = "px += amount, whatever the setting"
+    quantity = "horizontal kick beyond its setting"
+    own = "hcorrector"
 
 
 @register
@@ -37,6 +55,8 @@ class CorrectorKickY(_Kick, ErrorEffect):
     words = "corrector that kicks vertically beyond its setting"
     error = "kick_y"
     sign = "py += amount, whatever the setting"
+    quantity = "vertical kick beyond its setting"
+    own = "vcorrector"
 
 
 @register
@@ -51,6 +71,12 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     strength = "angle"
     unit = "relative"
     sign = "kick = (1 + amount) x setting; -2 is a reversed one"
+    quantity = "calibration"
+    remedy = "calibrate {}"
+    to_check = (
+        "Step its setting and read back its current; near -200 % its cables are exchanged, near "
+        "-100 % it is off."
+    )
     background = 0.04
     largest = 2.0
 
@@ -67,5 +93,8 @@ class CorrectorRoll(_OnCorrector, ErrorEffect):
     error = "roll"
     unit = "rad"
     sign = "positive turns the kick from x towards y"
+    quantity = "roll"
+    remedy = "turn {} upright"
+    to_check = "Measure its roll; look whether its two planes' cables are mixed up."
     background = 1e-2
     largest = 0.1

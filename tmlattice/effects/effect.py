@@ -54,6 +54,10 @@ class Effect(ABC):
         usual: looked for, and drawn by the challenge, where nobody says which effects to take.
         responds: a closed orbit's response to a corrector sees it alone, to first order.
         multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
+        quantity: what the amount is of, as a remedy says it ("integrated gradient"); else `words`.
+        remedy: what takes it away, of the element's name in {}: "turn {} upright".
+        to_check: what to look at on the machine, one sentence.
+        natural: no fault: known physics that the model leaves out, and nothing is to be repaired.
     """
 
     name: ClassVar[str]
@@ -77,6 +81,10 @@ class Effect(ABC):
     usual: ClassVar[bool] = True
     responds: ClassVar[bool] = False
     multiplies: ClassVar[bool] = False
+    quantity: ClassVar[str] = ""
+    remedy: ClassVar[str] = "find out what acts at {}"
+    to_check: ClassVar[str] = "Look at what stands there, and at what its record says."
+    natural: ClassVar[bool] = False
 
     @property
     def label(self) -> str:
@@ -86,6 +94,15 @@ class Effect(ABC):
     @abstractmethod
     def places(self, ring: Ring) -> list[str | None]:
         """The elements, or families, that it can sit on, in beam order; [None] for the beam."""
+
+    def stands_for(self, element: Element) -> tuple[str, float]:
+        """The effect whose remedy takes this one away too, and its amount for 1 of this one.
+
+        At one element two effects share a remedy where the same adjustment of the element takes
+        both away, to first order in the beam's place: a thin gradient in a quadrupole is undone by
+        the quadrupole's own gradient. Most stand for themselves.
+        """
+        return self.name, 1.0
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.
@@ -154,6 +171,13 @@ class RingEffect(Effect):
     def build(self, it: Build, amount: float) -> None:
         """Put it, all causes at the element added up, into what another engine is to build."""
 
+    def undone(self, element: Element, amount: float) -> Element | None:
+        """The element set so that with this much of the effect it acts as designed.
+
+        None where no setting of its own does that: somebody has to move, turn or mend it.
+        """
+        return None
+
 
 class ErrorEffect(RingEffect):
     """An effect that is one of the errors which an element can carry.
@@ -214,6 +238,16 @@ class StrengthEffect(RingEffect):
     def build(self, it: Build, amount: float) -> None:
         """Scale the whole."""
         it.scale *= 1 + amount
+
+    def undone(self, element: Element, amount: float) -> Element | None:
+        """The strength over 1 + amount; None where that is almost no field at all."""
+        if abs(1 + amount) < LEAST_FIELD:
+            return None
+        return self.changed(element, 1 / (1 + amount) - 1, 0.0)
+
+
+LEAST_FIELD = 0.1
+"""Share of its field below which a magnet is broken: no setting makes ten times as much of it."""
 
 
 class ReadingEffect(Effect):

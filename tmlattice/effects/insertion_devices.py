@@ -17,6 +17,12 @@ class InsertionDeviceFocusing(ErrorEffect):
     error = "entrance_k1l"
     unit = "1/m"
     sign = "integrated gradient k1 L, thin, at the entrance: px -= amount x, py += amount y"
+    quantity = "additional integrated gradient"
+    remedy = "correct the focusing of {}"
+    to_check = (
+        "Read its gap and its end coils; compare the focusing in the lattice file with the one "
+        "measured, and make it good with the quadrupoles beside it."
+    )
     largest = 0.03
     sits_on_text = "wigglers"
 

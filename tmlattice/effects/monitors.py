@@ -14,6 +14,11 @@ class _Offset(ReadingEffect):
     headline = True
     unit = "m"
     sign = "reading minus beam"
+    remedy = "correct the zero of {}"
+    to_check = (
+        "Find its zero by steering the beam through the middle of the quadrupole beside it; look "
+        "for a lost offset in its electronics."
+    )
     background = 2e-4
     largest = 2e-3
     plane: int
@@ -35,6 +40,7 @@ class MonitorOffsetX(_Offset):
 
     name = "monitor_offset_x"
     words = "horizontal offset of a monitor"
+    quantity = "offset in x"
     plane = 0
 
 
@@ -44,6 +50,7 @@ class MonitorOffsetY(_Offset):
 
     name = "monitor_offset_y"
     words = "vertical offset of a monitor"
+    quantity = "offset in y"
     plane = 1
 
 
@@ -51,6 +58,11 @@ class _Gain(ReadingEffect):
     multiplies = True
     headline = True
     calibrates = True
+    remedy = "calibrate {}"
+    to_check = (
+        "Look at its attenuators, gains and cables; near -200 % two cables of the plane are "
+        "exchanged, near -100 % a signal is lost."
+    )
     unit = "relative"
     sign = "reading = (1 + amount) beam; -2 is a reversed one"
     background = 0.025
@@ -75,6 +87,7 @@ class MonitorGainX(_Gain):
     name = "monitor_gain_x"
     responds = True
     words = "wrong horizontal gain of a monitor"
+    quantity = "gain in x"
     plane = 0
 
 
@@ -85,6 +98,7 @@ class MonitorGainY(_Gain):
     name = "monitor_gain_y"
     responds = True
     words = "wrong vertical gain of a monitor"
+    quantity = "gain in y"
     plane = 1
 
 
@@ -95,6 +109,9 @@ class MonitorRoll(ReadingEffect):
     name = "monitor_roll"
     responds = True
     words = "monitor rolled about the beam axis"
+    quantity = "roll"
+    remedy = "turn {} upright, or its readings"
+    to_check = "Measure its roll, and look at how its pick-ups are mounted."
     calibrates = True
     unit = "rad"
     sign = "x_read = x cos + y sin, y_read = -x sin + y cos"
@@ -118,6 +135,9 @@ class MonitorCoupling(ReadingEffect):
     name = "monitor_coupling"
     responds = True
     words = "monitor that mixes its planes"
+    quantity = "coupling of its planes"
+    remedy = "calibrate the electronics of {}"
+    to_check = "Measure crosstalk between its channels; compare the gains of its four buttons."
     calibrates = True
     unit = "relative"
     sign = "x_read += amount y, y_read += amount x"
@@ -140,6 +160,9 @@ class MonitorSwap(ReadingEffect):
     name = "monitor_swap"
     responds = True
     words = "monitor with its planes exchanged"
+    quantity = "planes exchanged"
+    remedy = "exchange the cables of {}"
+    to_check = "Follow its cables from the pick-ups to the electronics: x and y are exchanged."
     calibrates = True
     unit = "discrete"
     sign = "1: x and y are exchanged"
@@ -161,6 +184,9 @@ class MonitorDead(ReadingEffect):
 
     name = "monitor_dead"
     words = "dead monitor"
+    quantity = "readings"
+    remedy = "repair {}"
+    to_check = "Look at its cables, power and electronics, and whether its data are refreshed."
     calibrates = True
     modelled = False
     forms: ClassVar = {1.0: "no signal", 2.0: "frozen readings"}

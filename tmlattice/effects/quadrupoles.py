@@ -27,6 +27,12 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
     strength = "k1"
     unit = "relative"
     sign = "k1 becomes (1 + amount) k1"
+    quantity = "integrated gradient"
+    remedy = "set or repair the gradient of {}"
+    to_check = (
+        "Read back the current of its supply, and compare setting, calibration and cabling; then "
+        "look for a shorted turn or a wrong tap."
+    )
     background = 1e-3
     largest = 0.3
 
@@ -50,11 +56,31 @@ class GradientAbsolute(_Gradient, ErrorEffect):
     name = "gradient_absolute"
     words = "focusing error (quadrupole field) in the middle of an element"
     error = "k1l"
+    quantity = "additional integrated gradient"
+    remedy = "take the quadrupole field at {} away"
+    to_check = (
+        "Look for a quadrupole field that the model has not: a shorted turn, a trim winding, iron "
+        "beside the beam, or a neighbour whose gradient is wrong."
+    )
     sign = "integrated k1 L, thin, in the middle: px -= amount x, py += amount y"
 
     def build(self, it: Build, amount: float) -> None:
         """A thin quadrupole."""
         it.add_gradient("middle", normal=amount)
+
+    def stands_for(self, element: Element) -> tuple[str, float]:
+        """A powered quadrupole's own gradient, or a wiggler's focusing."""
+        if element.kind == "quadrupole" and element.k1 * element.length != 0:
+            return QuadrupoleGradient.name, 1 / (element.k1 * element.length)
+        if element.kind == "wiggler":
+            return "insertion_device_focusing", 1.0
+        return self.name, 1.0
+
+    def undone(self, element: Element, amount: float) -> Element | None:
+        """As much less of a powered quadrupole's own gradient."""
+        if self.stands_for(element)[0] != QuadrupoleGradient.name:
+            return None
+        return element.changed(k1=element.k1 - amount / element.length)
 
 
 @register
@@ -64,11 +90,23 @@ class SkewGradient(_Gradient, ErrorEffect):
     name = "skew_gradient"
     words = "skew quadrupole field in the middle of an element"
     error = "k1sl"
+    quantity = "integrated skew gradient"
+    remedy = "take the skew quadrupole field at {} away"
+    to_check = (
+        "Look for a skew quadrupole that is powered, a magnet that has turned, or iron that stands "
+        "on one side of the beam."
+    )
     sign = "integrated k1s L, thin, in the middle: px += amount y, py += amount x"
 
     def build(self, it: Build, amount: float) -> None:
         """A thin skew quadrupole."""
         it.add_gradient("middle", skew=amount)
+
+    def stands_for(self, element: Element) -> tuple[str, float]:
+        """The roll of a powered quadrupole: by theta it has k1s L = -2 theta k1 L."""
+        if element.kind == "quadrupole" and element.k1 * element.length != 0:
+            return QuadrupoleRoll.name, -1 / (2 * element.k1 * element.length)
+        return self.name, 1.0
 
 
 @register
@@ -82,6 +120,12 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
     error = "roll"
     unit = "rad"
     sign = "positive turns the magnet's x axis towards y"
+    quantity = "roll"
+    remedy = "turn {} upright"
+    to_check = (
+        "Measure its roll with a level or the survey; if it stands upright, look for a skew field: "
+        "poles powered unevenly."
+    )
     background = 2e-4
     largest = 0.03
 
@@ -96,6 +140,9 @@ class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
     error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
+    quantity = "horizontal position"
+    remedy = "move {} back horizontally"
+    to_check = "Survey its horizontal position against its neighbours; look at its supports."
     background = 1e-4
     largest = 2e-3
 
@@ -110,6 +157,9 @@ class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
     error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
+    quantity = "vertical position"
+    remedy = "move {} back vertically"
+    to_check = "Survey its height against its neighbours; look at its supports and its girder."
     background = 1e-4
     largest = 2e-3
 
@@ -124,6 +174,12 @@ class FamilyGradient(_OnQuadrupole, StrengthEffect):
     strength = "k1"
     unit = "relative"
     sign = "k1 of every member becomes (1 + amount) k1"
+    quantity = "integrated gradient of every member"
+    remedy = "set or repair the supply of the family {}"
+    to_check = (
+        "Read back the current of the family's common supply with a second instrument; compare its "
+        "setting with the lattice file."
+    )
     largest = 0.05
     sits_on_text = "families of two or more quadrupoles with k1 not 0, by the family's name"
 

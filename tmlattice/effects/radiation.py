@@ -36,6 +36,9 @@ class _Loss(RingEffect):
     unit = "scale"
     sign = "0: no loss, 1: the expected loss; adds to what the model has"
     largest = 1.2
+    remedy = "let the model radiate"
+    to_check = "Nothing at the machine: diagnose again with --radiation."
+    natural = True
     kind: str
 
     def sits_on(self, element: Element) -> bool:
@@ -70,6 +73,7 @@ class RadiationLossBends(_Loss):
 
     name = "radiation_loss_bends"
     words = "energy loss by radiation in the bends"
+    quantity = "energy loss in the bends"
     kind = "bend"
     sits_on_text = "all bends at once"
 
@@ -80,6 +84,7 @@ class RadiationLossWigglers(_Loss):
 
     name = "radiation_loss_wigglers"
     words = "energy loss by radiation in the wigglers"
+    quantity = "energy loss in the wigglers"
     kind = "wiggler"
     sits_on_text = "all wigglers at once"
 

@@ -23,6 +23,12 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
     strength = "k2"
     unit = "relative"
     sign = "k2 becomes (1 + amount) k2; -2 is a reversed one"
+    quantity = "integrated strength"
+    remedy = "set or repair the strength of {}"
+    to_check = (
+        "Read back the current of its supply; near -200 % its cables are exchanged, near -100 % it "
+        "is off."
+    )
     background = 5e-3
     largest = 2.0
 
@@ -38,6 +44,9 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
+    quantity = "horizontal position"
+    remedy = "move {} back horizontally"
+    to_check = "Survey its horizontal position against the quadrupoles beside it."
     background = 1e-4
     largest = 3e-3
 
@@ -53,5 +62,8 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
+    quantity = "vertical position"
+    remedy = "move {} back vertically"
+    to_check = "Survey its height against the quadrupoles beside it."
     background = 1e-4
     largest = 3e-3

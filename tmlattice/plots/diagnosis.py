@@ -12,6 +12,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
+from tmlattice.plots.readings import AFTER, BEFORE, mark, plot_readings, readings_caption
 from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import lattice_strip
 
@@ -28,8 +29,6 @@ COLOURS: Mapping[str, str] = {
 }
 """By the group of an effect."""
 
-BEFORE, AFTER = "C0", "C3"
-
 WIDE = 300.0
 """A finding whose place is wider than this is not drawn near by, m."""
 
@@ -39,7 +38,7 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     own = _trajectory_figures if diagnosis.kind == "trajectory" else response_figures
     yield from own(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
-        if len(finding.credible_set) > 1:
+        if len(finding.remedies) > 1:
             height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
             _, ax = plt.subplots(figsize=(9, height), layout="constrained")
             plot_credible_set(finding, ax)
@@ -53,7 +52,7 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
 def _trajectory_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     yield (
         "readings",
-        "Readings of one shot of the fit, and what each model leaves of them, its launch fitted.",
+        readings_caption(diagnosis),
         plot_readings(diagnosis),
     )
     yield (
@@ -85,80 +84,6 @@ def _figure(ax: Axes) -> Figure:
     figure = ax.figure
     assert isinstance(figure, Figure)
     return figure
-
-
-# --- readings -------------------------------------------------------------------------------------
-def plot_readings(
-    diagnosis: Diagnosis, figure: Figure | None = None, shot: int | None = None
-) -> Figure:
-    """First-turn readings of a shot of the fit and what the design and the repaired ring leave.
-
-    Args:
-        diagnosis: of `diagnose`.
-        figure: an empty one; else a new one.
-        shot: its place among those of the fit; else the one with the largest residual.
-    """
-    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
-    data, found = diagnosis.trajectories.data, diagnosis.explanation
-    explained = diagnosis.verdict != "distributed"
-    models = [found.before.point.view.readings]
-    if explained:
-        models.append(found.fit.point.view.readings)
-    monitors = diagnosis.ring.monitors
-    readings = np.where(data.valid, data.readings, np.nan)
-    if shot is None:
-        left = np.nan_to_num(readings - models[0]) ** 2 * data.active[:, None, None]
-        shot = int(left.sum(axis=(1, 2)).argmax())
-    first = slice(0, len(monitors))
-    s = np.array([monitor.s for monitor in monitors])
-    read, dropped = readings[shot, first], found.dropped[shot, first]
-    grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
-    names = ("design", "with the findings")
-    styles = ((BEFORE, "-"), (AFTER, "-"))
-    for plane, name in enumerate("xy"):
-        orbit, residual = grid[2 * plane], grid[2 * plane + 1]
-        orbit.plot(s, 1e3 * read[:, plane], "k.", ms=3, label="read by the monitors")
-        sigma = 1e3 * diagnosis.noise[plane]
-        residual.axhspan(-2 * sigma, 2 * sigma, color="0.88", zorder=0, label="noise, 2 rms")
-        texts = []
-        for model, label, (colour, style) in zip(models, names, styles, strict=False):
-            predicted = model[shot, first, plane]
-            orbit.plot(s, 1e3 * predicted, style, color=colour, linewidth=0.9, label=label)
-            left = np.where(dropped[:, plane], np.nan, read[:, plane] - predicted)
-            residual.plot(s, 1e3 * left, color=colour, linewidth=0.9)
-            rms = np.sqrt(np.nanmean(left**2)) if np.isfinite(left).any() else np.nan
-            texts.append(f"{1e6 * rms:.1f}")
-        if dropped[:, plane].any():
-            at = dropped[:, plane]
-            orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="left out")
-        orbit.set_ylabel(f"{name} [mm]")
-        residual.set_ylabel(f"residual {name} [mm]")
-        after = f", after {texts[1]}" if len(texts) > 1 else ""
-        residual.annotate(
-            f"rms before {texts[0]}{after}, noise {1e3 * sigma:.1f} µm (grey: 2 rms)",
-            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
-        )  # fmt: skip
-        low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.3 * (high - low))  # room for the words
-        for ax in (orbit, residual):
-            _mark(ax, diagnosis)
-            ax.grid(alpha=0.25)
-    grid[0].legend(
-        loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize="small", frameon=False
-    )
-    grid[0].set_title(f"Shot {shot + 1} of the {len(readings)} of the fit", loc="left")
-    lattice_strip(diagnosis.ring, grid[4])
-    _mark(grid[4], diagnosis)
-    return figure
-
-
-def _mark(ax: Axes, diagnosis: Diagnosis) -> None:
-    """A dotted line, or a band, where the findings sit."""
-    for finding in diagnosis.findings:
-        if finding.effect is None and finding.where is not None:
-            ax.axvspan(*finding.where, color="gold", alpha=0.4, linewidth=0, zorder=0)
-        elif finding.s is not None:
-            ax.axvline(finding.s, color="0.45", linestyle=":", linewidth=1.1, zorder=0.5)
 
 
 # --- the scan -------------------------------------------------------------------------------------
@@ -194,7 +119,7 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
         markerscale=3,
     )  # fmt: skip
     lattice_strip(diagnosis.ring, strip)
-    _mark(strip, diagnosis)
+    mark(strip, diagnosis)
     return figure
 
 
@@ -235,7 +160,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
         markerscale=1.3,
     )  # fmt: skip
     lattice_strip(diagnosis.ring, strip)
-    _mark(strip, diagnosis)
+    mark(strip, diagnosis)
     ax.set_xlim(low, high)
     return figure
 
@@ -320,7 +245,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
 
 
 def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> None:
-    _mark(ax, diagnosis)
+    mark(ax, diagnosis)
     low, high = span or (0.0, diagnosis.ring.length)
     placed = [
         (finding.s if finding.s is not None else float(np.mean(finding.where)), finding)

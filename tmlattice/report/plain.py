@@ -16,6 +16,7 @@ from tmlattice.report.text import (
     next_text,
     noise_text,
     sensitivity_rows,
+    suspect_rows,
     title,
     tune_texts,
     verdict_sentence,
@@ -23,6 +24,8 @@ from tmlattice.report.text import (
 )
 
 WIDTH = 100
+
+SUSPECTS = "Suspects, not findings; each explains much of it, and is where to look first:"
 
 
 def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
@@ -32,13 +35,17 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         diagnosis: of `diagnose`.
         width: columns.
     """
-    lines = [*wrapped(f"{diagnosis.verdict.upper()}. {verdict_sentence(diagnosis)}", "", width)]
+    lines = [*wrapped(f"{diagnosis.verdict.upper()}: {verdict_sentence(diagnosis)}", "", width)]
     for number, finding in enumerate(diagnosis.findings, 1):
         lines += ["", *wrapped(title(finding), f"{number}. ", width)]
         for name, text in finding_rows(finding):
             for i, part in enumerate(text.split("\n")):
                 label = f"   {name if i == 0 else '':<13}"
                 lines += wrapped(part, label, width)
+    if diagnosis.suspects:
+        lines += ["", *wrapped(SUSPECTS, "", width)]
+        for kind, place, what in suspect_rows(diagnosis):
+            lines += wrapped(f"{place}: {what}", f"   {kind:<13}", width)
     more = next_text(diagnosis) or advice(diagnosis)
     if more:
         lines += ["", *wrapped(more, "Next: ", width)]

@@ -8,66 +8,21 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from tmlattice.diagnosis.result import Diagnosis, Finding, Member
-from tmlattice.effects import CATALOGUE, find
+from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.effects import find
+from tmlattice.report.amounts import amount_text, least_text, probability_text, words
+from tmlattice.report.remedies import (
+    consequence_text,
+    mechanism_text,
+    or_text,
+    remedy_text,
+    title,
+)
 
-_SCALES = {
-    "relative": ((0.0, 100.0, "%"),),
-    "m": ((0.0, 1e6, "µm"), (1e-3, 1e3, "mm")),
-    "rad": ((0.0, 1e6, "µrad"), (1e-3, 1e3, "mrad")),
-    "1/m": ((0.0, 1.0, "1/m"),),
-    "scale": ((0.0, 1.0, "x expected"),),
-}
-"""By unit of the catalogue: from which modulus on, factor, readable unit."""
+__all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  # of its page too
 
 
 # --- words for parts ------------------------------------------------------------------------------
-def words(effect: str) -> str:
-    """An effect of the catalogue in plain words."""
-    return CATALOGUE[effect].words if effect in CATALOGUE else effect.replace("_", " ")
-
-
-def _scale(effect: str, amount: float) -> tuple[float, str]:
-    unit = find(effect).unit
-    steps = _SCALES.get(unit, ((0.0, 1.0, unit),))
-    _, factor, name = [step for step in steps if abs(amount) >= step[0] or step[0] == 0][-1]
-    return factor, name
-
-
-def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
-    """An amount in a readable unit, with its error to two digits where it has one.
-
-    Args:
-        effect: of the catalogue.
-        amount, sigma: in the effect's unit.
-    """
-    if find(effect).discrete:
-        return find(effect).forms.get(amount, "")
-    factor, unit = _scale(effect, amount)
-    value = factor * amount
-    if sigma is None or not 0 < sigma < np.inf:
-        return f"{value:.3g} {unit}"
-    error = factor * sigma
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
-    return f"{value:+.{digits}f} ± {error:.{digits}f} {unit}"
-
-
-def least_text(effect: str, amount: float) -> str:
-    """The least amount that would be seen; a fault's largest where that is less."""
-    kind = find(effect)
-    if not amount <= kind.largest:
-        return f"not even the largest fault, {amount_text(effect, kind.largest)}"
-    return amount_text(effect, amount)
-
-
-def member_text(member: Member) -> str:
-    """One explanation of a credible set."""
-    place = "" if member.element is None else f" at {member.element}"
-    s = "" if member.s is None else f" (s = {member.s:.1f} m)"
-    amount = amount_text(member.effect, member.amount)
-    return f"{words(member.effect)}{place}{s}" + (f", {amount}" if amount else "")
-
-
 def place_text(finding: Finding) -> str:
     """Where a finding sits: metres, and the monitors on both sides."""
     if finding.where is None:
@@ -82,21 +37,6 @@ def place_text(finding: Finding) -> str:
     if finding.s is None:
         return f"s = {span}{between}"
     return f"s = {finding.s:.2f} m; from {span}{between}"
-
-
-def title(finding: Finding) -> str:
-    """A finding in one line."""
-    if finding.effect is None:
-        return "something that no effect of the catalogue explains"
-    name = words(finding.effect)
-    return name if finding.element is None else f"{name}: {finding.element}"
-
-
-def probability_text(probability: float) -> str:
-    """In per cent; never more certain than the numbers allow."""
-    if probability > 0.9995:
-        return "> 99.9 %"
-    return f"{100 * probability:.1f} %" if probability > 0.001 else "< 0.1 %"
 
 
 def closed_text(diagnosis: Diagnosis) -> str:
@@ -124,22 +64,11 @@ def closed_text(diagnosis: Diagnosis) -> str:
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
     found = diagnosis.findings
-    count = len(found)
-    many = f"{count} causes" if count > 1 else "One cause"
     if diagnosis.verdict == "named":
-        what = "; ".join(_short(finding) for finding in found)
-        return f"{many} explain{'' if count > 1 else 's'} the gap: {what}."
+        many = f"{len(found)} faults: " if len(found) > 1 else ""
+        return many + "; ".join(_short(finding) for finding in found) + "."
     if diagnosis.verdict == "equivalent":
-        what = "; ".join(_short(finding) for finding in found)
-        several = [finding for finding in found if finding.verdict == "equivalent"]
-        if count > 1:
-            open_ = f"for {len(several)} of them the data allow other explanations too"
-        else:
-            others = len(found[0].credible_set) - 1
-            open_ = "but these readings do not exclude " + (
-                "another explanation" if others == 1 else f"{others} other explanations"
-            )
-        return f"Likeliest: {what}; {open_}."
+        return "; ".join(_open(finding) for finding in found) + "."
     if diagnosis.verdict == "located":
         places = [f for f in found if f.effect is None and f.where is not None]
         where = "; ".join(f"{f.where[0]:.1f} m to {f.where[1]:.1f} m" for f in places if f.where)
@@ -171,13 +100,26 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _short(finding: Finding) -> str:
-    if finding.effect is None:
+    if finding.remedy is None:
         low, high = finding.where or (float("nan"), float("nan"))
         return f"something unnamed at {low:.1f} m to {high:.1f} m"
-    amount = ""
-    if finding.amount is not None:
-        amount = amount_text(finding.effect, finding.amount, finding.amount_sigma)
-    return title(finding) + (f", {amount}" if amount else "")
+    return remedy_text(finding.remedy)
+
+
+SAID = 2
+"""Other remedies that a sentence names."""
+
+
+def _open(finding: Finding) -> str:
+    """A finding, and what else it may be."""
+    text, others = _short(finding), finding.remedies[1:]
+    if not others:
+        return text
+    more = len(others) - SAID
+    also = [remedy_text(remedy) for remedy in others[:SAID]]
+    also += [f"{more} more"] if more > 0 else []
+    chance = probability_text(finding.probability)
+    return f"likeliest ({chance}) {text}; the data do not exclude " + ", or ".join(also)
 
 
 def advice(diagnosis: Diagnosis) -> str:
@@ -224,8 +166,6 @@ def _enough(separation: float) -> str:
     """How many such shots make 5 standard deviations."""
     if separation >= 5:
         return "."
-    if separation < 1:
-        return ": too few; no candidate does better."
     return f"; {int(np.ceil((5 / separation) ** 2))} such shots reach 5."
 
 
@@ -259,20 +199,20 @@ def left_text(diagnosis: Diagnosis) -> str:
 def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     """What is known of a finding: (name, text)."""
     rows = []
-    if finding.effect is not None:
-        rows.append(("effect", f"{finding.effect}: {find(finding.effect).sign}"))
-        if finding.element is not None:
-            rows.append(("element", finding.element))
+    remedy = finding.remedy
+    if remedy is not None:
+        rows += [("remedy", remedy.action), ("check", find(remedy.effect).to_check)]
     rows.append(("place", place_text(finding)))
-    if finding.effect is not None and finding.amount is not None:
-        amount = amount_text(finding.effect, finding.amount, finding.amount_sigma)
-        if amount:
-            rows.append(("amount", amount))
-    if finding.effect is not None:
+    consequence = consequence_text(finding)
+    if consequence:
+        rows.append(("stored beam", consequence))
+    if remedy is not None:
         rows.append(("probability", probability_text(finding.probability)))
     rows.append(("seen", _seen_text(finding)))
-    if len(finding.credible_set) > 1:
-        rows.append(("or else", _others_text(finding.credible_set[1:])))
+    if remedy is not None:
+        rows.append(("mechanism", mechanism_text(remedy)))
+    if len(finding.remedies) > 1:
+        rows.append(("or else", or_text(finding, MOST)))
     return rows
 
 
@@ -289,15 +229,7 @@ def _chance(p_value: float) -> str:
 
 
 MOST = 6
-"""Other members of a credible set that a finding lists."""
-
-
-def _others_text(members: Sequence[Member]) -> str:
-    shown = [f"{probability_text(m.probability)} {member_text(m)}" for m in members[:MOST]]
-    if len(members) > MOST:
-        rest = sum(m.probability for m in members[MOST:])
-        shown.append(f"{len(members) - MOST} more ({probability_text(rest)} together)")
-    return "\n".join(shown)
+"""Other remedies that a finding lists."""
 
 
 def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
@@ -347,6 +279,25 @@ def sensitivity_rows(
     known = diagnosis.sensitivity
     chosen = known if effects is None else effects
     return [(words(name), least_text(name, known[name])) for name in chosen if name in known]
+
+
+def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Where to look first where nothing explains the data: (kind, where, what would explain most).
+
+    Suspects, not findings.
+    """
+    rows: list[tuple[str, str, str]] = []
+    for one in diagnosis.suspects:
+        low, high = one.where
+        place = one.element
+        if one.kind == "section":
+            place = f"s = {low:.1f} m to {high:.1f} m"
+            place += f", {' to '.join(dict.fromkeys(one.near))}" if one.near else ""
+        what = "something without a name" if one.effect is None else words(one.effect)
+        if one.kind == "section" and one.effect is not None:
+            what += f", {one.element}"
+        rows.append((one.kind, place, f"{what} (statistic {one.statistic:.4g})"))
+    return rows
 
 
 # --- lines of text --------------------------------------------------------------------------------

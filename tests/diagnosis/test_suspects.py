@@ -1,0 +1,51 @@
+"""Where to look first, where nothing explains the data."""
+
+import pytest
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.report.page import page
+
+SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}
+
+
+@pytest.fixture(scope="module")
+def among_small_errors(small_ring):
+    """A wrong monitor, a corrector and a magnet, all strong, among errors everywhere."""
+    name = next(e.name for e in small_ring.elements if e.kind == "hcorrector")
+    causes = [
+        Cause("monitor_gain_x", "end_3", -2.0),
+        Cause("corrector_kick_x", name, 1e-4),
+        Cause("quadrupole_gradient", "QD::5", -0.05),
+    ]
+    small = {"quadrupole_gradient": 5e-3, "quadrupole_offset_y": 1e-5}
+    data = simulate(small_ring, causes, background=small, **SHOTS).measurement()
+    return causes, diagnose(small_ring, data, max_effects=3)
+
+
+def test_strong_faults_among_small_errors_are_suspects_and_no_findings(
+    small_ring, among_small_errors
+):
+    causes, result = among_small_errors
+    assert (result.verdict, result.findings) == ("distributed", ())
+    (monitor, corrector, magnet) = causes
+    by_kind = {}
+    for one in result.suspects:
+        by_kind.setdefault(one.kind, []).append(one)
+    assert by_kind["monitor"][0].element == monitor.element
+    assert corrector.element in [one.element for one in by_kind["corrector"]]
+    s = small_ring[magnet.element].s
+    assert any(one.where[0] <= s <= one.where[1] for one in by_kind["section"])
+    assert all(len(some) <= 3 for some in by_kind.values())
+
+
+def test_page_lists_suspects(among_small_errors):
+    html = page(among_small_errors[1], [])
+    assert "Not findings" in html
+    assert "end_3" in html
+
+
+def test_named_verdict_has_no_suspects(small_ring):
+    data = simulate(small_ring, [Cause("quadrupole_gradient", "QD::5", -0.05)], **SHOTS)
+    result = diagnose(small_ring, data.measurement())
+    assert result.verdict == "named"
+    assert result.suspects == ()

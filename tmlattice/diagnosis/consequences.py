@@ -1,0 +1,173 @@
+"""What a finding does to the stored beam, and what is left of that after its repair.
+
+All of it comes from one closed orbit and the layers' Jacobians about it, in six coordinates at the
+ring's energy; only the layers that a cause touches are made anew.
+
+>>> told = consequences(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)])
+>>> told["quadrupole_gradient", "qd::12"].found.beta_beat_rms
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
+from tmlattice.beam.chain import Chain
+from tmlattice.beam.layers import Layers
+from tmlattice.diagnosis.remedies import undone
+from tmlattice.effects import Cause, RingEffect, changed_elements, find
+from tmlattice.errors import TmlatticeError
+from tmlattice.lattice import Element, Ring
+from tmlattice.maps import TaylorMap
+from tmlattice.optics import normal_modes
+
+Array = NDArray[np.float64]
+Pair = tuple[float, float]
+"""(x, y)."""
+
+
+@dataclass(frozen=True)
+class Beam:
+    """The stored beam of a ring beside the design's, at the exits of all magnets.
+
+    Attributes:
+        tunes: fractions of Qx, Qy.
+        beta_beat_rms, beta_beat_max: of beta / beta of the design - 1.
+        dispersion_rms: of the change of the dispersion, m.
+        orbit_rms: of the closed orbit, m.
+    """
+
+    tunes: Pair
+    beta_beat_rms: Pair
+    beta_beat_max: Pair
+    dispersion_rms: Pair
+    orbit_rms: Pair
+
+
+@dataclass(frozen=True)
+class Consequences:
+    """Of one finding; None where the ring has no stable closed orbit.
+
+    Attributes:
+        design: tunes of the design.
+        found: with everything that was found.
+        repaired: with this finding repaired and the others still there.
+    """
+
+    design: Pair | None
+    found: Beam | None
+    repaired: Beam | None
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {
+            "design_tunes": None if self.design is None else list(self.design),
+            "found": _json(self.found),
+            "repaired": _json(self.repaired),
+        }
+
+
+def _json(beam: Beam | None) -> dict[str, Any] | None:
+    return None if beam is None else {name: list(pair) for name, pair in asdict(beam).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Optics:
+    """Tunes [2]; beta, dispersion and orbit [layer + 1, 2], m."""
+
+    tunes: Array
+    beta: Array
+    dispersion: Array
+    orbit: Array
+
+
+def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Consequences]:
+    """What each cause does to the stored beam, by effect and element.
+
+    Those of monitors, of the beam itself and of what acts on settings alone do nothing to the
+    stored beam of the design's settings, and have none; nor has what is no fault.
+
+    Args:
+        ring: the design.
+        causes: all that were found.
+    """
+    felt = [cause for cause in causes if _felt(cause.effect)]
+    if not felt:
+        return {}
+    there = assembly(ring)
+    design = _optics(there, {})
+    found = _beside(design, _optics(there, _changed(ring, ring, causes)))
+    told: dict[Hypothesis, Consequences] = {}
+    for cause in felt:
+        others = [c for c in causes if c is not cause]
+        mended, by_hand = undone(ring, [cause])
+        changed = _changed(ring, mended, others if by_hand else causes)
+        told[cause.effect, cause.element] = Consequences(
+            None if design is None else _pair(design.tunes),
+            found,
+            _beside(design, _optics(there, changed)),
+        )
+    return told
+
+
+def _felt(effect: str) -> bool:
+    kind = find(effect)
+    return isinstance(kind, RingEffect) and not kind.acts_on_settings and not kind.natural
+
+
+def _changed(ring: Ring, mended: Ring, causes: Sequence[Cause]) -> dict[int, Element]:
+    """Elements that differ from the ring's where causes act on a ring with other settings."""
+    both = enumerate(zip(ring.elements, mended.elements, strict=True))
+    settings = {i: new for i, (old, new) in both if new is not old}
+    return settings | changed_elements(mended, causes)
+
+
+def _optics(there: Assembly, changed: Mapping[int, Element]) -> _Optics | None:
+    """Of the ring with these elements; None where it has no stable closed orbit."""
+    layers = Layers.of(there.maps)
+    layers.put(there.layers_with(changed))
+    W0, W1, W2 = layers.W
+    maps = replace(
+        there.maps, W0=W0[:-1], W1=W1[:-1], W2=W2[:-1], closing=TaylorMap([w[-1] for w in layers.W])
+    )
+    try:
+        path, total = Chain(maps).closed_orbit()
+        turn = total[-1]
+        values, modes = normal_modes(turn[:4, :4])
+    except (TmlatticeError, np.linalg.LinAlgError):
+        return None
+    start = np.linalg.solve(np.eye(4) - turn[:4, :4], turn[:4, 5])
+    vectors = total[:-1, :4, :4] @ modes
+    position = np.stack([vectors[:, 0, 0], vectors[:, 2, 1]], axis=-1)
+    dispersion = total[:-1, :4, :4] @ start + total[:-1, :4, 5]
+    return _Optics(
+        tunes=np.angle(values) / (2 * np.pi) % 1.0,
+        beta=np.abs(position) ** 2,
+        dispersion=dispersion[:, [0, 2]],
+        orbit=path[:-1][:, [0, 2]],
+    )
+
+
+def _beside(design: _Optics | None, ring: _Optics | None) -> Beam | None:
+    if design is None or ring is None:
+        return None
+    beat = ring.beta / design.beta - 1
+
+    def rms(values: Array) -> Pair:
+        return _pair(np.sqrt(np.mean(values**2, axis=0)))
+
+    return Beam(
+        tunes=_pair(ring.tunes),
+        beta_beat_rms=rms(beat),
+        beta_beat_max=_pair(np.abs(beat).max(axis=0)),
+        dispersion_rms=rms(ring.dispersion - design.dispersion),
+        orbit_rms=rms(ring.orbit),
+    )
+
+
+def _pair(values: Array) -> Pair:
+    x, y = values.tolist()
+    return x, y

@@ -1,0 +1,156 @@
+"""The readings of one shot along the ring, and what the models leave of them."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.effects import RingEffect, find
+from tmlattice.inference.newton import fit
+from tmlattice.observe.first_turns import turns_of
+from tmlattice.plots.strip import lattice_strip
+
+Array = NDArray[np.float64]
+
+BEFORE, AFTER = "C0", "C3"
+
+ENOUGH = 4
+"""Monitors before a finding that tell the launch without it."""
+
+
+def _starts(finding: Finding) -> float | None:
+    """Where a finding begins to act on the trajectory; None where it does not, or everywhere."""
+    if finding.effect is not None and not isinstance(find(finding.effect), RingEffect):
+        return None
+    if finding.s is not None:
+        return finding.s
+    return None if finding.where is None or finding.effect is not None else finding.where[0]
+
+
+def before_findings(diagnosis: Diagnosis) -> NDArray[np.bool_] | None:
+    """The monitors before the first place where something acts, [monitor]; None where there is no
+    such place, or too few of them."""
+    starts = [s for finding in diagnosis.findings if (s := _starts(finding)) is not None]
+    if not starts:
+        return None
+    before = np.array([monitor.s for monitor in diagnosis.ring.monitors]) < min(starts)
+    return before if before.sum() >= ENOUGH else None
+
+
+def readings_caption(diagnosis: Diagnosis) -> str:
+    """What the figure of the readings shows."""
+    if before_findings(diagnosis) is None:
+        return (
+            "Readings of one shot of the fit, and what each model leaves of them, its launch "
+            "fitted."
+        )
+    return (
+        "Readings of one shot of the fit, and what each model leaves of them. The launch of the "
+        "design is fitted to the monitors before the first finding alone, so that the gap is seen "
+        "to begin there."
+    )
+
+
+def design_readings(diagnosis: Diagnosis) -> Array:
+    """What the design predicts of the shots of the fit, its launches fitted to the monitors before
+    the first finding, else to all, [shot, reading, 2], m."""
+    found = diagnosis.explanation
+    before = before_findings(diagnosis)
+    if before is None:
+        return np.asarray(found.before.point.view.readings)
+    problem = turns_of(found)
+    behind = np.ones(problem.valid.shape, dtype=bool)
+    behind[:, : len(before)] = ~before[:, None]  # later turns are behind all of it
+    alone = fit(problem.without(behind), (), found.before.nuisances)
+    if alone.point.projection is None:  # lost
+        return np.asarray(found.before.point.view.readings)
+    return np.asarray(alone.point.view.readings)
+
+
+def plot_readings(
+    diagnosis: Diagnosis, figure: Figure | None = None, shot: int | None = None
+) -> Figure:
+    """First-turn readings of a shot of the fit and what the design and the repaired ring leave.
+
+    Args:
+        diagnosis: of `diagnose`.
+        figure: an empty one; else a new one.
+        shot: its place among those of the fit; else the one with the largest residual.
+    """
+    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+    data, found = diagnosis.trajectories.data, diagnosis.explanation
+    explained = diagnosis.verdict != "distributed"
+    models, before = [design_readings(diagnosis)], before_findings(diagnosis)
+    if explained:
+        models.append(found.fit.point.view.readings)
+    monitors = diagnosis.ring.monitors
+    readings = np.where(data.valid, data.readings, np.nan)
+    if shot is None:
+        left = np.nan_to_num(readings - models[0]) ** 2 * data.active[:, None, None]
+        shot = int(left.sum(axis=(1, 2)).argmax())
+    first = slice(0, len(monitors))
+    s = np.array([monitor.s for monitor in monitors])
+    read, dropped = readings[shot, first], found.dropped[shot, first]
+    grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
+    names = ("design", "with the findings")
+    styles = ((BEFORE, "-"), (AFTER, "-"))
+    for plane, name in enumerate("xy"):
+        orbit, residual = grid[2 * plane], grid[2 * plane + 1]
+        orbit.plot(s, 1e3 * read[:, plane], "k.", ms=3, label="read by the monitors")
+        sigma = 1e3 * diagnosis.noise[plane]
+        residual.axhspan(-2 * sigma, 2 * sigma, color="0.88", zorder=0, label="noise, 2 rms")
+        texts = []
+        for model, label, (colour, style) in zip(models, names, styles, strict=False):
+            predicted = model[shot, first, plane]
+            orbit.plot(s, 1e3 * predicted, style, color=colour, linewidth=0.9, label=label)
+            left = np.where(dropped[:, plane], np.nan, read[:, plane] - predicted)
+            residual.plot(s, 1e3 * left, color=colour, linewidth=0.9)
+            texts.append(_left_text(left, before if label == "design" else None))
+        if dropped[:, plane].any():
+            at = dropped[:, plane]
+            orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="left out")
+        orbit.set_ylabel(f"{name} [mm]")
+        residual.set_ylabel(f"residual {name} [mm]")
+        after = f"; with the findings {texts[1]}" if len(texts) > 1 else ""
+        residual.annotate(
+            f"rms of the design {texts[0]}{after}; noise {1e3 * sigma:.1f} µm (grey: 2 rms)",
+            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
+        )  # fmt: skip
+        low, high = residual.get_ylim()
+        residual.set_ylim(low, high + 0.3 * (high - low))  # room for the words
+        for ax in (orbit, residual):
+            mark(ax, diagnosis)
+            ax.grid(alpha=0.25)
+    grid[0].legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize="small", frameon=False
+    )
+    title = f"Shot {shot + 1} of the {len(readings)} of the fit"
+    if before is not None:
+        title += f"; the design's launch from the {int(before.sum())} monitors before"
+    grid[0].set_title(title, loc="left", fontsize="medium")
+    lattice_strip(diagnosis.ring, grid[4])
+    mark(grid[4], diagnosis)
+    return figure
+
+
+def _left_text(left: Array, before: NDArray[np.bool_] | None) -> str:
+    """The rms of what is left, m, as µm: of all, or before and behind the first finding."""
+
+    def rms(values: Array) -> str:
+        seen = values[np.isfinite(values)]
+        return f"{1e6 * np.sqrt(np.mean(seen**2)):.1f}" if len(seen) else "-"
+
+    if before is None:
+        return rms(left)
+    return f"{rms(left[before])} before the finding, {rms(left[~before])} behind"
+
+
+def mark(ax: Axes, diagnosis: Diagnosis) -> None:
+    """A dotted line, or a band, where the findings sit."""
+    for finding in diagnosis.findings:
+        if finding.effect is None and finding.where is not None:
+            ax.axvspan(*finding.where, color="gold", alpha=0.4, linewidth=0, zorder=0)
+        elif finding.s is not None:
+            ax.axvline(finding.s, color="0.45", linestyle=":", linewidth=1.1, zorder=0.5)

@@ -1,0 +1,59 @@
+"""Amounts, probabilities and effects in words."""
+
+import numpy as np
+
+from tmlattice.effects import CATALOGUE, find
+
+_SCALES = {
+    "relative": ((0.0, 100.0, "%"),),
+    "m": ((0.0, 1e6, "µm"), (1e-3, 1e3, "mm")),
+    "rad": ((0.0, 1e6, "µrad"), (1e-3, 1e3, "mrad")),
+    "1/m": ((0.0, 1.0, "1/m"),),
+    "scale": ((0.0, 1.0, "x expected"),),
+}
+"""By unit of the catalogue: from which modulus on, factor, readable unit."""
+
+
+def words(effect: str) -> str:
+    """An effect of the catalogue in plain words."""
+    return CATALOGUE[effect].words if effect in CATALOGUE else effect.replace("_", " ")
+
+
+def _scale(effect: str, amount: float) -> tuple[float, str]:
+    unit = find(effect).unit
+    steps = _SCALES.get(unit, ((0.0, 1.0, unit),))
+    _, factor, name = [step for step in steps if abs(amount) >= step[0] or step[0] == 0][-1]
+    return factor, name
+
+
+def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
+    """An amount in a readable unit, with its error to two digits where it has one.
+
+    Args:
+        effect: of the catalogue.
+        amount, sigma: in the effect's unit.
+    """
+    if find(effect).discrete:
+        return find(effect).forms.get(amount, "")
+    factor, unit = _scale(effect, amount)
+    value = factor * amount
+    if sigma is None or not 0 < sigma < np.inf:
+        return f"{value:.3g} {unit}"
+    error = factor * sigma
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
+    return f"{value:+.{digits}f} ± {error:.{digits}f} {unit}"
+
+
+def least_text(effect: str, amount: float) -> str:
+    """The least amount that would be seen; a fault's largest where that is less."""
+    kind = find(effect)
+    if not amount <= kind.largest:
+        return f"not even the largest fault, {amount_text(effect, kind.largest)}"
+    return amount_text(effect, amount)
+
+
+def probability_text(probability: float) -> str:
+    """In per cent; never more certain than the numbers allow."""
+    if probability > 0.9995:
+        return "> 99.9 %"
+    return f"{100 * probability:.1f} %" if probability > 0.001 else "< 0.1 %"

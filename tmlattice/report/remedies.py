@@ -1,0 +1,115 @@
+"""What is to be done about a finding, in the words of a control room."""
+
+from tmlattice.diagnosis.consequences import Beam, Consequences
+from tmlattice.diagnosis.remedies import Remedy
+from tmlattice.diagnosis.result import Finding
+from tmlattice.effects import ReadingEffect, RingEffect, find
+from tmlattice.report.amounts import amount_text, probability_text, words
+
+_KINDS = {
+    "bend": "bending magnet",
+    "hcorrector": "horizontal corrector",
+    "vcorrector": "vertical corrector",
+}
+"""Kinds of elements that a control room calls otherwise."""
+
+SETTLED = Beam((1e-5, 1e-5), (1e-4, 1e-4), (1e-4, 1e-4), (1e-5, 1e-5), (1e-7, 1e-7))
+"""A beam that differs from the design's by less is as designed."""
+
+
+def subject(remedy: Remedy) -> str:
+    """What it is about: "quadrupole qd::12"."""
+    if remedy.element is None or remedy.kind is None:
+        return "the beam"
+    kind = _KINDS.get(remedy.kind, remedy.kind)
+    family = " family" if remedy.effect.startswith("family") else ""
+    return f"{kind}{family} {remedy.element}"
+
+
+def remedy_text(remedy: Remedy) -> str:
+    """What is wrong there, as a line of a logbook."""
+    effect = find(remedy.effect)
+    amount = amount_text(remedy.effect, remedy.amount, remedy.amount_sigma)
+    if effect.discrete and amount:
+        what = amount  # "no signal"
+    else:
+        what = f"{effect.quantity or effect.words} {amount}".rstrip()
+    told = ""
+    if remedy.strength is not None:
+        own = remedy.strength
+        told = f" ({own.name} {own.before:.4g} -> {own.after:.4g} {own.unit})"
+    return f"{subject(remedy)}, {what}{told}"
+
+
+def title(finding: Finding) -> str:
+    """A finding in one line."""
+    if finding.remedy is None:
+        return "something that no effect of the catalogue explains"
+    return remedy_text(finding.remedy)
+
+
+def mechanism_text(remedy: Remedy) -> str:
+    """Which explanations share a remedy, and how likely each is."""
+    if len(remedy.mechanisms) == 1:
+        effect = remedy.mechanisms[0][0]
+        return f"{words(effect)} ({effect}: {find(effect).sign})"
+    told = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in remedy.mechanisms)
+    return "; or ".join(told) + ": the remedy is the same"
+
+
+def or_text(finding: Finding, most: int) -> str:
+    """What else it may be that has another place or another remedy."""
+    others = finding.remedies[1:]
+    shown = [f"{probability_text(r.probability)} {remedy_text(r)}" for r in others[:most]]
+    if len(others) > most:
+        rest = sum(r.probability for r in others[most:])
+        shown.append(f"{len(others) - most} more ({probability_text(rest)} together)")
+    return "\n".join(shown)
+
+
+# --- what it does to the stored beam --------------------------------------------------------------
+def consequence_text(finding: Finding) -> str:
+    """What a finding does to the stored beam, and what is left of it after the repair."""
+    if finding.effect is None:
+        return ""
+    effect, told = find(finding.effect), finding.consequences
+    if told is None:
+        if effect.natural or not isinstance(effect, RingEffect):
+            nothing = "the stored beam does not feel it"
+            reads = "; its readings are wrong" if isinstance(effect, ReadingEffect) else ""
+            return "" if effect.natural else nothing + reads
+        return "none while it is set to zero" if effect.acts_on_settings else ""
+    return f"as found: {_beam_text(told.found, told)}\nafter the repair: {_after_text(told)}"
+
+
+def _after_text(told: Consequences) -> str:
+    beam = told.repaired
+    if beam is None or told.design is None:
+        return _beam_text(beam, told)
+    off = [abs(a - b) for a, b in zip(beam.tunes, told.design, strict=True)]
+    settled = max(off) < SETTLED.tunes[0] and all(
+        max(getattr(beam, name)) < getattr(SETTLED, name)[0]
+        for name in ("beta_beat_rms", "beta_beat_max", "dispersion_rms", "orbit_rms")
+    )
+    return "as designed" if settled else _beam_text(beam, told)
+
+
+def _beam_text(beam: Beam | None, told: Consequences) -> str:
+    if told.design is None:
+        return "the design itself is unstable"
+    if beam is None:
+        return "unstable: no beam can be stored"
+    x, y = beam.tunes
+    design = f"{told.design[0]:.4f}, {told.design[1]:.4f}"
+    return (
+        f"tunes {x:.4f}, {y:.4f} (design {design}); "
+        f"beta beat {_pair(beam.beta_beat_rms, 100, 1)} % rms, "
+        f"{_pair(beam.beta_beat_max, 100, 1)} % at most; "
+        f"dispersion off by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms; "
+        f"closed orbit {_pair(beam.orbit_rms, 1e6, 1)} µm rms"
+    )
+
+
+def _pair(values: tuple[float, float], factor: float, digits: int) -> str:
+    """x and y."""
+    return " and ".join(f"{factor * value:.{digits}f}" for value in values)
