@@ -556,6 +556,11 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
     assert data.monitors == tuple(names)
     assert_allclose(data.readings[0], 1e-3 * turns, rtol=1e-6)
     assert np.isinf(data.launch_sigma[0, :4]).all()
+    x, y = (frame.rename(index={"bpm::5": "BPM.OF.ANOTHER"}) for frame in (x, y))
+    tbt.write(tmp_path / "c.sdds", tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 20), datatype="lhc")
+    found = bring_in([tmp_path / "c.sdds"], Options(lattice=lattice[0]))
+    assert found.measurement.monitors == ("bpm::0", "bpm::6")
+    assert "'BPM.OF.ANOTHER'" in " ".join(found.doubts)
     (tmp_path / "b.sdds").write_text("nothing")
     with pytest.raises(TmlatticeError, match="cannot be read as 'lhc'"):
         bring_in([tmp_path / "b.sdds"])
