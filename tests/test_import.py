@@ -294,6 +294,25 @@ def test_command_writes_a_folder_that_reads_back(simulated, tmp_path):
     tmlattice("import", "a.loco.mat", "--out", "m", "--force", "-q", cwd=tmp_path, check=0)
 
 
+def element(place, **fields):
+    """The lattice with other fields of one element."""
+    ring = elements()
+    ring[place].update(fields)
+    return np.array(ring, dtype=object)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        element(2, PassMethod=3.0),
+        element(3, FamName=np.full(5, np.nan)),
+    ],
+)
+def test_fields_that_are_not_needed_may_be_anything(simulated, brought, change):
+    found = brought(changed(simulated, RINGData_Lattice=change, LocoFlags_ClosedOrbitType=3.0))
+    assert len(found.measurement.correctors) == 32
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -306,6 +325,9 @@ def test_command_writes_a_folder_that_reads_back(simulated, tmp_path):
         ({"RINGData_Energy": "none"}, "energy"),
         ({"RINGData_Lattice": 3.0}, "no list of elements"),
         ({"LocoMeasData_M": "no numbers"}, "holds no numbers"),
+        ({"RINGData_Lattice": element(2, Length=1e300)}, "has the length 1e+300"),
+        ({"RINGData_Lattice": element(2, Length=np.ones(3))}, "has the length"),
+        ({"RINGData_Lattice": element(1, PolynomB="much")}, "element 2 of the lattice, 'QF'"),
     ],
 )
 def test_damaged_loco_files_are_a_sentence(simulated, brought, change, told):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported, counted, numbers
+from tmlattice.importers.imported import Imported, counted, is_number, numbers
 from tmlattice.importers.matlab_ring import Placed, Roles, ring_of_elements
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
@@ -67,7 +67,8 @@ def bring_loco(
     if isinstance(lattice, list):  # the ring itself
         lattice = {"Lattice": lattice}
     lattice = _first(lattice, f"RINGData of '{path}'")
-    flags = _first(content["LocoFlags"], "LocoFlags") if content.get("LocoFlags") else {}
+    stated = isinstance(content.get("LocoFlags"), Mapping | list)
+    flags = _first(content["LocoFlags"], "LocoFlags") if stated else {}
     at_monitor = _index(monitors, "BPMIndex")
     every = {
         "HBPMIndex": np.arange(len(at_monitor)) + 1,
@@ -137,14 +138,10 @@ def _index(structure: Fields, name: str) -> Indices:
 
 def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
     """GeV; LOCO has it in GeV, AT's elements in eV."""
-    stated = [s["Energy"] for s in (lattice, *elements) if _is_number(s.get("Energy"))]
+    stated = [s["Energy"] for s in (lattice, *elements) if is_number(s.get("Energy"))]
     if not stated or not stated[0] > 0:
         raise MeasurementError("neither RINGData nor its elements state an energy; add Energy")
     return float(stated[0]) * (1e-9 if stated[0] > 1e5 else 1.0)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and np.isfinite(value)
 
 
 # --- the lattice ----------------------------------------------------------------------------------
@@ -176,7 +173,7 @@ def _elements(
             )
         for setting in first:
             _put(elements, setting)
-    except (KeyError, IndexError, TypeError, ValueError):
+    except (ArithmeticError, KeyError, IndexError, TypeError, ValueError):
         return elements, f"{as_it_is}: the fit's parameters cannot be followed"
     return elements, (
         f"the model is RINGData with the {len(first)} parameters of FitParameters(1), with which "
@@ -328,15 +325,12 @@ def _rf(
     placed: Placed,
 ) -> RfStep | None:
     step, eta = data.get("DeltaRF"), np.asarray(data.get("Eta", ()))
-    cavity: Fields = next((e for e in lattice["Lattice"] if _is_number(e.get("HarmNumber"))), {})
+    cavity: Fields = next((e for e in lattice["Lattice"] if is_number(e.get("HarmNumber"))), {})
     frequency = lattice.get("CavityFrequency", cavity.get("Frequency"))
     frequency = data.get("RF", frequency)
     harmonic = lattice.get("CavityHarmNumber", cavity.get("HarmNumber"))
-    if not (_is_number(step) and _is_number(frequency) and _is_number(harmonic) and eta.size):
+    if not (is_number(step) and is_number(frequency) and is_number(harmonic) and eta.size):
         return None
-    assert isinstance(frequency, int | float)
-    assert isinstance(harmonic, int | float)
-    assert isinstance(step, int | float)
     rows = len(reads["x"]) + len(reads["y"])
     orbit = _spread(1e-3 * numbers(eta, "LocoMeasData.Eta", (rows,)), reads, good, placed)
     return RfStep(float(frequency), round(harmonic), float(step), orbit)
