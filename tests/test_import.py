@@ -244,6 +244,18 @@ def test_a_convention_that_the_data_contradict_is_named_and_kept(simulated, brou
     assert_allclose(found.measurement.response[:, :, 0].T, M[:16], rtol=1e-12)
 
 
+def test_frequency_or_momentum_is_told_by_the_data(simulated, brought):
+    """AT's orbits at a fixed path length, and the same ring's at a fixed momentum."""
+    assert any("the data agree that the frequency" in s for s in brought(simulated).assumed)
+    found = brought(simulated)
+    data, model = found.measurement, ResponseModel(found.ring, dimension=4)
+    at_monitor = [model.monitors.index(name) for name in data.monitors]
+    flat = model.response(data.correctors)[:, at_monitor] * data.kicks[:, None, None]
+    M = 1e3 * np.concatenate([flat[:, :, 0].T, flat[:, :, 1].T])
+    found = brought(changed(simulated, LocoMeasData_M=M))
+    assert any("the momentum stood still" in sentence for sentence in found.doubts)
+
+
 def test_lattice_before_the_fit(simulated, brought):
     """FitParameters hold the values of every iteration; the lattice has the last ones'."""
     first = next(i for i, f in enumerate(elements()) if f["FamName"] == "QF")
@@ -650,7 +662,8 @@ def test_computed_dispersion_of_a_real_ring_is_told():
     doubts = {name: bring_in([DATA / f"{name}.loco.mat"]).doubts for name in README}
     computed = {name for name, said in doubts.items() if any("computed" in s for s in said)}
     assert computed == {"siam_2007-09-25"}
-    assert not any("other sign" in s or "exchanged" in s for said in doubts.values() for s in said)
+    wrong = ("other sign", "exchanged", "momentum", "design's (")
+    assert not any(word in s for said in doubts.values() for s in said for word in wrong)
 
 
 @real

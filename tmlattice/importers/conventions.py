@@ -8,6 +8,7 @@ design's; minus one, a half, two or a thousand each has a plain reason. Nothing 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import UnstableRingError
@@ -22,6 +23,10 @@ ODD = 0.6
 """Correlation below which a single one resembles nothing where most have more than 0.9."""
 SURE = 0.95
 """Correlation above which it is another's: neighbours a tenth of a wave apart have 0.8."""
+CLEARER = 1.02
+"""Ratio of what two models leave, above which the data tell them apart: on ten real rings a fixed
+frequency leaves 1.04 to 11 times less than a fixed momentum."""
+ROUNDS = 5
 FACTORS = {
     0.5: "half", 2.0: "twice", 1e3: "a thousand times", 1e-3: "a thousandth of",
     1e6: "a million times", 1e-6: "a millionth of",
@@ -67,8 +72,9 @@ def slopes(measured: Array, design: Array) -> Slopes:
     return Slopes(*along(1), *along(0))
 
 
-def doubts(ring: Ring, measured: OrbitResponse) -> list[str]:
-    """What the data contradict, beside the ring's own response; a sentence each.
+def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]:
+    """What the data confirm and what they contradict, beside the ring's own response; a sentence
+    each.
 
     Args:
         ring: the design, with the measurement's names.
@@ -77,7 +83,7 @@ def doubts(ring: Ring, measured: OrbitResponse) -> list[str]:
     try:
         model = ResponseModel(ring)
     except UnstableRingError as error:
-        return [f"the lattice has no closed orbit to compare with ({error})"]
+        return [], [f"the lattice has no closed orbit to compare with ({error})"]
     index = {ring[name].name: i for i, name in enumerate(model.monitors)}
     at = [index[ring[name].name] for name in measured.monitors]
     design = model.response(measured.correctors)[:, at] * measured.kicks[:, None, None]
@@ -109,7 +115,48 @@ def doubts(ring: Ring, measured: OrbitResponse) -> list[str]:
             )
         else:
             said += _of_size("orbit changes in x by the RF's step", rf.typical)
-    return [*said, *_signs({key: own.typical for key, own in found.items()})]
+    said += _signs({key: own.typical for key, own in found.items()})
+    if "x" not in found or np.isnan(found["x"].typical):
+        return [], said
+    confirmed, contradicted = _frequency(ring, measured, design, planes == 0, at)
+    return confirmed, said + contradicted
+
+
+def _frequency(
+    ring: Ring,
+    measured: OrbitResponse,
+    design: Array,
+    columns: NDArray[np.bool_],
+    at: list[int],
+) -> tuple[list[str], list[str]]:
+    """Whether the frequency stood still, or the momentum did: which of them leaves less in x, with
+    a gain free for each monitor and each corrector."""
+    names = [n for n, x in zip(measured.correctors, columns.tolist(), strict=True) if x]
+    flat = ResponseModel(ring, dimension=4).response(names)[:, at, 0]
+    orbits = measured.response[columns, :, 0]
+    fixed, momentum = (
+        1e6 * _left(orbits, d)
+        for d in (design[columns, :, 0], flat * measured.kicks[columns, None])
+    )
+    told = f"with gains free, {fixed:.3g} µm are left in x, and {momentum:.3g} at a fixed momentum"
+    if fixed < momentum / CLEARER:
+        return [f"the data agree that the frequency stood still: {told}"], []
+    if momentum < fixed / CLEARER:
+        return [], [f"the momentum stood still, and not the frequency: {told}"]
+    return [], []
+
+
+def _left(measured: Array, design: Array) -> float:
+    """rms that a gain for each column and each monitor leaves, over what was read."""
+    there = np.isfinite(measured)
+    m, d = np.where(there, measured, 0.0), np.where(there, design, 0.0)
+    gain = np.ones(m.shape[1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for _ in range(ROUNDS):
+            kick = np.nan_to_num((m * d * gain).sum(axis=1) / ((d * gain) ** 2).sum(axis=1))
+            turned = d * kick[:, None]
+            gain = np.nan_to_num((m * turned).sum(axis=0) / (turned**2).sum(axis=0))
+    return float(np.sqrt(((m - turned * gain) ** 2).sum() / there.sum()))
 
 
 def _rf(model: ResponseModel, measured: OrbitResponse, at: list[int]) -> Slopes | None:
