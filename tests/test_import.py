@@ -371,6 +371,50 @@ def test_damaged_mat_files_are_a_sentence(simulated, tmp_path):
         read_mat(path)
 
 
+def save_as_hdf5(path, variables):
+    """A MATLAB 7.3 file, as MATLAB writes it: transposed arrays, cells of references."""
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        references = file.create_group("#refs#")
+
+        def write(place, name, value):
+            if isinstance(value, dict):
+                group = place.create_group(name)
+                group.attrs["MATLAB_class"] = np.bytes_("struct")
+                for key, item in value.items():
+                    write(group, key, item)
+            elif isinstance(value, np.ndarray) and value.dtype == object:
+                cells = []
+                for item in value:
+                    key = f"c{len(references)}"
+                    write(references, key, item)
+                    cells.append(references[key].ref)
+                place[name] = np.array(cells, dtype=h5py.ref_dtype)[:, None]
+                place[name].attrs["MATLAB_class"] = np.bytes_("cell")
+            elif isinstance(value, str):
+                place[name] = np.array([[ord(c)] for c in value], dtype=np.uint16)
+                place[name].attrs["MATLAB_class"] = np.bytes_("char")
+            else:
+                place[name] = np.atleast_2d(np.asarray(value, dtype=float)).T
+                place[name].attrs["MATLAB_class"] = np.bytes_("double")
+
+        for key, value in variables.items():
+            write(file, key, value)
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM"
+    path.write_bytes(head + path.read_bytes()[len(head) :])
+
+
+def test_matlabs_file_of_version_7_3_is_the_same(simulated, brought, tmp_path):
+    same = brought(simulated)
+    save_as_hdf5(tmp_path / "simulated.mat", simulated)
+    found = bring_in([tmp_path / "simulated.mat"])
+    assert np.array_equal(found.measurement.response, same.measurement.response)
+    assert found.measurement.correctors == same.measurement.correctors
+    assert [e.name for e in found.ring.elements] == [e.name for e in same.ring.elements]
+    assert np.array_equal([e.k1 for e in found.ring.elements], [e.k1 for e in same.ring.elements])
+
+
 # --- other files ----------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def esrf(simulated, tmp_path_factory):
