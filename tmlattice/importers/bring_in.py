@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.conventions import doubts
+from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported
 from tmlattice.importers.lattices import Elements, elements_of
@@ -72,8 +72,12 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     brought = _bring(files, matlab, hdf5, options)
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
         return brought
-    more = doubts(brought.ring, brought.measurement)
-    return replace(brought, doubts=(*brought.doubts, *more))
+    confirmed, contradicted = compared(brought.ring, brought.measurement)
+    return replace(
+        brought,
+        assumed=(*brought.assumed, *confirmed),
+        doubts=(*brought.doubts, *contradicted),
+    )
 
 
 def _bring(

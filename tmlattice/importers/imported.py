@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,13 @@ def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
             )
         array = array.reshape(tuple(shape))
     return array
+
+
+def is_number(value: Any) -> TypeGuard[int | float]:
+    """Whether something of a file is one finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300
 
 
 def counted(names: Sequence[str], most: int = 8) -> str:

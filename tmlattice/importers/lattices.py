@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tmlattice.errors import LatticeError
+from tmlattice.importers.imported import is_number
 
 
 @dataclass(frozen=True)
@@ -76,4 +75,4 @@ def elements_of(content: Mapping[str, Any], path: Path, sequence: str | None = N
 
 
 def _positive(value: Any) -> bool:
-    return isinstance(value, int | float) and bool(np.isfinite(value)) and value > 0
+    return is_number(value) and value > 0

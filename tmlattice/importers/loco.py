@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported, counted, numbers
+from tmlattice.importers.imported import Imported, counted, is_number, numbers
 from tmlattice.importers.matlab_ring import Placed, Roles, ring_of_elements
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
@@ -59,13 +59,22 @@ def bring_loco(
         MeasurementError: a variable or field is missing, or shapes do not fit.
         LatticeError: the lattice cannot be made.
     """
-    data, monitors, correctors, lattice = (
+    data, monitors, correctors = (
         _first(content.get(name), f"{name} of '{path}'")
-        for name in ("LocoMeasData", "BPMData", "CMData", "RINGData")
+        for name in ("LocoMeasData", "BPMData", "CMData")
     )
-    flags = _first(content["LocoFlags"], "LocoFlags") if content.get("LocoFlags") else {}
+    lattice = content.get("RINGData")
+    if isinstance(lattice, list):  # the ring itself
+        lattice = {"Lattice": lattice}
+    lattice = _first(lattice, f"RINGData of '{path}'")
+    stated = isinstance(content.get("LocoFlags"), Mapping | list)
+    flags = _first(content["LocoFlags"], "LocoFlags") if stated else {}
     at_monitor = _index(monitors, "BPMIndex")
-    reads = {plane: _index(monitors, f"{k}BPMIndex") for plane, k in (("x", "H"), ("y", "V"))}
+    every = {
+        "HBPMIndex": np.arange(len(at_monitor)) + 1,
+        "VBPMIndex": np.arange(len(at_monitor)) + 1,
+    }
+    reads = {p: _index({**every, **monitors}, f"{k}BPMIndex") for p, k in (("x", "H"), ("y", "V"))}
     kickers = {plane: _index(correctors, f"{k}CMIndex") for plane, k in (("x", "H"), ("y", "V"))}
     for plane, index in reads.items():
         if len(index) and not 0 <= index.min() <= index.max() < len(at_monitor):
@@ -95,7 +104,7 @@ def bring_loco(
         measured,
         placed.ring,
         assumed=(*conventions(flags, measured), *of_lists, of_lattice, *placed.said),
-        doubts=tuple(_computed(data, content.get("LocoModel"), good)),
+        doubts=(*_computed(data, content.get("LocoModel"), good), *_unkicked(correctors, kickers)),
     )
 
 
@@ -129,14 +138,10 @@ def _index(structure: Fields, name: str) -> Indices:
 
 def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
     """GeV; LOCO has it in GeV, AT's elements in eV."""
-    stated = [s["Energy"] for s in (lattice, *elements) if _is_number(s.get("Energy"))]
+    stated = [s["Energy"] for s in (lattice, *elements) if is_number(s.get("Energy"))]
     if not stated or not stated[0] > 0:
         raise MeasurementError("neither RINGData nor its elements state an energy; add Energy")
     return float(stated[0]) * (1e-9 if stated[0] > 1e5 else 1.0)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and np.isfinite(value)
 
 
 # --- the lattice ----------------------------------------------------------------------------------
@@ -168,7 +173,7 @@ def _elements(
             )
         for setting in first:
             _put(elements, setting)
-    except (KeyError, IndexError, TypeError, ValueError):
+    except (ArithmeticError, KeyError, IndexError, TypeError, ValueError):
         return elements, f"{as_it_is}: the fit's parameters cannot be followed"
     return elements, (
         f"the model is RINGData with the {len(first)} parameters of FitParameters(1), with which "
@@ -258,18 +263,15 @@ def _columns(
     names, planes, kicks, kept = [], [], [], []
     for plane, letter in (("x", "H"), ("y", "V")):
         index = kickers[plane]
-        steps = numbers(_field(correctors, f"{letter}CMKicks"), f"{letter}CMKicks")
-        steps = np.broadcast_to(steps, len(index)) if steps.size == 1 else np.ravel(steps)
-        if len(steps) != len(index):
-            raise MeasurementError(f"{letter}CMKicks has {len(steps)} steps, not {len(index)}")
         names += [placed.correctors[place, plane] for place in index.tolist()]
         planes += [plane] * len(index)
-        kicks += (1e-3 * steps).tolist()
+        kicks += (1e-3 * _steps(correctors, letter, len(index))).tolist()
         kept += good[letter].tolist()
     response = np.stack([_spread(column, reads, good, placed) for column in M.T])
     noise = None
     if np.size(data.get("BPMSTD", ())):
-        given = 1e-3 * numbers(data["BPMSTD"], "LocoMeasData.BPMSTD", (rows,))
+        given = 1e-3 * numbers(data["BPMSTD"], "LocoMeasData.BPMSTD")
+        given = numbers(np.repeat(given, rows if given.size == 1 else 1), "BPMSTD", (rows,))
         every = {plane: np.ones_like(flags) for plane, flags in good.items()}
         noise = _spread(np.where(given > 0, given, np.nan), reads, every, placed)
     take = np.array(kept, dtype=bool) & (np.array(kicks) != 0)
@@ -281,6 +283,23 @@ def _columns(
         "response": response[take],
         "noise": noise,
     }
+
+
+def _steps(correctors: Fields, letter: str, count: int) -> Array:
+    steps = np.ravel(numbers(_field(correctors, f"{letter}CMKicks"), f"{letter}CMKicks"))
+    steps = np.repeat(steps, count) if steps.size == 1 else steps
+    if len(steps) != count:
+        raise MeasurementError(f"{letter}CMKicks has {len(steps)} steps, not {count}")
+    return steps
+
+
+def _unkicked(correctors: Fields, kickers: Mapping[str, Indices]) -> list[str]:
+    """Correctors without a step, which no response can be of."""
+    counts = [
+        int(np.count_nonzero(_steps(correctors, letter, len(kickers[plane])) == 0))
+        for plane, letter in (("x", "H"), ("y", "V"))
+    ]
+    return [f"{sum(counts)} correctors have a step of 0 and are left out"] if sum(counts) else []
 
 
 def _spread(
@@ -306,15 +325,14 @@ def _rf(
     placed: Placed,
 ) -> RfStep | None:
     step, eta = data.get("DeltaRF"), np.asarray(data.get("Eta", ()))
-    frequency = data.get("RF", lattice.get("CavityFrequency"))
-    harmonic = lattice.get("CavityHarmNumber")
-    if not (_is_number(step) and _is_number(frequency) and _is_number(harmonic) and eta.size):
+    cavity: Fields = next((e for e in lattice["Lattice"] if is_number(e.get("HarmNumber"))), {})
+    frequency = lattice.get("CavityFrequency", cavity.get("Frequency"))
+    frequency = data.get("RF", frequency)
+    harmonic = lattice.get("CavityHarmNumber", cavity.get("HarmNumber"))
+    if not (is_number(step) and is_number(frequency) and is_number(harmonic) and eta.size):
         return None
     rows = len(reads["x"]) + len(reads["y"])
     orbit = _spread(1e-3 * numbers(eta, "LocoMeasData.Eta", (rows,)), reads, good, placed)
-    assert frequency is not None
-    assert harmonic is not None
-    assert step is not None
     return RfStep(float(frequency), round(harmonic), float(step), orbit)
 
 

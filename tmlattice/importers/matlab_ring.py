@@ -23,10 +23,13 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError
+from tmlattice.importers.imported import is_number
 from tmlattice.lattice import Ring
 from tmlattice.lattice.at_file import ring_from_at
 
 PLANES = "xy"
+LONGEST = 1e5
+"""m; no element of a ring is longer."""
 _LETTER = {"x": "h", "y": "v"}
 _APERTURES = ("AperturePass", "EAperturePass", "LongtAperturePass")
 _MAD = {"x": "HKICKER", "y": "VKICKER"}
@@ -90,7 +93,9 @@ def ring_of_elements(
             "lattice is not that of its measurement"
         )
     said: Counter[str] = Counter()
-    made = [_element(fields, i, energy, said) for i, fields in enumerate(elements)]
+    with warnings.catch_warnings():  # AT's own, of what it finds in old files
+        warnings.simplefilter("ignore")
+        made = [_element(fields, i, energy, said) for i, fields in enumerate(elements)]
     both = {
         _family(made[i])
         for i, planes in roles.kicks.items()
@@ -120,7 +125,10 @@ def ring_of_elements(
     lattice = at.Lattice(sequence, name=name, energy=energy * 1e9, periodicity=1)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        ring = ring_from_at(lattice, name, energy)
+        try:
+            ring = ring_from_at(lattice, name, energy)
+        except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
+            raise LatticeError(f"the lattice cannot be taken over ({error}); mend it") from error
     names = _names(ring, [_family(element) for element in sequence], where.values())
     return Placed(
         ring=ring,
@@ -183,11 +191,12 @@ def _element(fields: Mapping[str, Any], place: int, energy: float, said: Counter
         raise LatticeError(f"element {place + 1} of the lattice is no structure; save it again")
     kept = {key: value for key, value in fields.items() if _is_data(value)}
     length = kept.get("Length", 0.0)
-    if not isinstance(length, int | float) or not np.isfinite(length):
-        raise LatticeError(f"element {place + 1} of the lattice has the length {length!r}")
-    kept["FamName"] = str(kept.get("FamName") or f"element_{place + 1}")
-    if kept.get("PassMethod") not in _shipped():
-        said[f"'{str(kept.get('PassMethod'))[:40]}' is no pass method of AT: a drift"] += 1
+    if not is_number(length) or abs(length) > LONGEST:
+        raise LatticeError(f"element {place + 1} of the lattice has the length {length!r:.40}")
+    name, method = kept.get("FamName"), kept.get("PassMethod")
+    kept["FamName"] = name if isinstance(name, str) and name else f"element_{place + 1}"
+    if not isinstance(method, str) or method not in _shipped():
+        said[f"'{str(method)[:40]}' is no pass method of AT: a drift"] += 1
         kept = {"FamName": kept["FamName"], "Length": length}
         kept["PassMethod"] = "DriftPass" if length else "IdentityPass"
     if str(kept["PassMethod"]) in _APERTURES:

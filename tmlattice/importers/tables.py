@@ -9,16 +9,18 @@ header, in brackets; without one they are m, rad and m/rad. Names are the lattic
 import csv
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported
+from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, read_table, read_turn_by_turn
+from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
 from tmlattice.measurement.tables import Unit
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
@@ -72,15 +74,16 @@ def bring_turns(
     Raises:
         MeasurementError: it cannot be read, or its readings cannot be of that unit.
     """
-    kinds = [kind] if kind else ["lhc", "sps"]
-    known = None if ring is None else [element.name for element in ring.monitors]
     failed: MeasurementError | None = None
-    for one in kinds:
+    for one in [kind] if kind else ["lhc", "sps"]:
         try:
-            data = read_turn_by_turn(path, one, monitors=known, unit=unit or "mm")
+            data = read_turn_by_turn(path, one, unit=unit or "mm")
         except MeasurementError as error:
             failed = failed or error
             continue
+        doubts: tuple[str, ...] = ()
+        if ring is not None:
+            data, doubts = _of_ring(data, ring)
         read = np.atleast_2d(np.isfinite(data.readings).any(axis=(0, 1)))
         single = int((read.sum(axis=1) == 1).sum())
         said = [
@@ -89,9 +92,25 @@ def bring_turns(
             f"monitors: {int(read[:, 0].sum())} in x, {int(read[:, 1].sum())} in y"
             + (f", {single} of one plane" if single else ""),
         ]
-        return Imported(_unlaunched(data, ring), ring, tuple(said))
+        return Imported(_unlaunched(data, ring), ring, tuple(said), doubts)
     assert failed is not None
     raise failed
+
+
+def _of_ring(data: Measurement, ring: Ring) -> tuple[Measurement, tuple[str, ...]]:
+    """The monitors that the ring has, under its names and in its order, and what it has not."""
+    ours = Names("monitor", [element.name for element in ring.monitors])
+    place = {name: ours.find(name) for name in data.monitors}
+    there = sorted((at, name) for name, at in place.items() if at is not None)
+    missing = [name for name, at in place.items() if at is None]
+    if not there:
+        ours[missing[0]]  # an UnknownNameError with the nearest names
+    data = replace(
+        data.select(monitors=[name for _, name in there]),
+        monitors=tuple(ours.names[at] for at, _ in there),
+    )
+    what = f"monitors that the lattice does not have, left out: {counted(missing)}"
+    return data, (what,) if missing else ()
 
 
 def _unlaunched(data: Measurement, ring: Ring | None) -> Measurement:

@@ -83,15 +83,15 @@ def read_mat(path: Path, variables: Sequence[str] | None = None) -> dict[str, An
                 )
                 return {k: _plain(v) for k, v in content.items() if not k.startswith("__")}
             return _read_hdf5(path, variables)
-        except LatticeError as error:
-            raise LatticeError(f"'{path}': {error}") from error
+        except (LatticeError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise LatticeError(f"'{path}': {error}; save it again") from error
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
     from scipy.io.matlab import MatlabFunction, MatlabOpaque, mat_struct
 
     if depth > DEEPEST:
-        raise LatticeError(f"structures {DEEPEST} deep; save what is needed of them")
+        raise LatticeError(f"structures are {DEEPEST} deep")
     if isinstance(value, mat_struct):
         return {name: _plain(getattr(value, name), depth + 1) for name in value._fieldnames}
     if isinstance(value, MatlabFunction | MatlabOpaque):
@@ -121,7 +121,7 @@ def _plain_hdf5(file: Any, item: Any, depth: int = 0) -> Any:
     import h5py
 
     if depth > DEEPEST:
-        raise LatticeError(f"structures {DEEPEST} deep; save what is needed of them")
+        raise LatticeError(f"structures are {DEEPEST} deep")
     if isinstance(item, h5py.Group):
         fields = {name: _plain_hdf5(file, item[name], depth + 1) for name in item}
         many = [n for n in item if isinstance(item[n], h5py.Dataset) and _references(item[n])
