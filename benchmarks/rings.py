@@ -60,7 +60,8 @@ def cases() -> list[Case]:
         shipped("australian_synchrotron.m"),
         shipped("soleil.m", markers="BPM"),
         shipped("esrf.m", options={"correctors": "S4,S6,S13,S19,S20,S22,S24"}),
-        shipped("hmba.mat", options={"correctors": "SH*"}),
+        # at 1 mm third orders are 13 micrometres rms in this ring: as large as the noise
+        shipped("hmba.mat", options={"correctors": "SH*"}, amplitude=3e-4),
         shipped("err.mat", full=False),
     ]  # fmt: skip
     data = Path(os.environ.get("TMLATTICE_DATA", "nowhere"))
@@ -164,6 +165,7 @@ def follow(case: Case, ring, row: dict, lap) -> None:
         row["tune_fit"] = fit.problem
         if fit.network_tunes is not None:
             row["tune_fit"] = float(np.abs(fit.network_tunes - fit.true_tunes).max())
+            row["tune_shift"] = float(np.abs(fit.design_tunes - fit.true_tunes).max())
     except TmlatticeError as error:
         row["tune_fit"] = str(error)
     lap("tune_fit")
@@ -184,32 +186,37 @@ def green(row: dict) -> bool:
     return good and row.get("place", True) and not isinstance(row.get("tune_fit"), str)
 
 
-COLUMNS = (
+AGREEMENT = (
     ("ring", "ring", "{}"), ("length", "m", "{:.1f}"), ("energy", "GeV", "{:.3g}"),
-    ("magnets", "magnets", "{}"), ("monitors", "monitors", "{}"), ("correctors", "corr.", "{}"),
+    ("magnets", "magnets", "{}"), ("monitors", "monitors", "{}"),
+    ("correctors", "correctors", "{}"),
     ("tunes", "tunes", "{0[0]:.4f} / {0[1]:.4f}"), ("tunes_at", "less AT's", "{:.0e}"),
     ("chromaticity", "chromaticity", "{0[0]:+.2f} / {0[1]:+.2f}"),
-    ("turn_file", "first turn, AT's", "{:.1e}"), ("turn_engines", "engines", "{:.1e}"),
-    ("turns_engines", "5 turns", "{:.1e}"), ("response", "response", "{:.1e}"),
-    ("fault", "fault", "{}"), ("verdict", "verdict", "{}"), ("place", "place", "{}"),
-    ("tune_fit", "tune-fit dQ", "{:.0e}"), ("s_info", "info s", "{:.1f}"),
-    ("s_track", "turns s", "{:.1f}"), ("s_response", "response s", "{:.1f}"),
-    ("s_simulate", "simulate s", "{:.1f}"), ("s_diagnose", "diagnose s", "{:.1f}"),
-    ("s_tune_fit", "tune-fit s", "{:.1f}"), ("green", "all", "{}"),
+    ("turn_file", "first turn, AT's", "{:.0e}"), ("turn_engines", "engines, 1 turn", "{:.0e}"),
+    ("turns_engines", "5 turns", "{:.0e}"), ("response", "response", "{:.0e}"),
+)  # fmt: skip
+WORK = (
+    ("ring", "ring", "{}"), ("fault", "fault", "{}"), ("verdict", "verdict", "{}"),
+    ("place", "place", "{}"), ("tune_shift", "its dQ", "{:.0e}"),
+    ("tune_fit", "after tune-fit", "{:.0e}"), ("s_info", "info", "{:.1f}"),
+    ("s_track", "turns", "{:.1f}"), ("s_response", "2 responses", "{:.1f}"),
+    ("s_simulate", "simulate", "{:.1f}"), ("s_diagnose", "diagnose", "{:.1f}"),
+    ("s_tune_fit", "tune-fit", "{:.1f}"), ("green", "all", "{}"),
 )  # fmt: skip
 
 
-def shown(row: dict) -> list[str]:
-    cells = []
-    for key, _, form in COLUMNS:
-        value = row.get(key)
-        if isinstance(value, bool | np.bool_):
-            cells.append("right" if value else "**wrong**")
-        elif value is None:
-            cells.append("-")
-        else:
-            cells.append(value if isinstance(value, str) else form.format(value))
-    return cells
+def cell(value, form: str) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "right" if value else "**wrong**"
+    return value if isinstance(value, str) else form.format(value)
+
+
+def table(rows: list[dict], columns) -> str:
+    lines = [[title for _, title, _ in columns], ["---" for _ in columns]]
+    lines += [[cell(row.get(key), form) for key, _, form in columns] for row in rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def main() -> None:
@@ -219,19 +226,19 @@ def main() -> None:
     chosen = parser.parse_args()
     logging.getLogger("tmlattice").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
-    lines = [" | ".join(title for _, title, _ in COLUMNS), " | ".join("---" for _ in COLUMNS)]
-    print(f"| {lines[0]} |\n| {lines[1]} |", flush=True)
+    rows = []
     for case in cases():
         if chosen.names and case.name not in chosen.names:
             continue
         try:
-            cells = shown(study(case))
+            rows.append(study(case))
         except TmlatticeError as error:
-            cells = [case.name, str(error)]
-        lines.append(" | ".join(cells))
-        print(f"| {lines[-1]} |", flush=True)
+            rows.append({"ring": case.name, "verdict": str(error), "green": False})
+        print(table(rows[-1:], WORK).splitlines()[-1], flush=True)
+    text = table(rows, AGREEMENT) + "\n" + table(rows, WORK)
+    print(f"\n{text}")
     if chosen.out:
-        chosen.out.write_text("".join(f"| {line} |\n" for line in lines), encoding="utf-8")
+        chosen.out.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

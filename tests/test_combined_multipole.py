@@ -1,5 +1,9 @@
 """Magnets of several fields in one: nothing is lost in the maps, the engines or the JSON."""
 
+import os
+import warnings
+from pathlib import Path
+
 import at
 import numpy as np
 import pytest
@@ -10,8 +14,9 @@ from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.ocelot_engine import OcelotEngine
+from tmlattice.maps.magnets import way_map
 from tmlattice.maps.quadratic import parts_of
-from tmlattice.optics import off_momentum
+from tmlattice.optics import off_momentum, one_turn_optics
 
 ENERGY = 1.9
 
@@ -77,6 +82,30 @@ def test_first_turn_of_both_engines_is_that_of_the_file(lattice, ring):
                                    if hasattr(engine, "name") else "at")  # fmt: skip
 
 
+def test_a_bend_with_other_fields_keeps_them_in_its_middle():
+    form = {"EntranceAngle": 0.05, "ExitAngle": 0.05, "NumIntSteps": 100}
+    others = {"PolynomA": [3e-4, 0.05, 4.0], "PolynomB": [-2e-4, 0.4, 6.0]}
+    starts = 1e-3 * np.vstack([np.zeros(4), np.eye(4)[[0, 2]]])
+    moved, tracked = [], []
+    for fields in (others, {"PolynomB": [0, 0.4, 6.0]}):
+        element = at.Dipole("B", 0.3, 0.1, 0.0, **form, **fields)
+        lattice = at.Lattice([element], energy=ENERGY * 1e9, periodicity=1)
+        found = ring_from_at(lattice, "x")
+        moved.append([way_map(found.elements, ENERGY)(start) for start in starts])
+        six = np.zeros((6, 3), order="F")
+        six[:4] = starts.T
+        tracked.append(lattice.track(six)[0][:4, :, 0, 0].T)
+        if fields is others:
+            assert [e.name for e in found.elements] == ["b", "b_coil", "b_2"]
+            assert found.pieces("b") == ("b", "b_2")
+    # what the other fields do: thin in the middle here, spread over 0.3 m there
+    effect, ours = np.subtract(*tracked), np.subtract(*moved)
+    assert np.abs(effect).max(axis=0).min() > 1e-6
+    np.testing.assert_allclose(
+        ours, effect, rtol=0.02, atol=0.02 * np.abs(effect).max(axis=0).min()
+    )
+
+
 def test_half_and_half_is_the_whole(ring):
     from tmlattice.maps.quadratic import composed, of_ocelot
 
@@ -126,3 +155,84 @@ def test_a_corrector_of_two_planes_kicks_in_both_and_one_that_is_named_in_one():
         np.testing.assert_allclose(engine(ring).track(start)[0, 0, 0], tracked, rtol=0, atol=1e-12)
         kicked = engine(ring).track(start, settings=[{"cor_v::1": {"kick": 1e-4}}])[0, 0, 0]
         np.testing.assert_allclose(kicked - tracked, [0, 1.1e-4], rtol=0, atol=1e-9)
+
+
+def real(*parts):
+    path = Path(os.environ.get("TMLATTICE_DATA") or "nowhere").joinpath("real_rings", *parts)
+    if not path.is_file():
+        pytest.skip(f"TMLATTICE_DATA has no {path.name}")
+    return path
+
+
+def of_loco(path, energy):
+    """The lattice of a LOCO file as AT's own elements."""
+    from at.load.utils import element_from_dict
+    from scipy.io import loadmat
+
+    ring = loadmat(path, squeeze_me=True, struct_as_record=False)["RINGData"]
+    elements = []
+    for e in getattr(ring, "Lattice", ring):
+        fields = {k: getattr(e, k) for k in e._fieldnames}
+        fields = {k: v for k, v in fields.items() if np.size(v)}
+        elements.append(element_from_dict(fields, check=False))
+    return at.Lattice(elements, energy=energy, periodicity=1)
+
+
+def exact_chromaticity(ring):
+    """Of the AT engine's exact bends: their orbits, matrices and tunes at +-1e-4."""
+    lattice, tunes = AtEngine(ring).lattice(), []
+    step = 1e-5 * np.hstack([np.zeros((4, 1)), np.eye(4), -np.eye(4)])
+    for delta in (-1e-4, 1e-4):
+        orbit = np.zeros(4)
+        for _ in range(6):
+            states = np.zeros((6, 9), order="F")
+            states[:4] = orbit[:, None] + step
+            states[4] = delta
+            before = states.copy()
+            lattice.track(states, in_place=True)
+            matrix = (states[:4, 1:5] - states[:4, 5:]) / 2e-5
+            orbit += np.linalg.solve(np.eye(4) - matrix, (states - before)[:4, 0])
+        halves = [np.trace(matrix[i : i + 2, i : i + 2]) / 2 for i in (0, 2)]
+        signs = [np.sign(matrix[i, i + 1]) for i in (0, 2)]
+        tunes.append([s * np.arccos(h) / 2 / np.pi for s, h in zip(signs, halves, strict=True)])
+    return (np.array(tunes[1]) - tunes[0]) / 2e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "energy", "count", "dropped"),
+    [("als_2008-01-05.loco.mat", 1.9e9, 96, 25.0), ("spear3_2006-01-09.loco.mat", 3e9, 72, 10.0)],
+)
+def test_real_sextupoles_with_coils_make_the_chromaticity(name, energy, count, dropped):
+    """Without the sextupoles that were dropped it was -27 / -34 at ALS."""
+    lattice = of_loco(real(name), energy)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # skew fields of three bends are left out
+        found = ring_from_at(lattice, name)
+    assert found.counts()["sextupole"] == count
+    ours = off_momentum(Chain.from_ring(found, 6), found.length).chromaticity
+    # second-order maps have the edges of bends but to second order: 0.2 in y of a small ring
+    np.testing.assert_allclose(ours, exact_chromaticity(found), rtol=0, atol=0.25)
+    lattice.disable_6d()
+    np.testing.assert_allclose(ours[0], at.get_chrom(lattice)[0], rtol=0, atol=0.1)
+    np.testing.assert_allclose(
+        one_turn_optics(Chain.from_ring(found)).tunes, at.get_tune(lattice)[:2], rtol=0, atol=1e-4
+    )
+    for element in lattice:
+        if isinstance(element, at.Multipole) and not isinstance(element, at.Dipole):
+            element.PolynomB = np.concatenate([element.PolynomB[:2], np.zeros(6)])
+    assert np.abs(ours - at.get_chrom(lattice)[:2]).min() > dropped
+
+
+def test_real_multipoles_of_several_orders_keep_those_up_to_the_sextupole():
+    path = real("esrf_ebs", "betamodel.mat")
+    with pytest.warns(UserWarning, match=r"orders of multipoles above the sextupole \(64\)"):
+        found = load_ring(path, sequence="betamodel")
+    lattice = at.load_lattice(path, use="betamodel")
+    lattice.disable_6d()
+    np.testing.assert_allclose(
+        one_turn_optics(Chain.from_ring(found)).tunes, at.get_tune(lattice)[:2], rtol=0, atol=2e-4
+    )
+    ours = off_momentum(Chain.from_ring(found, 6), found.length).chromaticity
+    np.testing.assert_allclose(ours, at.get_chrom(lattice)[:2], rtol=0, atol=0.1)
+    # a gradient at the edge of a sextupole is a piece of it
+    assert found.pieces("sj1b") == ("sj1b", "crosstalk_sj1b")

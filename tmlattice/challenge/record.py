@@ -135,7 +135,8 @@ def oracle_one_remedy(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bo
 def column(result: Mapping[str, Any], cause: Cause) -> str:
     """The column of the confusion table."""
     if not result["findings"]:
-        return "unknown" if result["verdict"] == "distributed" else "nothing"
+        refused = result["verdict"] == "distributed" and not result.get("priors")
+        return "unknown" if refused else "nothing"
     finding = result["findings"][0]
     if finding["effect"] is None:
         return "unknown"

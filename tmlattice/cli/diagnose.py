@@ -11,6 +11,7 @@ from tmlattice.cli.options import (
     FILE,
     Careful,
     NameList,
+    assume_option,
     background_option,
     console,
     json_option,
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="A measurement of the same machine before the fault: static errors cancel.",
 )
-@background_option("Small errors that the machine has everywhere")
+@background_option("Small errors everywhere (not given: the data say)")
+@assume_option
 @click.option(
     "--max-effects",
     type=click.IntRange(1),
@@ -113,6 +115,7 @@ def diagnose(
     lattice_out: Path | None,
     repaired_out: Path | None,
     missing: bool,
+    assumed: tuple[str, ...],
     json_file: Path | None,
     out: Path | None,
     quiet: bool,
@@ -160,12 +163,14 @@ def diagnose(
                 _check_out(ring, f"--{option}-out", path)
         with _progress(quiet) as progress:
             where = str(measurement) if reference is None else f"{measurement} or {reference}"
-            result = _diagnosed(ring, data, where, effects=effects, progress=progress, **options)
+            result = _diagnosed(
+                ring, data, where, effects=effects, assume=assumed, progress=progress, **options
+            )
             reading = None
             if network:
                 assert isinstance(data, Measurement)
                 progress("network")
-                reading = _weights(ring, network, data)
+                reading = _weights(ring, network, data, assumed)
             _write(result, str(measurement), folder, extra, progress)
             written = _write_rings(result, lattice_out, repaired_out)
             if folder and reading:
@@ -247,11 +252,15 @@ def calibration_beside(lattice: Path) -> Path:
     return lattice.with_name(f"{lattice.name}.calibration.json")
 
 
-def _weights(ring: "Ring", path: Path, data: "Measurement") -> "WeightReading":
+def _weights(
+    ring: "Ring", path: Path, data: "Measurement", assumed: tuple[str, ...]
+) -> "WeightReading":
     from tmlattice.fitting.weights import read_network
+    from tmlattice.measurement.assume import assume
     from tmlattice.network import load_network
 
-    return read_network(ring, load_network(ring, path), data)
+    names = [monitor.name for monitor in ring.monitors]
+    return read_network(ring, load_network(ring, path), assume(data, assumed, names))
 
 
 def _write_weights(reading: "WeightReading", folder: Path) -> None:

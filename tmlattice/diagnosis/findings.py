@@ -165,8 +165,8 @@ def verdict_of(
     more, far_more = judgement.noise
     if explanation.full and left < judgement.false_alarm:
         said = (
-            f"as many as {len(findings)} causes do not explain the data: small errors everywhere; "
-            "state their rms as a background, or give a reference from before the fault"
+            f"as many as {len(findings)} causes do not explain the data; a reference from before "
+            "the fault would cancel what was there anyway"
         )
         return "distributed", (), (said,)
     if not findings:

@@ -200,7 +200,9 @@ class Diagnosis:
         steps: of a dense fit, those kept; the first is the design's, the last the result's.
         refused: those that did not help.
         bad_monitors: names of those left out.
-        priors: rms of the families' priors, as the data have them, by name.
+        priors: rms of small errors, as the data have them or as they were told, by family.
+        prior_errors: relative error of those that were learnt; above one half the readings hardly
+            see the family.
         degenerate: what the data alone do not settle, in words.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
@@ -230,6 +232,7 @@ class Diagnosis:
     refused: "tuple[Step, ...]" = ()
     bad_monitors: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
+    prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
@@ -297,7 +300,11 @@ class Diagnosis:
 
     @property
     def gap(self) -> dict[str, Any]:
-        """Before and after on the fit's readings and on held-out ones."""
+        """Before and after on the fit's readings and on held-out ones.
+
+        Where there are small errors and findings, before is with the small errors alone; the
+        design's own is the first of the steps.
+        """
 
         def both(before: Misfit, after: Misfit) -> dict[str, Any]:
             return {"before": dict(vars(before)), "after": dict(vars(after))}
@@ -306,7 +313,7 @@ class Diagnosis:
         heldout = None
         if gap is not None:
             heldout = {
-                **both(gap.misfits[0], gap.misfits[-1]),
+                **both(gap.misfits[gap.since], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
                 "monitors": "odd" if self.kind == "trajectory" else "half",
                 "steps": [dict(vars(m)) for m in gap.misfits],
@@ -337,6 +344,7 @@ class Diagnosis:
             "bad_monitors": list(self.bad_monitors),
             "degenerate": list(self.degenerate),
             "priors": dict(self.priors),
+            "prior_errors": dict(self.prior_errors),
             "errors": [
                 {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
                 for c, s in zip(self.causes, self.errors, strict=True)

@@ -9,6 +9,7 @@ A magnet of one field is OCELOT's quadrupole, sextupole or octupole; with severa
 its class or MADType where it has that field, else its strongest field at 2 cm from the axis.
 """
 
+import copy
 import math
 from collections import Counter
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.lattice.places import Place
 from tmlattice.lattice.ring import Kind
 
 KIND_OF: dict[int, Kind] = {1: "quadrupole", 2: "sextupole", 3: "octupole"}
@@ -138,14 +140,12 @@ def _kind(strengths: Any, own: int | None) -> Kind:
 def bend(
     element: Any, family: str, length: float, roll: float, left_out: Counter[str]
 ) -> tuple[Kind, Any]:
-    """A bend with its edges, gradient and sextupole field; other fields are left out."""
+    """A bend with its edges, gradient and sextupole field; see `with_coils` for its others."""
     from tmlattice.lattice.ocelot import elements as ocelot
 
     strengths = strengths_of(element)
-    if strengths[0] != 0:
-        left_out["field errors of bends"] += 1
-    if any(complex(k).imag for k in strengths) or any(strengths[3:]):
-        left_out["skew fields and octupoles of bends"] += 1
+    if any(strengths[3:]):
+        left_out["orders of bends above the sextupole"] += 1
     source = ocelot.SBend(
         l=length,
         angle=float(element.BendingAngle),
@@ -162,3 +162,19 @@ def bend(
         eid=family,
     )
     return "bend", source
+
+
+def with_coils(element: Any, family: str, source: Any) -> list[Place]:
+    """A bend; with skew fields or a field error it is cut into halves, and they are in between."""
+    strengths = strengths_of(element)[:3]
+    others = np.array([strengths[0], 1j * strengths[1].imag, 1j * strengths[2].imag])
+    if not others.any():
+        return [(family, "bend", source)]
+    first, second = (copy.deepcopy(source) for _ in range(2))
+    for half in (first, second):
+        half.l, half.angle = source.l / 2, source.angle / 2
+    first.e2 = first.fintx = first.h_pole2 = 0.0
+    second.e1 = second.fint = second.h_pole1 = 0.0
+    name = f"{family}_coil"
+    coil: Place = (name, "multipole", _combined(source.l * others, 0.0, source.tilt, name))
+    return [(family, "bend", first), coil, (f"{family}_2", "bend", second)]

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.at_fields import bend, straight, thin
+from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
 from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
@@ -147,14 +147,18 @@ def _roll(element: Any, left_out: Counter[str]) -> float:
 
 
 def _places(element: Any, family: str, energy: float, left_out: Counter[str]) -> list[Place]:
-    """What one AT element is in the ring: one element, but for a corrector of both planes."""
+    """What one AT element is in the ring: one element, but for correctors of both planes and bends
+    with coils."""
     import at
 
     mad = str(getattr(element, "MADType", "")).upper()
     mad = mad or str(getattr(element, "origin", "")).upper()
     if isinstance(element, at.Corrector):
         return _correctors(element, family, mad)
-    return [(family, *_convert(element, family, mad, energy, left_out))]
+    kind, source = _convert(element, family, mad, energy, left_out)
+    if kind == "bend":
+        return with_coils(element, family, source)
+    return [(family, kind, source)]
 
 
 def _convert(
