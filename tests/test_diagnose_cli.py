@@ -240,8 +240,7 @@ def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, sch
         ("located", ["no effect of the catalogue explains it", "Next: Look at what stands there",
                      "(bpm::5, QD::5, end_5)", "cannot be put into the lattice"]),
         ("nothing", ["No error is seen", "Would have been seen", "wrong strength of a quadrupole"]),
-        ("distributed", ["all along the ring", "--background all", "--reference",
-                         "Suspects, not findings"]),
+        ("distributed", ["all along the ring", "a fault that small errors hide", "--reference"]),
     ],
 )  # fmt: skip
 def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):

@@ -152,6 +152,11 @@ def _open(finding: Finding) -> str:
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
+    if diagnosis.verdict == "distributed" and diagnosis.priors and not diagnosis.steps:
+        return (
+            "A measurement of this machine from before the fault (--reference) shows a fault that "
+            "small errors hide."
+        )
     if diagnosis.verdict == "distributed" and not diagnosis.steps:
         return (
             "Small errors everywhere look like this: state them (--background all), or give a "
@@ -326,7 +331,13 @@ def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         what = "something without a name" if one.effect is None else words(one.effect)
         if one.kind == "section" and one.effect is not None:
             what += f", {one.element}"
-        rows.append((one.kind, place, f"{what} (statistic {one.statistic:.4g})"))
+        rows.append(
+            (
+                one.kind,
+                place,
+                f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})",
+            )
+        )
     return rows
 
 
