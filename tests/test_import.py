@@ -278,6 +278,13 @@ def test_lattice_before_the_fit(simulated, brought):
     assert any("not those of the fit's last iteration" in s for s in found.assumed)
 
 
+def test_noise_that_no_file_gives_can_be_told(simulated, brought):
+    bare = changed(simulated, LocoMeasData_BPMSTD=np.zeros(0))
+    assert brought(bare).measurement.noise is None
+    assert_allclose(brought(bare, noise=3e-6).measurement.noise, 3e-6)
+    assert_allclose(brought(simulated, noise=3e-6).measurement.noise, 2e-7)  # the file's own
+
+
 def test_computed_dispersion_is_told(simulated, brought):
     model = {"Eta": simulated["LocoMeasData"]["Eta"] * (1 + 1e-6)}
     found = brought({**simulated, "LocoModel": model})

@@ -47,6 +47,12 @@ if TYPE_CHECKING:
     type=click.Choice(["m", "mm", "um"]),
     help="Of the readings of first turns [m] or of a turn-by-turn file [mm].",
 )
+@click.option(
+    "--noise",
+    type=click.FloatRange(0, min_open=True),
+    metavar="M",
+    help="Rms of a reading, or of an orbit change, m, where FILES give none.",
+)
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
 @quiet_option
@@ -59,6 +65,7 @@ def import_files(
     energy: float | None,
     turns: str | None,
     unit: Literal["m", "mm", "um"] | None,
+    noise: float | None,
     keep_bad: bool,
     force: bool,
     quiet: bool,
@@ -77,7 +84,8 @@ def import_files(
         raise MeasurementError(
             f"'{out}' holds a measurement already; name another folder, or replace it with --force"
         )
-    brought = bring_in(files, Options(iteration, keep_bad, sequence, lattice, energy, turns, unit))
+    options = Options(iteration, keep_bad, sequence, lattice, energy, turns, unit, noise)
+    brought = bring_in(files, options)
     write_imported(brought, out)
     if not quiet:
         _print(brought, out)

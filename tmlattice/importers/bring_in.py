@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
@@ -34,6 +36,7 @@ class Options:
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
         unit: of the readings of first turns or turns.
+        noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
     iteration: Iteration = "last"
@@ -43,6 +46,7 @@ class Options:
     energy: float | None = None
     turns: str | None = None
     unit: Unit | None = None
+    noise: float | None = None
 
 
 def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imported:
@@ -70,6 +74,10 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
     brought = _bring(files, matlab, hdf5, options)
+    if options.noise is not None and brought.measurement.noise is None:
+        noise = np.full((len(brought.measurement.monitors), 2), options.noise)
+        brought = replace(brought, measurement=replace(brought.measurement, noise=noise))
+        brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
         return brought
     confirmed, contradicted = compared(brought.ring, brought.measurement)
