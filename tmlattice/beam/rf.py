@@ -51,8 +51,8 @@ class Rf:
         return self.own or loss > 0 or frequency != 0
 
     def frequency(self, ring: Ring) -> float:
-        """Hz, of a beam at the speed of light on the design orbit."""
-        return float(self.harmonic * SPEED_OF_LIGHT / ring.length)
+        """Hz, of a beam on the design orbit; that of light for electrons, at their energies."""
+        return float(self.harmonic * speed_of(ring) / ring.length)
 
 
 def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None) -> Rf:
@@ -70,14 +70,19 @@ def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None)
     sources = [elements[i].source for i in cavities]
     if harmonic is None:
         known = [f for f in (float(getattr(s, "freq", 0.0)) for s in sources) if f]
-        harmonic = round((known[0] if known else FREQUENCY) * ring.length / SPEED_OF_LIGHT)
+        harmonic = round((known[0] if known else FREQUENCY) * ring.length / speed_of(ring))
     if voltage is None:
         voltage = 1e9 * sum(float(getattr(s, "v", 0.0)) for s in sources)  # OCELOT's are GV
         if not voltage:
-            loss = sum(expected_loss(e, ring.energy) for e in elements)
+            loss = sum(expected_loss(e, ring.energy) for e in elements) if ring.radiates else 0.0
             voltage = OVERVOLTAGE * loss * ring.energy * 1e9
     places = tuple(cavities or named[:1] or [len(elements)])
     return Rf(places, max(harmonic, 1), voltage, bool(cavities))
+
+
+def speed_of(ring: Ring) -> float:
+    """m/s; that of light where particles are as fast to 1e-6, as the lattices of electrons say."""
+    return SPEED_OF_LIGHT * (ring.beta if ring.beta < 1 - 1e-6 else 1.0)
 
 
 def frequency_of(settings: Settings) -> float:
@@ -124,14 +129,14 @@ def cavities(
     """
     if not rf.on(loss, frequency) or rf.voltage == 0:
         return NO_RF
-    crest = rf.voltage / (ring.energy * 1e9)
+    crest = rf.voltage / (ring.energy * 1e9 * ring.beta)
     if loss >= crest:
         raise LatticeError(
             f"an RF of {rf.voltage / 1e6:.3g} MV cannot make good a loss of "
             f"{loss * ring.energy * 1e3:.3g} MeV a turn; give the ring's cavities their voltage"
         )
-    wave = 2 * np.pi * rf.harmonic / ring.length * (1 + frequency)
-    slip = ring.length * frequency / (1 + frequency)
+    wave = 2 * np.pi * rf.harmonic / ring.length * ring.beta * (1 + frequency)
+    slip = ring.length / ring.beta * frequency / (1 + frequency)
     end = len(ring.magnets) + 1
     exits = [int(layer_of[i]) if i < len(ring.elements) else end for i in rf.places]
     values = np.array([crest / len(exits), np.arcsin(max(loss, 0.0) / crest), wave, slip])

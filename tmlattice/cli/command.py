@@ -9,6 +9,7 @@ import click
 
 from tmlattice import __version__
 from tmlattice.cli.challenge import challenge
+from tmlattice.cli.check import check
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
@@ -30,8 +31,9 @@ def tmlattice() -> None:
     """The gap between the model of a storage ring and the ring itself.
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
-    .repr), MAD-X (.seq, .madx) or the package's own JSON. OCELOT's files are Python code and are
-    run, and AT's .m and .repr are evaluated: load only files that you trust.
+    .repr), MAD-X (.seq, .madx, or a TWISS table: .tfs, .twiss, .dat), elegant (.lte), Xsuite
+    (.json) or the package's own JSON. OCELOT's files are Python code and are run, and AT's .m and
+    .repr, MAD-X's and elegant's are evaluated: load only files that you trust.
     """
 
 
@@ -41,6 +43,7 @@ tmlattice.add_command(study)
 tmlattice.add_command(import_files)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
+tmlattice.add_command(check)
 tmlattice.add_command(diagnose)
 tmlattice.add_command(predict)
 tmlattice.add_command(reproduce)
@@ -48,10 +51,12 @@ tmlattice.add_command(challenge)
 
 
 def main() -> NoReturn:
-    """Run the command line. Exit code 0: done; 2: input that cannot be used; 130: Ctrl-C."""
+    """Run the command line. Exit code 0: done; 1: done, and told what is wrong (`check`); 2: input
+    that cannot be used; 130: Ctrl-C."""
     warnings.showwarning = _show_warning
+    code = 0
     try:
-        tmlattice(standalone_mode=False)
+        code = tmlattice(standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         sys.exit(BAD_INPUT)
@@ -66,7 +71,7 @@ def main() -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(STOPPED)  # temporary files are gone; torch and its threads need a second to end
-    sys.exit(0)
+    sys.exit(code)
 
 
 def _fail(message: str, code: int) -> NoReturn:

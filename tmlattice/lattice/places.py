@@ -4,12 +4,40 @@ import logging
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, cast
 
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import Element, Kind, number_names
 
 log = logging.getLogger(__name__)
+
+Place = tuple[str, Kind, Any]
+"""Family, kind and OCELOT element, before its name has a number."""
+
+
+def corrector(family: str, plane: Literal["h", "v"], length: float, kick: float = 0.0) -> Place:
+    """A horizontal ("h") or vertical ("v") corrector; length in m, kick in rad."""
+    from tmlattice.lattice.ocelot import elements
+
+    cls, kind = (elements.Hcor, "hcorrector") if plane == "h" else (elements.Vcor, "vcorrector")
+    return family, cast(Kind, kind), cls(l=length, angle=kick, eid=family)
+
+
+def corrector_pair(family: str, length: float, x: float = 0.0, y: float = 0.0) -> list[Place]:
+    """A corrector of both planes: FAMILY_h and FAMILY_v, thin, in the middle of its length.
+
+    Args:
+        family: its name.
+        length: m; a way of half of it lies before and behind.
+        x, y: kicks, rad.
+    """
+    from tmlattice.lattice.ocelot import elements
+
+    pair = [corrector(f"{family}_h", "h", 0.0, x), corrector(f"{family}_v", "v", 0.0, y)]
+    if length == 0:
+        return pair
+    half: Place = (f"{family}_half", "drift", elements.Drift(l=length / 2, eid=f"{family}_half"))
+    return [half, *pair, half]
 
 
 def source_kind(source: Any) -> Kind:

@@ -54,6 +54,10 @@ def wiggler_curvature(element: Element, energy: float) -> float:
 
 def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
     """Energy loss of the design orbit in a turn, eV: C_gamma E^4 / 2 pi, integral of 1/rho^2."""
+    if not ring.radiates:
+        if bends or wigglers:
+            raise LatticeError(f"the particles of '{ring.name}' are too heavy to radiate")
+        return 0.0
     energy = ring.energy * 1e9
     bent = sum(e.angle**2 / e.length for e in ring.elements if e.kind == "bend")
     wiggled = sum(wiggler_curvature(e, energy) for e in ring.elements if e.kind == "wiggler")
@@ -189,20 +193,22 @@ class Builder:
             more |= {"T1": -shift, "T2": shift}
         if angle:
             more |= {"R1": _rotation(angle), "R2": _rotation(-angle)}
+        source = element.source
+        skew = [0.0] * len(normal)
+        combined = type(source).__name__ == "CombinedMultipole"
+        if combined:
+            normal = [float(source.k0), *normal[1:]]
+            skew = [float(source.k0s), float(source.k1s), float(source.k2s)]
         factorial = [1.0, 1.0, 2.0, 6.0]
-        strengths = [k / n for k, n in zip(normal, factorial, strict=False)]
+        B, A = ([k / n for k, n in zip(f, factorial, strict=False)] for f in (normal, skew))
 
         def body(share: float) -> list[Any]:
-            return [
-                at.Multipole(
-                    element.name,
-                    share * element.length,
-                    [0.0] * len(strengths),
-                    strengths,
-                    NumIntSteps=self.steps,
-                    **more,
-                )
-            ]
+            if element.length == 0:  # a combined multipole's fields are integrated then
+                thin = share if combined else 0.0
+                parts = [[thin * k for k in field] for field in (A, B)]
+                return [at.ThinMultipole(element.name, *parts, **more)]
+            length = share * element.length
+            return [at.Multipole(element.name, length, A, B, NumIntSteps=self.steps, **more)]
 
         return body
 
@@ -226,7 +232,7 @@ class Builder:
         return self._straight(element, [0.0, 0.0, 0.0, k3], wrong, False)(1.0)
 
     def _multipole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
-        if element.length > 0:  # a thick one, as AT's files have them
+        if not hasattr(element.source, "kn"):
             return self._straight(element, [0.0, element.k1, element.k2], wrong, False)(1.0)
         strengths = np.asarray(element.source.kn, dtype=float)
         if strengths[0]:

@@ -10,7 +10,8 @@ owe it to its own model.
 Launches are OCELOT's (x, px, y, py, tau, p); AT tracks (x, px, y, py, delta, ct). The first four
 are the same: px = Px / p0, no angle. From p = dE / (p0 c) follows delta = P / p0 - 1 through
 E^2 = (P c)^2 + (m c^2)^2. tau = c t - s / beta0 and ct have the same sign, positive for a late
-particle; AT takes the speed of light for all particles, an error of 1 / gamma^2 in ct alone.
+particle; AT takes the speed of light for all particles: its ct is the way, beta0 c t, and what the
+velocity adds stands at the end of the line where it counts (protons).
 """
 
 import copy
@@ -36,6 +37,9 @@ Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
 """What is set on purpose, by element: {"kick": rad}, {"k1_relative": 1}, {"k2_relative": 1},
 and {"rf": {"frequency_relative": 1}}."""
+
+RELATIVISTIC = 1e3
+"""Above this gamma particles of other energies are as fast, to a millionth."""
 
 TURNS_AT_ONCE = 2**22
 """AT's result is cut into blocks of so many states, so that many turns fit into memory."""
@@ -109,6 +113,10 @@ class AtEngine:
             self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
             self._line += pieces
         self._line.append(at.Marker("rf_at_the_end"))
+        if ring.gamma < RELATIVISTIC:  # AT's ct is the way: what the velocity adds
+            matrix = np.eye(6, order="F")
+            matrix[5, 4] = -ring.length / ring.gamma**2
+            self._line.append(at.M66("velocity", matrix))
         self._monitors = np.array(
             [i for i, e in enumerate(self._line) if isinstance(e, at.Monitor)], dtype=np.uint32
         )
@@ -125,7 +133,7 @@ class AtEngine:
 
     def _set_rf(self, harmonic: int | None, voltage: float | None) -> None:
         rf = rf_of(self.ring, harmonic, voltage)
-        behind = len(self._line) - 1  # the marker at the end
+        behind = self._places[-1].stop  # the marker at the end
         self._cavities = [
             self._places[i].start if i < len(self._places) else behind for i in rf.places
         ]
@@ -168,7 +176,7 @@ class AtEngine:
             raise ValueError(f"{turns} turns cannot be tracked; one at least can")
         if settings is not None and len(settings) != len(start):
             raise ValueError(f"{len(settings)} settings for {len(start)} shots; give one a shot")
-        state = to_at(start, self.ring.energy)
+        state = to_at(start, self.ring.energy, self.ring.mass)
         readings = np.empty((len(start), turns, len(self._monitors), 2))
         for shots, changed, frequency in self._groups(settings or [{}] * len(start)):
             line = self._line.copy()
@@ -252,10 +260,11 @@ class AtEngine:
         frequency = self._harmonic * SPEED_OF_LIGHT / self.ring.length * (1 + frequency_relative)
         # Above transition a late particle has too much energy: the field falls with ct.
         phase = np.arcsin(self.expected_loss / self._voltage)
+        energy = self.ring.energy * 1e9 * self.ring.beta**2  # dP / P = dE / (beta^2 E)
         return at.RFCavity(
             "rf",
             length,
-            self._voltage / len(self._cavities) * self._energy / (self.ring.energy * 1e9),
+            self._voltage / len(self._cavities) * self._energy / energy,
             frequency,
             self._harmonic,
             self._energy,
@@ -297,18 +306,21 @@ class AtEngine:
         return readings
 
 
-def to_at(launches: ArrayLike, energy: float) -> Array:
+def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> Array:
     """AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6].
 
     Args:
         launches: [..., 6].
         energy: of the reference particle, GeV.
+        mass: its rest energy, GeV.
     """
     launches = np.asarray(launches, dtype=float)
-    reference = np.sqrt((energy * 1e9) ** 2 - ELECTRON**2)
+    rest = 1e9 * mass
+    reference = np.sqrt((energy * 1e9) ** 2 - rest**2)
     total = energy * 1e9 + launches[..., 5] * reference
     converted = launches[..., SWAPPED].copy()
-    converted[..., 4] = np.sqrt(total**2 - ELECTRON**2) / reference - 1
+    converted[..., 4] = np.sqrt(total**2 - rest**2) / reference - 1
+    converted[..., 5] *= reference / (energy * 1e9)
     return converted
 
 
