@@ -216,17 +216,17 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
     ("fields", "told"),
     [
         (lambda d: {"LocoMeasData_M": d["M"] * np.repeat([1, -1], len(d["M"]) // 2)[:, None]},
-         "kicks of correctors of y are of the other sign, or y is"),
-        (lambda d: {"LocoMeasData_DeltaRF": -d["DeltaRF"]}, "the RF's step is of the other sign"),
-        (lambda d: {"LocoMeasData_M": d["M"] * 1e-3}, "a thousandth of the design's"),
+         "--assume y-reversed"),
+        (lambda d: {"LocoMeasData_DeltaRF": -d["DeltaRF"]}, "--assume rf-reversed"),
+        (lambda d: {"LocoMeasData_M": d["M"] * 1e-3}, "--assume kicks-in-mrad"),
         (lambda d: {"LocoMeasData_M": d["M"] * 1e3 / 2e2, "LocoMeasData_Eta": d["Eta"]},
-         "5 times the design's"),
-        (lambda d: {"LocoMeasData_M": d["M"] / 2}, "half the design's"),
+         "the response is not that of"),
+        (lambda d: {"LocoMeasData_M": d["M"] / 2}, "--assume kicks-halved"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
-            [-d["M"][:16], d["M"][16:]])}, "x is of the other sign"),
-        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "planes are exchanged"),
+            [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
+        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),
         (lambda d: {"LocoMeasData_M": d["M"][np.random.default_rng(1).permutation(len(d["M"]))]},
-         "does not resemble the design"),
+         "the response is not that of"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 3, -1, 1)[:, None]},
          "single monitors of x have the sign against the others: 'bpm::3'"),
         (lambda d: {"LocoMeasData_M": d["M"][[*range(2), 5, 3, 4, 2, *range(6, 32)]]},
@@ -713,7 +713,7 @@ def test_computed_dispersion_of_a_real_ring_is_told():
     doubts = {name: bring_in([DATA / f"{name}.loco.mat"]).doubts for name in README}
     computed = {name for name, said in doubts.items() if any("computed" in s for s in said)}
     assert computed == {"siam_2007-09-25"}
-    wrong = ("other sign", "exchanged", "momentum", "design's (")
+    wrong = ("assume", "momentum", "is not that of")
     assert not any(word in s for said in doubts.values() for s in said for word in wrong)
 
 
