@@ -285,6 +285,14 @@ def test_noise_that_no_file_gives_can_be_told(simulated, brought):
     assert_allclose(brought(simulated, noise=3e-6).measurement.noise, 2e-7)  # the file's own
 
 
+def test_noise_that_single_monitors_lack_is_the_typical_one(simulated, brought):
+    given = np.repeat([2e-4, 3e-4], 2 * CELLS)
+    given[[3, 20]] = [0.0, np.nan]
+    found = brought(changed(simulated, LocoMeasData_BPMSTD=given))
+    assert_allclose(found.measurement.noise, np.repeat([[2e-7, 3e-7]], 2 * CELLS, axis=0))
+    assert any("'bpm::3', 'bpm::4'" in sentence for sentence in found.assumed)
+
+
 def test_computed_dispersion_is_told(simulated, brought):
     model = {"Eta": simulated["LocoMeasData"]["Eta"] * (1 + 1e-6)}
     found = brought({**simulated, "LocoModel": model})

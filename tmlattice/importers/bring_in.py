@@ -10,7 +10,7 @@ import numpy as np
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
-from tmlattice.importers.imported import Imported
+from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.lattices import Elements, elements_of
 from tmlattice.importers.loco import Iteration, bring_loco, is_loco
 from tmlattice.importers.middle_layer import bring_middle_layer, is_beside, is_response
@@ -78,6 +78,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         noise = np.full((len(brought.measurement.monitors), 2), options.noise)
         brought = replace(brought, measurement=replace(brought.measurement, noise=noise))
         brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
+    if isinstance(brought.measurement, OrbitResponse):
+        brought = _with_all_noise(brought, brought.measurement)
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
         return brought
     confirmed, contradicted = compared(brought.ring, brought.measurement)
@@ -86,6 +88,20 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         assumed=(*brought.assumed, *confirmed),
         doubts=(*brought.doubts, *contradicted),
     )
+
+
+def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
+    """The typical noise of a plane where the files have none for a monitor."""
+    if data.noise is None or not np.isfinite(data.noise).any(axis=0).all():
+        return brought
+    unknown = np.isnan(data.noise)
+    read = np.isfinite(data.response).any(axis=0)
+    noise = np.where(unknown, np.nanmedian(data.noise, axis=0), data.noise)
+    brought = replace(brought, measurement=replace(data, noise=noise))
+    names = [n for n, u in zip(data.monitors, (unknown & read).any(axis=1), strict=True) if u]
+    if not names:
+        return brought
+    return brought.saying(f"no noise is given for {counted(names)}: that of the typical monitor")
 
 
 def _bring(
