@@ -98,7 +98,7 @@ def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
     read = np.isfinite(data.response).any(axis=0)
     noise = np.where(unknown, np.nanmedian(data.noise, axis=0), data.noise)
     brought = replace(brought, measurement=replace(data, noise=noise))
-    names = [n for n, u in zip(data.monitors, (unknown & read).any(axis=1), strict=True) if u]
+    names = [data.monitors[i] for i in np.unique(np.nonzero(unknown & read)[0])]
     if not names:
         return brought
     return brought.saying(f"no noise is given for {counted(names)}: that of the typical monitor")
