@@ -188,6 +188,7 @@ def test_halves_of_a_magnet_that_kicks_are_the_magnet(simulated, brought):
     halves = [e for e in ring.elements if e.family in ("sf", "sf_2")]
     assert [e.name for e in halves[:4]] == ["sf::0", "sf_2::0", "sf::1", "sf_2::1"]
     assert_allclose([e.length for e in halves], 0.1)
+    assert ring.pieces("sf_2::3") == ("sf::3", "sf_2::3")  # one magnet, one gradient
     assert ring.length == pytest.approx(sum(f["Length"] for f in elements()))
     thin = ring["sf_h::0"]
     assert thin.length == 0
@@ -319,6 +320,11 @@ def test_command_writes_a_folder_that_reads_back(simulated, tmp_path):
     refused = tmlattice("import", "a.loco.mat", "--out", "m", cwd=tmp_path, check=2)
     assert "--force" in refused.stderr
     tmlattice("import", "a.loco.mat", "--out", "m", "--force", "-q", cwd=tmp_path, check=0)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "lattice.json").write_text("another ring")
+    refused = tmlattice("import", "a.loco.mat", "--out", "other", cwd=tmp_path, check=2)
+    assert "lattice.json" in refused.stderr
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["lattice.json"]
 
 
 def element(place, **fields):

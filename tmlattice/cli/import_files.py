@@ -77,16 +77,13 @@ def import_files(
     lattice (.mat); a table (.csv) with --lattice; or a turn-by-turn file. What was assumed (units,
     signs, steps) is printed, and what the data contradict: nothing is mended silently.
     """
-    from tmlattice.errors import MeasurementError
     from tmlattice.importers import Options, bring_in, write_imported
+    from tmlattice.measurement.write import check_free
 
-    if not force and any((out / name).exists() for name in ("measurement.json", "lattice.json")):
-        raise MeasurementError(
-            f"'{out}' holds a measurement already; name another folder, or replace it with --force"
-        )
+    check_free(out, force)
     options = Options(iteration, keep_bad, sequence, lattice, energy, turns, unit, noise)
     brought = bring_in(files, options)
-    write_imported(brought, out)
+    write_imported(brought, out, force)
     if not quiet:
         _print(brought, out)
 
