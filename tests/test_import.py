@@ -188,6 +188,7 @@ def test_halves_of_a_magnet_that_kicks_are_the_magnet(simulated, brought):
     halves = [e for e in ring.elements if e.family in ("sf", "sf_2")]
     assert [e.name for e in halves[:4]] == ["sf::0", "sf_2::0", "sf::1", "sf_2::1"]
     assert_allclose([e.length for e in halves], 0.1)
+    assert ring.pieces("sf_2::3") == ("sf::3", "sf_2::3")  # one magnet, one gradient
     assert ring.length == pytest.approx(sum(f["Length"] for f in elements()))
     thin = ring["sf_h::0"]
     assert thin.length == 0
@@ -216,17 +217,17 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
     ("fields", "told"),
     [
         (lambda d: {"LocoMeasData_M": d["M"] * np.repeat([1, -1], len(d["M"]) // 2)[:, None]},
-         "kicks of correctors of y are of the other sign, or y is"),
-        (lambda d: {"LocoMeasData_DeltaRF": -d["DeltaRF"]}, "the RF's step is of the other sign"),
-        (lambda d: {"LocoMeasData_M": d["M"] * 1e-3}, "a thousandth of the design's"),
+         "--assume y-reversed"),
+        (lambda d: {"LocoMeasData_DeltaRF": -d["DeltaRF"]}, "--assume rf-reversed"),
+        (lambda d: {"LocoMeasData_M": d["M"] * 1e-3}, "--assume kicks-in-mrad"),
         (lambda d: {"LocoMeasData_M": d["M"] * 1e3 / 2e2, "LocoMeasData_Eta": d["Eta"]},
-         "5 times the design's"),
-        (lambda d: {"LocoMeasData_M": d["M"] / 2}, "half the design's"),
+         "the response is not that of"),
+        (lambda d: {"LocoMeasData_M": d["M"] / 2}, "--assume kicks-halved"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
-            [-d["M"][:16], d["M"][16:]])}, "x is of the other sign"),
-        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "planes are exchanged"),
+            [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
+        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),
         (lambda d: {"LocoMeasData_M": d["M"][np.random.default_rng(1).permutation(len(d["M"]))]},
-         "does not resemble the design"),
+         "the response is not that of"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 3, -1, 1)[:, None]},
          "single monitors of x have the sign against the others: 'bpm::3'"),
         (lambda d: {"LocoMeasData_M": d["M"][[*range(2), 5, 3, 4, 2, *range(6, 32)]]},
@@ -278,6 +279,21 @@ def test_lattice_before_the_fit(simulated, brought):
     assert any("not those of the fit's last iteration" in s for s in found.assumed)
 
 
+def test_noise_that_no_file_gives_can_be_told(simulated, brought):
+    bare = changed(simulated, LocoMeasData_BPMSTD=np.zeros(0))
+    assert brought(bare).measurement.noise is None
+    assert_allclose(brought(bare, noise=3e-6).measurement.noise, 3e-6)
+    assert_allclose(brought(simulated, noise=3e-6).measurement.noise, 2e-7)  # the file's own
+
+
+def test_noise_that_single_monitors_lack_is_the_typical_one(simulated, brought):
+    given = np.repeat([2e-4, 3e-4], 2 * CELLS)
+    given[[3, 20]] = [0.0, np.nan]
+    found = brought(changed(simulated, LocoMeasData_BPMSTD=given))
+    assert_allclose(found.measurement.noise, np.repeat([[2e-7, 3e-7]], 2 * CELLS, axis=0))
+    assert any("'bpm::3', 'bpm::4'" in sentence for sentence in found.assumed)
+
+
 def test_computed_dispersion_is_told(simulated, brought):
     model = {"Eta": simulated["LocoMeasData"]["Eta"] * (1 + 1e-6)}
     found = brought({**simulated, "LocoModel": model})
@@ -304,6 +320,11 @@ def test_command_writes_a_folder_that_reads_back(simulated, tmp_path):
     refused = tmlattice("import", "a.loco.mat", "--out", "m", cwd=tmp_path, check=2)
     assert "--force" in refused.stderr
     tmlattice("import", "a.loco.mat", "--out", "m", "--force", "-q", cwd=tmp_path, check=0)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "lattice.json").write_text("another ring")
+    refused = tmlattice("import", "a.loco.mat", "--out", "other", cwd=tmp_path, check=2)
+    assert "lattice.json" in refused.stderr
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["lattice.json"]
 
 
 def element(place, **fields):
@@ -706,7 +727,7 @@ def test_computed_dispersion_of_a_real_ring_is_told():
     doubts = {name: bring_in([DATA / f"{name}.loco.mat"]).doubts for name in README}
     computed = {name for name, said in doubts.items() if any("computed" in s for s in said)}
     assert computed == {"siam_2007-09-25"}
-    wrong = ("other sign", "exchanged", "momentum", "design's (")
+    wrong = ("assume", "momentum", "is not that of")
     assert not any(word in s for said in doubts.values() for s in said for word in wrong)
 
 

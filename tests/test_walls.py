@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "tmlattice"
 ORDER = (
     "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
-    "inference", "observe", "importers", "diagnosis", "fitting", "machine", "challenge", "systems",
+    "inference", "observe", "diagnosis", "importers", "fitting", "machine", "challenge", "systems",
     "plots", "report", "cli",
 )  # fmt: skip
 BESIDE = {

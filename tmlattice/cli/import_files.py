@@ -47,6 +47,12 @@ if TYPE_CHECKING:
     type=click.Choice(["m", "mm", "um"]),
     help="Of the readings of first turns [m] or of a turn-by-turn file [mm].",
 )
+@click.option(
+    "--noise",
+    type=click.FloatRange(0, min_open=True),
+    metavar="M",
+    help="Rms of a reading, or of an orbit change, m, where FILES give none.",
+)
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
 @quiet_option
@@ -59,6 +65,7 @@ def import_files(
     energy: float | None,
     turns: str | None,
     unit: Literal["m", "mm", "um"] | None,
+    noise: float | None,
     keep_bad: bool,
     force: bool,
     quiet: bool,
@@ -70,15 +77,13 @@ def import_files(
     lattice (.mat); a table (.csv) with --lattice; or a turn-by-turn file. What was assumed (units,
     signs, steps) is printed, and what the data contradict: nothing is mended silently.
     """
-    from tmlattice.errors import MeasurementError
     from tmlattice.importers import Options, bring_in, write_imported
+    from tmlattice.measurement.write import check_free
 
-    if not force and any((out / name).exists() for name in ("measurement.json", "lattice.json")):
-        raise MeasurementError(
-            f"'{out}' holds a measurement already; name another folder, or replace it with --force"
-        )
-    brought = bring_in(files, Options(iteration, keep_bad, sequence, lattice, energy, turns, unit))
-    write_imported(brought, out)
+    check_free(out, force)
+    options = Options(iteration, keep_bad, sequence, lattice, energy, turns, unit, noise)
+    brought = bring_in(files, options)
+    write_imported(brought, out, force)
     if not quiet:
         _print(brought, out)
 

@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
-from tmlattice.importers.imported import Imported
+from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.lattices import Elements, elements_of
 from tmlattice.importers.loco import Iteration, bring_loco, is_loco
 from tmlattice.importers.middle_layer import bring_middle_layer, is_beside, is_response
@@ -34,6 +36,7 @@ class Options:
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
         unit: of the readings of first turns or turns.
+        noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
     iteration: Iteration = "last"
@@ -43,6 +46,7 @@ class Options:
     energy: float | None = None
     turns: str | None = None
     unit: Unit | None = None
+    noise: float | None = None
 
 
 def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imported:
@@ -70,6 +74,12 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
     brought = _bring(files, matlab, hdf5, options)
+    if options.noise is not None and brought.measurement.noise is None:
+        noise = np.full((len(brought.measurement.monitors), 2), options.noise)
+        brought = replace(brought, measurement=replace(brought.measurement, noise=noise))
+        brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
+    if isinstance(brought.measurement, OrbitResponse):
+        brought = _with_all_noise(brought, brought.measurement)
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
         return brought
     confirmed, contradicted = compared(brought.ring, brought.measurement)
@@ -78,6 +88,20 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         assumed=(*brought.assumed, *confirmed),
         doubts=(*brought.doubts, *contradicted),
     )
+
+
+def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
+    """The typical noise of a plane where the files have none for a monitor."""
+    if data.noise is None or not np.isfinite(data.noise).any(axis=0).all():
+        return brought
+    unknown = np.isnan(data.noise)
+    read = np.isfinite(data.response).any(axis=0)
+    noise = np.where(unknown, np.nanmedian(data.noise, axis=0), data.noise)
+    brought = replace(brought, measurement=replace(data, noise=noise))
+    names = [data.monitors[i] for i in np.unique(np.nonzero(unknown & read)[0])]
+    if not names:
+        return brought
+    return brought.saying(f"no noise is given for {counted(names)}: that of the typical monitor")
 
 
 def _bring(

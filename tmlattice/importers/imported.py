@@ -12,6 +12,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder
 from tmlattice.lattice import Ring, save_ring
 from tmlattice.measurement import Measurement, OrbitResponse, write_measurement
+from tmlattice.measurement.write import check_free
 
 Array = NDArray[np.float64]
 
@@ -94,13 +95,24 @@ def described(brought: Imported) -> str:
     return f"first turns: {shots} shots, {turns} turns, {monitors} monitors"
 
 
-def write_imported(brought: Imported, folder: Path) -> None:
+def write_imported(brought: Imported, folder: Path, force: bool = False) -> None:
     """Write the measurement folder, with `lattice.json` where there is a ring, as a whole.
+
+    Args:
+        brought: what to write.
+        folder: made where it is not there.
+        force: a measurement or lattice that is there already is replaced.
 
     Raises:
         OutputError: it cannot be written.
-        MeasurementError: readings that no reader would take.
+        MeasurementError: readings that no reader would take, or old data without force.
     """
+    check_free(folder, force)
+    if brought.ring is not None and not force and (folder / "lattice.json").exists():
+        raise MeasurementError(
+            f"'{folder}' holds a lattice.json already; name another folder, or replace it with "
+            "--force (in Python: force=True)"
+        )
     with output_folder(folder) as temporary:
         write_measurement(temporary, brought.measurement)
         if brought.ring is not None:
