@@ -20,8 +20,10 @@ from tmlattice.machine import simulate
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement.assume import assume
 
-RINGS = ("tests/lattices/small_ring.py", "petra3", "esrf.m")
-SHOTS, SEEDS = 6, 8
+RINGS = ("petra3", "tests/lattices/small_ring.py", "esrf.m", "thomx.m")
+SHOTS = 6
+SEEDS = range(300, 308)
+"""Others than those that the thresholds were chosen with, 0 to 16, 100 to 116 and 200 to 212."""
 LARGE = {"quadrupole_gradient": -0.2, "monitor_gain_x": -2.0, "monitor_gain_y": -2.0}
 SMALL_OF_RESPONSES = {
     "quadrupole_gradient": 1e-3,
@@ -127,6 +129,8 @@ def wrong_response(data, ring):
         ("correctors shifted by 1", "correctors-shifted=-1", "correctors-shifted=1"),
         ("RF step of wrong sign", "rf-reversed", "rf-reversed"),
     ):
+        if name.startswith("horizontal") and data.planes.count("x") < 2:
+            continue  # no one could tell it from a bad corrector
         if name == "kicks in mrad":
             yield name, replace(data, kicks=data.kicks * 1e3), {asked}
         else:
@@ -189,6 +193,32 @@ def healthy(ring, seed):
     yield "3 mm of orbit", [fault(ring, rng)], {"amplitude": 3e-3}
 
 
+def healthy_response(ring, seed):
+    """Kind, causes and small errors of the machine."""
+    rng = np.random.default_rng(seed)
+    small = SMALL_OF_RESPONSES
+    yield "response: small errors", [], small
+    yield (
+        "response: a quadrupole 3 %",
+        [Cause("quadrupole_gradient", place(ring, "quadrupole_gradient", rng), 0.03)],
+        small,
+    )
+    yield (
+        "response: a bad corrector",
+        [Cause("corrector_calibration", place(ring, "corrector_calibration", rng), -2.0)],
+        small,
+    )
+    yield (
+        "response: a monitor reversed",
+        [Cause("monitor_gain_x", place(ring, "monitor_gain_x", rng), -2.0)],
+        small,
+    )
+    yield "response: three exchanged", [
+        Cause("monitor_swap", m, 1.0)
+        for m in {place(ring, "monitor_swap", rng) for _ in range(3)}], small  # fmt: skip
+    yield "response: gradients 0.5 %", [], {**small, "quadrupole_gradient": 5e-3}
+
+
 def measured(ring, causes, options, seed):
     options = {"shots": SHOTS, "seed": seed, **options}
     keep = options.pop("keep", None)
@@ -199,6 +229,14 @@ def measured(ring, causes, options, seed):
         places = np.sort(rng.choice(len(data.monitors), count, replace=False))
         data = data.select(monitors=[data.monitors[i] for i in places])
     return data
+
+
+def stepped(ring, causes, background, seed):
+    names_ = [e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
+    some = [names_[i] for i in np.unique(np.linspace(0, len(names_) - 1, 60).round().astype(int))]
+    return simulate_response(
+        ring, causes, background=background, correctors=some, engine="ocelot", seed=seed
+    ).measured
 
 
 def checked(ring, data):
@@ -240,10 +278,14 @@ def main(rings):
         print(f"\nnamed {right} of {len(cases)}; {np.median(seconds):.2f} s, {max(seconds):.2f}")
         print("\n| healthy | cases | told |\n|---|---|---|")
         told, count = {}, {}
-        for seed in range(SEEDS):
-            for what, causes, options in healthy(ring, seed):
+        steers = any(e.kind == "hcorrector" for e in ring.elements)
+        for seed in SEEDS:
+            cases = [(measured, case) for case in healthy(ring, seed)]
+            if steers:
+                cases += [(stepped, case) for case in healthy_response(ring, seed)]
+            for make, (what, causes, options) in cases:
                 try:
-                    own = measured(ring, causes, options, seed)
+                    own = make(ring, causes, options, seed)
                 except tmlattice.errors.TmlatticeError as error:
                     print(f"    not made: {what}: {error}"[:150])
                     continue

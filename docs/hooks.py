@@ -1,6 +1,8 @@
-"""What the pages take from the package when they are built: the catalogue and the schemas.
+"""What the pages take from the package when they are built: the catalogue, what may be assumed of
+data, the schemas.
 
-A page says `<!-- effects -->` or `<!-- schema measurement -->` where a table is to stand.
+A page says `<!-- effects -->`, `<!-- assumptions -->` or `<!-- schema measurement -->` where one
+is to stand.
 """
 
 import json
@@ -9,12 +11,13 @@ from collections.abc import Iterator
 from importlib.resources import files
 from typing import Any
 
-MARK = re.compile(r"^<!-- (effects|schema) ?([\w-]*) -->$", re.MULTILINE)
+MARK = re.compile(r"^<!-- (effects|assumptions|schema) ?([\w-]*) -->$", re.MULTILINE)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the marks of a page."""
-    return MARK.sub(lambda mark: effects() if mark[1] == "effects" else schema(mark[2]), markdown)
+    made = {"effects": effects, "assumptions": assumptions}
+    return MARK.sub(lambda mark: made[mark[1]]() if mark[1] in made else schema(mark[2]), markdown)
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -49,6 +52,22 @@ def effects() -> str:
         "largest",
     ]
     return table(head, rows)
+
+
+def assumptions() -> str:
+    """What may be assumed of data, in its own order."""
+    from tmlattice.measurement.assume import ASSUMPTIONS
+
+    rows = [
+        [
+            f"`{name}`",
+            own.words,
+            "yes" if own.trajectory else "",
+            "yes" if own.response else "",
+        ]
+        for name, own in ASSUMPTIONS.items()
+    ]
+    return table(["--assume", "what is written down wrongly", "first turns", "responses"], rows)
 
 
 def schema(name: str) -> str:

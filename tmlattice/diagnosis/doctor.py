@@ -36,11 +36,13 @@ FAR = 100.0
 """Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first monitors spoil them by."""
+SECTIONS = 4
+"""At least, that tell what is usual."""
 SPOILT = 3.0
 """Misfit of a section, over the typical one, from which it is not trusted."""
 OVER, UNDER = 2.5, 3.0
 """Factors by which a stated noise may be too large, and too small."""
-SPIKE = 12.0
+SPIKE = 20.0
 """Sigma from which one reading is wrong for once, where its neighbours agree without it."""
 
 
@@ -209,14 +211,16 @@ def _launches(judge: Judge) -> Check:
         return fine("launches", "no launch is stated; they are fitted")
     own, misfit = judge.launches(square, EXACT)
     good = misfit < SPOILT * square  # else a fault of the first magnets spoils the fit
-    if not good.any():
-        return fine("launches", "something is wrong near the start: launches are not judged")
+    sections = judge.found(data)[1].misfit.shape[1]
+    if not good.any() or sections < SECTIONS:
+        return fine("launches", "too few good monitors near the start to judge the launches")
     worst = float(np.median(own[good], axis=0).max())
     if worst > FAR:
         return note(
             "launches",
             f"the fitted launches differ from the stated ones by {np.sqrt(worst):.0f} of their "
-            "launch_sigma: mend the launches or their rms, or go on with --assume launches-unknown",
+            "launch_sigma, unless something is wrong before the first monitors: mend the launches "
+            "or their rms, or go on with --assume launches-unknown",
             before=worst, assume=("launches-unknown",),
         )  # fmt: skip
     return fine("launches", "the fitted launches are the stated ones")

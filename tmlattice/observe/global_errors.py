@@ -36,7 +36,7 @@ NOISE_WIDTH = np.log(3.0)
 """A stated noise is right to a factor of three, one standard deviation."""
 ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
 """m; first turns have an orbit of a millimetre, to a factor of ten, one standard deviation."""
-GAIN, CERTAIN = 9.0, 15.0
+GAIN, CERTAIN = 12.0, 15.0
 """Log evidence from which a global error is told, and from which it is certain: no healthy
 measurement of `benchmarks/doctor.py` gains as much."""
 SHARE = 0.65
@@ -45,13 +45,16 @@ by chance, but then many others lose."""
 CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
 """Factors by which chi-square of sections or launches falls with what was wrong undone: at least;
 with a unit undone; of sections where launches say the contrary. Units are powers of a thousand."""
-RIGHT = 9.0
+RIGHT = 5.0
 """Chi-square of launches that are right then."""
-FINE = 0.1
-"""Share of the orbit that sections leave from which they agree anyhow."""
+FINE, FINE_GAIN = 0.1, 30.0
+"""Share of the orbit that sections leave from which they agree anyhow, and log evidence that
+curvature, or a few correctors that were set, have to gain then."""
 ALIKE = 3.0
 """Log evidence below which two assumptions explain the data alike."""
-_LAST = ("noise-from-data", "launches-unknown")  # of these others decide
+_LAST = ("noise-from-data", "launches-unknown", "readings-doubled", "readings-halved")
+"""Not tried: of the first two others decide, and small errors everywhere look like a factor of two.
+"""
 BEAM = 4
 """Assumptions, the best ones, that are tried together with every other."""
 _TURNED = np.array([1.0, -1.0, 1.0, -1.0])
@@ -303,8 +306,8 @@ class Judge:
         names = [n for n, a in ASSUMPTIONS.items() if a.trajectory and n not in _LAST]
         without = []
         if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
-            without += ["launches", "slopes", "positions", "beam", "readings-doubled"]
-            without += ["readings-halved", "readings-in-km"]  # only curvature would tell
+            without += ["launches", "slopes", "positions", "beam"]
+            without += ["readings-in-km"]  # only curvature would tell
         if not data.launches[:, 4].any():
             without += ["energies"]
         if not any("kick" in own for shot in data.settings for own in shot.values()):
@@ -409,13 +412,13 @@ def _believable(verdict: Verdict, share: float) -> bool:
     """
     (local, launch), (local_then, launch_then) = verdict.before, verdict.after
     local_clears, launch_clears = local / max(local_then, 1e-12), launch / max(launch_then, 1e-12)
-    if launch_then > launch and local_clears < AGAINST:
+    if launch_then > RIGHT and local_clears < AGAINST:  # false where no launch is stated
         return False
     unit = any("-in-" in name for name in verdict.names)
     clear = CLEAR_UNIT if unit else CLEAR
-    if local_clears > clear or (launch_clears > clear and launch_then < RIGHT):
+    if local_clears > clear or launch_clears > clear:
         return True
-    return share < FINE and not unit  # the sections agree anyhow: curvature tells
+    return share < FINE and not unit and verdict.gain > FINE_GAIN
 
 
 def _levels(terms: Terms) -> tuple[float, float]:

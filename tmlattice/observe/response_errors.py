@@ -27,6 +27,8 @@ USUAL = 0.01
 """Mean square of what the usual errors leave of a column, in units of the column's own: a tenth."""
 GAIN = 2.5
 """Log of the misfit that each of the changed columns has to lose in the mean."""
+COLUMNS = 2
+"""At least, that an assumption about correctors or monitors changes: one may be a bad corrector."""
 SHARE = 0.8
 """Of the columns that an assumption changes, how many it has to change for the better."""
 ALIKE = 2.0
@@ -114,7 +116,8 @@ class ResponseJudge:
             other = self.misfit(names)
             change = np.log((other + USUAL) / (stated + USUAL))
             moved = np.abs(np.nan_to_num(change)) > np.log(2.0)
-            if moved.any() and (change[moved] < 0).mean() >= SHARE:
+            few = moved.sum() < COLUMNS and not names[0].startswith("rf")
+            if moved.any() and not few and (change[moved] < 0).mean() >= SHARE:
                 gain = -float(change[moved].sum())
                 if gain > GAIN * moved.sum():
                     before, after = (float(np.median(own[moved])) for own in (stated, other))

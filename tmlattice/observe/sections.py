@@ -32,7 +32,7 @@ Places = NDArray[np.intp]
 _KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates; a pass without RF does not ask for tau
 WEAK = 1e-8
 """Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
-STEPS = 6
+STEPS = 8
 """Of Newton's method: the maps are nearly linear."""
 FAR_OFF = 1e15
 """Sigma that stand for a trajectory which cannot be followed."""
@@ -294,19 +294,23 @@ class Sections:
                 if step == STEPS - 1 or not moved > SETTLED:
                     break
                 own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
-                back = np.linalg.solve(curvature, np.swapaxes(A, -1, -2))
+                back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
                 step_4 = (back @ left[..., None])[..., 0]
                 fitted = (A @ step_4[..., None])[..., 0]
-                moved, clean = float(np.nanmedian(np.abs(fitted))), left - fitted
-                alone = own - (A @ (back @ own[..., None]))[..., 0]
+                drift = -(back @ own[..., None])[..., 0]  # of the trajectories, by the energy
+                inner = _told(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
+                ends = way[group[:, None], np.arange(W)](x)
+                outer = _joints(x[..., :4], ends, step_4, drift, _inverse(curvature))
                 prior = passes.delta - x[:, 0, 4]
-                change, known = _shared(clean, alone, freedom, prior, passes.alone)
-                by_energy = -(back @ own[..., None])[..., 0] / np.sqrt(known)[:, None, None]
-                step_4 = step_4 - (back @ own[..., None])[..., 0] * change[:, None, None]
+                change, known = _shared(inner, outer, prior, passes.alone)
+                by_energy = drift / np.sqrt(known)[:, None, None]
+                moved = float(np.nanmedian(np.abs(fitted)))
+                moved = max(moved, float(np.nanmax(np.abs(change) * np.sqrt(known))))
+                step_4 = step_4 + drift * change[:, None, None]
                 x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
                 x[..., 4] += change[:, None]
         whole: Array = np.nan_to_num((left**2).sum(axis=2), nan=1e30, posinf=1e30)
-        covariance = np.asarray(np.linalg.inv(curvature), dtype=float)
+        covariance = _inverse(curvature)
         end, slope = way[group[:, None], np.arange(W)](x)
         J = slope[..., :4, :4]
         return Found(
@@ -336,28 +340,65 @@ class Sections:
         return x, J
 
 
-def _shared(
-    left: Array, slope: Array, freedom: NDArray[np.int64], prior: Array, alone: bool
-) -> tuple[Array, Array]:
-    """What all sections of a pass, or of all passes, say together of the energy, [pass], and one
-    over its variance.
+Told = tuple[Array, Array, Array]
+"""What some terms [pass, term] say of the energy: their misfit, and the right and the left side of
+the equation for it."""
+
+
+def _told(left: Array, slope: Array, freedom: NDArray[np.int64]) -> Told:
+    """Of readings, cleaned of the trajectories of their sections, [pass, section, reading]."""
+    misfit = np.where(freedom > 0, (left**2).sum(axis=2) / np.maximum(freedom, 1), np.inf)
+    return misfit, (left * slope).sum(axis=2), (slope**2).sum(axis=2)
+
+
+def _joints(
+    start: Array, ends: tuple[Array, Array], step: Array, drift: Array, covariance: Array
+) -> Told:
+    """Of the joints between sections, the trajectories' next step taken."""
+    J = ends[1][..., :4, :4]
+    end = ends[0][..., :4] + (J @ step[..., None])[..., 0]
+    pushed = (J @ drift[..., None])[..., 0] + ends[1][..., :4, 4]
+    miss = np.nan_to_num((start + step)[:, 1:] - end[:, :-1])
+    slope = np.nan_to_num(drift[:, 1:] - pushed[:, :-1])
+    carried = J @ covariance @ np.swapaxes(J, -1, -2)
+    spread = np.nan_to_num(covariance[:, 1:] + carried[:, :-1])
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", spread), 1e-60))
+    even = spread / size[..., None] / size[..., None, :] + 1e-9 * np.eye(4)
+    both = np.linalg.solve(even, np.stack([miss / size, slope / size], axis=-1))
+    misfit = (both[..., 0] * miss / size).sum(axis=-1) / 4
+    return (
+        misfit,
+        -(both[..., 0] * slope / size).sum(axis=-1),
+        (both[..., 1] * slope / size).sum(-1),
+    )
+
+
+def _shared(inner: Told, outer: Told, prior: Array, alone: bool) -> tuple[Array, Array]:
+    """What sections and joints of a pass, or of all passes, say together of the energy, [pass], and
+    one over its variance; a term that a fault spoils says little.
 
     Args:
-        left, slope: of the readings, cleaned of their own trajectories, [pass, section, reading].
-        freedom: [pass, section].
+        inner, outer: of sections, of joints.
         prior: where the energy is expected to be, [pass].
         alone: see `Passes`.
     """
-    misfit = (left**2).sum(axis=2) / np.maximum(freedom, 1)
-    level = np.array([np.median(own[free > 0]) if free.any() else 1.0
-                      for own, free in zip(misfit, freedom, strict=True)])  # fmt: skip
-    level = np.nan_to_num(level, nan=1.0)[:, None] + 1e-12
-    weight = (freedom > 0) / np.maximum(misfit, level)  # a spoilt section says little
-    asked = np.nan_to_num((weight * (left * slope).sum(axis=2)).sum(axis=1)) + prior / ENERGY**2
-    told = np.nan_to_num((weight * (slope**2).sum(axis=2)).sum(axis=1)) + 1 / ENERGY**2
+    asked, known = prior / ENERGY**2, np.full(len(prior), 1 / ENERGY**2)
+    for misfit, right, left in (inner, outer):
+        there = np.isfinite(misfit)
+        if not there.any():
+            continue
+        level = float(np.median(misfit[there]))
+        weight = np.where(there, 1 / np.maximum(misfit, max(level, 1.0)), 0.0)
+        asked = asked + np.nan_to_num(weight * right).sum(axis=1)
+        known = known + np.nan_to_num(weight * left).sum(axis=1)
     if alone:
-        return asked / told, told
-    return np.full(len(left), asked.sum() / told.sum()), np.full(len(left), told.sum())
+        return asked / known, known
+    count = len(prior)
+    return np.full(count, asked.sum() / known.sum()), np.full(count, known.sum())
+
+
+def _inverse(curvature: Array) -> Array:
+    return np.asarray(np.linalg.inv(curvature), dtype=float)
 
 
 def _held(curvature: Array) -> Array:
