@@ -29,9 +29,16 @@ from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, RingEffect, check, find
 from tmlattice.effects.build import Build
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.ring import NO_ERRORS, Ring
 from tmlattice.machine import at_orbit
-from tmlattice.machine.at_elements import ELECTRON, NOTHING, SWAPPED, Builder, expected_loss
+from tmlattice.machine.at_elements import (
+    ELECTRON,
+    NOTHING,
+    SWAPPED,
+    Builder,
+    errors_of,
+    expected_loss,
+)
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
@@ -55,7 +62,8 @@ SET_ON: Mapping[str, frozenset[str]] = {
 class AtEngine:
     """A ring with its causes as a line of AT elements.
 
-    Causes of the same effect on the same element add up. A thin kick sits on the design axis,
+    Causes of the same effect on the same element add up, and to what the ring's own elements have
+    wrong (`Element.errors`). A thin kick sits on the design axis,
     whatever the offset and roll of its magnet.
 
     Args:
@@ -332,7 +340,7 @@ def _check_setting(name: str, what: Iterable[str], known: Iterable[str]) -> None
 
 
 def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
-    """What is wrong with the elements, by place in the ring."""
+    """What is wrong with the elements, in the ring itself and by causes, by place in the ring."""
     causes = list(causes)
     check(ring, causes)
     amounts: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
@@ -341,10 +349,12 @@ def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
         if isinstance(effect, RingEffect):
             for i in effect.members(ring, cause.element):
                 amounts[i][effect.name] += cause.amount
-    wrong = {i: Build() for i in amounts}
+    wrong = {
+        i: errors_of(e, ring.energy) for i, e in enumerate(ring.elements) if e.errors != NO_ERRORS
+    }
     for i, own in amounts.items():
         for name, amount in own.items():
             effect = find(name)
             assert isinstance(effect, RingEffect)
-            effect.build(wrong[i], amount)
+            effect.build(wrong.setdefault(i, Build()), amount)
     return wrong
