@@ -9,8 +9,10 @@ import click
 
 from tmlattice import __version__
 from tmlattice.cli.challenge import challenge
+from tmlattice.cli.check import check
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
+from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
 from tmlattice.cli.predict import predict
 from tmlattice.cli.reproduce import reproduce
@@ -38,8 +40,10 @@ def tmlattice() -> None:
 tmlattice.add_command(tune_fit)
 tmlattice.add_command(info)
 tmlattice.add_command(study)
+tmlattice.add_command(import_files)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
+tmlattice.add_command(check)
 tmlattice.add_command(diagnose)
 tmlattice.add_command(predict)
 tmlattice.add_command(reproduce)
@@ -47,10 +51,12 @@ tmlattice.add_command(challenge)
 
 
 def main() -> NoReturn:
-    """Run the command line. Exit code 0: done; 2: input that cannot be used; 130: Ctrl-C."""
+    """Run the command line. Exit code 0: done; 1: done, and told what is wrong (`check`); 2: input
+    that cannot be used; 130: Ctrl-C."""
     warnings.showwarning = _show_warning
+    code = 0
     try:
-        tmlattice(standalone_mode=False)
+        code = tmlattice(standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         sys.exit(BAD_INPUT)
@@ -65,7 +71,7 @@ def main() -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(STOPPED)  # temporary files are gone; torch and its threads need a second to end
-    sys.exit(0)
+    sys.exit(code)
 
 
 def _fail(message: str, code: int) -> NoReturn:

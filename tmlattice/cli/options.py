@@ -81,7 +81,7 @@ def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[...
         type=BackgroundText(),
         multiple=True,
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
-        "one.",
+        "one, or `none`.",
     )
 
 
@@ -212,6 +212,15 @@ def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
     )):  # fmt: skip
         function = decorate(function)
     return function
+
+
+def assume_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """--assume NAME, repeated."""
+    return click.option(
+        "--assume", "assumed", multiple=True, metavar="NAME",
+        help="What is written down wrongly everywhere, such as x-reversed or launches-in-mm; it is "
+        "undone first. Repeat for more (docs: check).",
+    )(function)  # fmt: skip
 
 
 def json_option(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
+from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
@@ -55,6 +56,7 @@ def diagnose_response(
     max_effects: int = 8,
     false_alarm: float = DEFAULT.false_alarm,
     missing: bool = False,
+    assume: Sequence[str] = (),
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Diagnosis:
@@ -68,6 +70,8 @@ def diagnose_response(
         max_effects: steps that are kept at most.
         false_alarm: chance that the readings of a faultless ring are said to have an error.
         missing: weigh too which effect the result still lacks.
+        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone
+            first.
         seed: of the split.
         progress: called with the name of each stage.
 
@@ -77,7 +81,9 @@ def diagnose_response(
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
+    measured = mended(ring, measured, assume)
     trials, data = _trials(effects), response_data(ring, measured)
+    said = consulted(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
@@ -95,6 +101,7 @@ def diagnose_response(
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
+        **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     return Diagnosis(
@@ -108,7 +115,7 @@ def diagnose_response(
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=None,
         sensitivity={},
-        warnings=(*(() if few is None else few.said), *_warnings(fit)),
+        warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
         noise=(noise_x, noise_y),
         noise_estimated=False,
         provenance=_provenance(ring, options, seed, begun),

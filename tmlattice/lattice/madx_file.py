@@ -9,6 +9,7 @@ from typing import Any
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice.at_file import quiet_at, ring_from_at
+from tmlattice.lattice.madx_matrix import matrix_command
 from tmlattice.lattice.ring import Ring
 
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
@@ -31,7 +32,11 @@ def read_madx(
     import at
 
     elegant = path.suffix.lower() == ".lte"
-    parser = at.ElegantParser(verbose=False) if elegant else at.MadxParser(verbose=False)
+    parser = (
+        at.ElegantParser(verbose=False)
+        if elegant
+        else at.MadxParser(verbose=False, matrix=matrix_command())
+    )
     try:
         with redirect_stdout(StringIO()), quiet_at():
             parser.parse_files(str(path))

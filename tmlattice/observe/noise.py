@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Paths
 from tmlattice.observe.data import Data
+from tmlattice.observe.sections import Found, Passes
 
 Array = NDArray[np.float64]
 
@@ -45,3 +46,42 @@ def estimate(data: Data, paths: Paths) -> Array:
     misfit = local_misfit(data, paths)
     planes = [misfit[:, :, plane][np.isfinite(misfit[:, :, plane])] for plane in (0, 1)]
     return np.array([_MAD * np.median(np.abs(p)) if len(p) > 20 else np.nan for p in planes])
+
+
+SCATTER = 3
+"""Passes beyond those that errors of monitors and magnets take up: a constant, and what is in
+proportion to the trajectory in its plane (or in both, where there are enough)."""
+IN_PROPORTION = 0.015
+"""Share of the orbit that unknown errors leave in proportion to what is not taken up."""
+
+
+def random_part(passes: Passes, found: Found) -> float | None:
+    """How many times its noise a reading scatters from pass to pass.
+
+    Small errors everywhere leave the same in every shot, or in proportion to its trajectory: that
+    is taken out, and what is left is noise. None where there are too few passes, or too little is
+    left to tell it from errors of the other plane.
+    """
+    count = len(found.left)
+    both = count >= 5 + SCATTER
+    if count < 3 + SCATTER - 1:
+        return None
+    ratios = []
+    for w in range(found.left.shape[1]):
+        for reading in range(found.left.shape[2]):
+            if not found.there[:, w, reading].all() or (found.freedom[:, w] < 2).any():
+                continue
+            plane = slice(0, 4) if both else slice(2 * (reading % 2), 2 * (reading % 2) + 2)
+            fixed = np.column_stack([np.ones(count), found.start[:, w, plane]])
+            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), 1e-30)
+            left = found.left[:, w, reading]
+            left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
+            share = found.freedom[:, w].mean() / found.there[:, w].sum(axis=1).mean()
+            ratios.append(float(np.sum(left**2) / (count - fixed.shape[1]) / share))
+    if len(ratios) < 8:
+        return None
+    random = float(np.sqrt(np.median(ratios)))
+    orbit = float(np.sqrt(np.nanmean(passes.readings**2)))
+    if not both and random * float(np.median(passes.sigma)) < IN_PROPORTION * orbit:
+        return None
+    return random

@@ -292,6 +292,8 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
         f"+ {find(cause.effect).words}\n{cause.element or ''}".rstrip()
         for cause in diagnosis.causes
     ]
+    if diagnosis.priors:
+        labels = ["design", "+ small errors\neverywhere", "+ what was\nfound"][: len(rms)]
     crowded = len(labels) > 4
     ax.set_xticks(
         steps,

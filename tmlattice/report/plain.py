@@ -16,6 +16,7 @@ from tmlattice.report.text import (
     next_text,
     noise_text,
     sensitivity_rows,
+    small_rows,
     suspect_rows,
     title,
     tune_texts,
@@ -52,6 +53,9 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
     lines += ["", *_gap_table(diagnosis)]
     lines += wrapped(closed_text(diagnosis) + ".", "", width)
     lines += wrapped(left_text(diagnosis), "", width)
+    small = small_rows(diagnosis)
+    if small:
+        lines += ["", "Small errors everywhere:", *columns(small, "   ")]
     if diagnosis.steps:
         lines += ["", *steps_text(diagnosis, width)]
     if diagnosis.verdict == "nothing":

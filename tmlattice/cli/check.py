@@ -1,0 +1,88 @@
+"""`tmlattice check`: what is wrong with a measurement as a whole."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tmlattice.cli.options import (
+    FILE,
+    assume_option,
+    console,
+    json_option,
+    lattice_options,
+    quiet_option,
+)
+
+if TYPE_CHECKING:
+    from tmlattice.diagnosis.checkup import Checkup
+
+WRONG = 1
+
+
+@click.command("check")
+@click.argument("lattice")
+@click.argument("measurement", type=FILE)
+@lattice_options
+@assume_option
+@click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
+@json_option
+@quiet_option
+@click.pass_context
+def check(
+    context: click.Context,
+    lattice: str,
+    measurement: Path,
+    sequence: str | None,
+    energy: float | None,
+    assumed: tuple[str, ...],
+    radiation: bool,
+    json_file: Path | None,
+    quiet: bool,
+) -> None:
+    """Say what is wrong with a measurement as a whole, in a second.
+
+    Wrong signs, units, names and orders everywhere; launches and noise that are not what is
+    stated; silent, frozen, copied monitors; single readings far off. MEASUREMENT is a folder of
+    first turns or of an orbit response. The exit code is 0 where a diagnosis means something, 1
+    where something has to be mended first.
+    """
+    from contextlib import nullcontext
+
+    from tmlattice.errors import MeasurementError, UnknownNameError
+    from tmlattice.files import output_file, write_json
+
+    with output_file(json_file) if json_file else nullcontext() as path:
+        from tmlattice.diagnosis.doctor import check_data
+        from tmlattice.lattice import load_ring
+        from tmlattice.measurement import read_measurement
+
+        data = read_measurement(measurement)
+        ring = load_ring(lattice, sequence, energy)
+        try:
+            found = check_data(ring, data, assumed=assumed, radiation=radiation)
+        except (MeasurementError, UnknownNameError) as error:
+            raise MeasurementError(f"{measurement}: {error}") from error
+        if path:
+            document = found.as_json()
+            document["provenance"] = {**document["provenance"], "measurement": str(measurement)}
+            write_json(path, document)
+    if not quiet:
+        _print(found, json_file)
+    if found.status == "wrong":
+        context.exit(WRONG)
+
+
+def _print(found: "Checkup", json_file: Path | None) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    screen = console()
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_header=False)
+    for own in found.checks:
+        table.add_row(own.name, "ok" if own.status == "fine" else own.status, own.sentence)
+    screen.print(table)
+    made = found.provenance
+    screen.print(f"{made['lattice']}: {len(found.checks)} checks, {made['seconds']:.1f} s")
+    if json_file:
+        screen.print(f"written: {json_file}")

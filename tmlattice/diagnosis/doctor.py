@@ -1,0 +1,318 @@
+"""The data doctor: what is wrong with a measurement as a whole, before any fault is sought.
+
+>>> checkup = check_data(load_ring("petra3"), read_measurement("day_1"))
+>>> [check.sentence for check in checkup.told]
+
+Global before local: a wrong sign, unit or order everywhere is told in a second, with the mend and
+with what to assume to go on; then launches, noise, monitors and single readings.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis import signals
+from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
+from tmlattice.effects import Cause, expected_radiation
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.observe.global_errors import Judge, Names, Verdict, certain
+from tmlattice.observe.noise import random_part
+from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
+from tmlattice.observe.sections import Found, Passes
+
+Array = NDArray[np.float64]
+
+ENERGY = 0.02
+"""Share by which a stated beam energy may differ from the lattice's."""
+ALIEN = 0.85
+"""Share of the orbit that no trajectory of a section explains, of which noise or readings in no
+order leave all and strong errors everywhere 0.7: the data are of another ring."""
+FAR = 100.0
+"""Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
+EXACT = 0.01
+"""Share of the launches that gains of the first monitors spoil them by."""
+SPOILT = 3.0
+"""Misfit of a section, over the typical one, from which it is not trusted."""
+OVER, UNDER = 2.5, 3.0
+"""Factors by which a stated noise may be too large, and too small."""
+SPIKE = 12.0
+"""Sigma from which one reading is wrong for once, where its neighbours agree without it."""
+
+
+def check_data(
+    ring: Ring,
+    data: Measurement | OrbitResponse,
+    *,
+    assumed: Sequence[str] = (),
+    radiation: bool = False,
+) -> Checkup:
+    """What is wrong with a measurement as a whole.
+
+    Args:
+        ring: the design.
+        data: first turns, or an orbit response.
+        assumed: what was written down wrongly, names of `ASSUMPTIONS`; it is undone first.
+        radiation: the model radiates as expected.
+
+    Raises:
+        MeasurementError: an assumption without meaning for these data.
+        UnknownNameError: a monitor that the ring does not have, or an unknown assumption.
+    """
+    begun = time.perf_counter()
+    names = [monitor.name for monitor in ring.monitors]
+    kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
+    few = signals.few(ring, data)
+    checks = [_stated(ring, data)]
+    if few is not None:
+        checks.append(few)
+    elif isinstance(data, Measurement):
+        known = tuple(expected_radiation(ring)) if radiation else ()
+        mended = assume(in_beam_order(data, names), assumed, names)
+        checks += _of_first_turns(ring, mended, known)
+    else:
+        checks += _of_response(ring, assume(in_beam_order(data, names), assumed, names))
+    return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
+
+
+_GLOBAL = "signs, units and order"
+_TOLD = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
+"""Of what is noted, what the diagnosis does not find by itself."""
+
+
+def consulted(ring: Ring, data: Measurement | OrbitResponse, radiation: bool = False) -> list[str]:
+    """What a diagnosis of these data has to say of them.
+
+    Raises:
+        MeasurementError: something has to be mended first.
+        UnknownNameError: see `check_data`.
+    """
+    checkup = check_data(ring, data, radiation=radiation)
+    checkup.stop()
+    return [check.sentence for check in checkup.told if check.name in _TOLD]
+
+
+Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)
+
+
+def mended(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
+    """The data, if there are some, with what is assumed undone."""
+    if data is None or not assumed:
+        return data
+    return assume(data, assumed, [monitor.name for monitor in ring.monitors])
+
+
+def _provenance(
+    ring: Ring, assumed: Sequence[str], radiation: bool, begun: float
+) -> dict[str, object]:
+    from tmlattice import __version__
+
+    return {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"assume": list(assumed), "radiation": radiation},
+        "seconds": time.perf_counter() - begun,
+    }
+
+
+def _stated(ring: Ring, data: Measurement | OrbitResponse) -> Check:
+    """What the data say of their lattice and energy."""
+    if data.energy is None:
+        return fine("energy", "the data state no energy")
+    if abs(data.energy / ring.energy - 1) > ENERGY:
+        return note(
+            "energy",
+            f"the data state a beam energy of {data.energy:g} GeV, the lattice {ring.energy:g}: "
+            "name this machine's lattice, or its energy (--energy)",
+        )
+    return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
+
+
+# --- first turns ----------------------------------------------------------------------------------
+def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
+    flat = data.readings.reshape(-1, len(data.monitors), 2)
+    checks = [*signals.monitors(ring, data.monitors, flat), *signals.first_turns(ring, data)]
+    if any(check.status == "wrong" for check in checks):
+        return checks  # nothing can be fitted to such turns
+    judge = Judge(ring, data, known)
+    verdicts = judge.verdicts()
+    for verdict in verdicts:
+        judge = judge.mended(verdict.names)
+    passes, found = judge.found(judge.measurement)
+    lattice = _lattice(ring, judge, passes, found)
+    if lattice.status == "wrong":  # no wrong sign, unit or order mends that
+        return [*checks, lattice]
+    checks += [*_global(verdicts), lattice]
+    if any(check.status == "wrong" for check in checks):
+        return checks  # until that is mended, noise and launches mean nothing
+    return [*checks, _launches(judge), _noise(judge, passes, found), _spikes(judge, passes, found)]
+
+
+def _global(verdicts: Sequence[Verdict]) -> list[Check]:
+    """One sentence for each global error."""
+    if not verdicts:
+        return [fine(_GLOBAL, "no global error would make the data agree better")]
+    return [_sentence(verdict) for verdict in verdicts]
+
+
+def _sentence(verdict: Verdict) -> Check:
+    words, others, mend = _words(verdict.names, verdict.alike)
+    where, before, after = "", verdict.before[0], verdict.after[0]
+    if not before > 2 * after:  # the sections agree either way: the launches tell
+        where, before, after = " of the launches", verdict.before[1], verdict.after[1]
+    if not np.isfinite(before):
+        where, before, after = "", verdict.before[0], verdict.after[0]
+    sure = certain(verdict)
+    said = (
+        f"{words if sure else f'it may be that {words}'}{others}: chi-square per reading{where} "
+        f"{_number(before)} as stated, {_number(after)} with that undone; {mend}"
+    )
+    make = wrong if sure else note
+    return make("signs, units and order", said, before=before, after=after, assume=verdict.names)
+
+
+def _options(names: Iterable[str]) -> str:
+    return " ".join(f"--assume {name}" for name in names)
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:.3g}"
+
+
+def _lattice(ring: Ring, judge: Judge, passes: Passes, found: Found) -> Check:
+    """Whether the readings follow trajectories of this ring at all."""
+    share = found.share(passes)
+    if not np.isfinite(share):
+        return fine("lattice", "too few monitors to say whether this is the machine's lattice")
+    stated = judge.measurement.noise is not None
+    if share > ALIEN and not (stated and found.level < 4):
+        return wrong(
+            "lattice",
+            f"the readings follow no trajectory of '{ring.name}': {100 * share:.0f} % of the orbit "
+            "is left even between neighbouring monitors; name the lattice of this machine, and "
+            "check the names and the order of the monitors",
+            before=found.level if stated else None,
+        )
+    return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
+
+
+def _launches(judge: Judge) -> Check:
+    """Fitted launches against the stated ones."""
+    square = max(judge.square([()]), 1.0)
+    data = judge.measurement
+    if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
+        return fine("launches", "no launch is stated; they are fitted")
+    own, misfit = judge.launches(square, EXACT)
+    good = misfit < SPOILT * square  # else a fault of the first magnets spoils the fit
+    if not good.any():
+        return fine("launches", "something is wrong near the start: launches are not judged")
+    worst = float(np.median(own[good], axis=0).max())
+    if worst > FAR:
+        return note(
+            "launches",
+            f"the fitted launches differ from the stated ones by {np.sqrt(worst):.0f} of their "
+            "launch_sigma: mend the launches or their rms, or go on with --assume launches-unknown",
+            before=worst, assume=("launches-unknown",),
+        )  # fmt: skip
+    return fine("launches", "the fitted launches are the stated ones")
+
+
+def _noise(judge: Judge, passes: Passes, found: Found) -> Check:
+    """The stated noise against what neighbouring monitors leave."""
+    level = float(np.sqrt(found.level))
+    if not np.isfinite(level):
+        return fine("noise", "too few monitors to judge the noise")
+    typical = float(np.median(passes.sigma))
+    if judge.measurement.noise is None:
+        return fine("noise", f"none is stated; the readings leave {_micro(level * typical)}")
+    if level < 1 / OVER:
+        return wrong(
+            "noise",
+            f"the stated noise of {_micro(typical)} is {1 / level:.1f} times what neighbouring "
+            f"monitors leave ({_micro(level * typical)}; chi-square per reading {level**2:.2g}): "
+            "state the noise of one reading, or go on with --assume noise-from-data",
+            before=level**2, after=1.0, assume=("noise-from-data",),
+        )  # fmt: skip
+    random = random_part(passes, found)
+    if random is not None and random > UNDER:
+        return wrong(
+            "noise",
+            f"the stated noise of {_micro(typical)} is too small: from shot to shot the readings "
+            f"scatter by {_micro(random * typical)} about the trajectories that their neighbours "
+            f"follow (chi-square per reading {level**2:.3g}): state the noise of one reading, or "
+            "go on with --assume noise-from-data",
+            before=level**2, after=1.0, assume=("noise-from-data",),
+        )  # fmt: skip
+    return fine("noise", f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}")
+
+
+def _micro(metres: float) -> str:
+    return f"{1e6 * metres:.3g} µm"
+
+
+def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
+    """Single readings far off, where the same section of other shots agrees."""
+    none = fine("spikes", "no single reading is far off")
+    there = found.freedom > 2
+    if len(found.misfit) < 3 or not there.any():
+        return none
+    square = found.level
+    usual = np.median(found.misfit, axis=0) < SPOILT * square  # [section]
+    odd = there & (found.misfit > SPOILT * square) & usual
+    told = []
+    for p, w in np.argwhere(odd):
+        alone = found.left[p, w] ** 2 / np.maximum(found.free[p, w], 0.05)
+        worst = int(alone.argmax())
+        rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
+        if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
+            name = judge.measurement.monitors[found.owner[w, worst]]
+            shot = judge.measurement.shots[passes.shot[p]]
+            told.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
+    if not told:
+        return none
+    return note("spikes", f"single readings far off: {signals.some(told)}; leave them empty")
+
+
+# --- an orbit response ----------------------------------------------------------------------------
+def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
+    checks = signals.monitors(ring, data.monitors, data.response)
+    judge = ResponseJudge(ring, data)
+    verdicts = judge.verdicts()
+    for verdict in verdicts:
+        judge = judge.mended(verdict.names)
+    left = judge.misfit(())
+    typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
+    if typical > ANOTHER:  # no wrong sign, unit or order mends that
+        return [*checks, wrong(
+            "lattice",
+            f"the response is not that of '{ring.name}': the typical column differs from the "
+            f"design's by {100 * np.sqrt(typical):.0f} % of its size; name the lattice of this "
+            "machine, and check the names and the order of monitors and correctors",
+        )]  # fmt: skip
+    if not verdicts:
+        checks.append(fine(_GLOBAL, "no global error would make the response agree better"))
+    for verdict in verdicts:
+        words, others, mend = _words(verdict.names, verdict.alike)
+        before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
+        said = (
+            f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
+            f"stated, by {after:.0f} % with that undone; {mend}"
+        )
+        checks.append(wrong(_GLOBAL, said, assume=verdict.names))
+    said = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
+    return [*checks, fine("lattice", said)]
+
+
+def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
+    """What is wrong, what else it might be, and the mend."""
+    words = " and ".join(ASSUMPTIONS[n].words for n in names)
+    others = "; ".join(
+        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}" for own in alike
+    )
+    mends = ", ".join(dict.fromkeys(ASSUMPTIONS[n].mend for n in names))
+    return words, f" ({others})" if others else "", f"{mends}, or go on with {_options(names)}"

@@ -1,0 +1,155 @@
+"""What is said of the monitors' signals before any model: silent, frozen, copied, cut off."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.checkup import Check, fine, note, wrong
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement, OrbitResponse
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+NAMED = 3
+"""Names of monitors that a sentence has at most."""
+CUT = 3
+"""Monitors without a reading, the last ones of a shot, from which the beam is said to be lost."""
+SAME_PLACE = 1e-6
+"""m."""
+STRAY = 0.02
+"""Share of a turn's readings below which a turn far behind the others is a slip of the pen."""
+
+
+def some(names: Sequence[str]) -> str:
+    """The first few of several names."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def monitors(ring: Ring, names: Sequence[str], values: Array) -> list[Check]:
+    """Silent, frozen and copied monitors.
+
+    Args:
+        ring: that they are of.
+        names: of the monitors.
+        values: readings, [reading, monitor, 2], m; NaN where missing.
+    """
+    there = np.isfinite(values)
+    checks = []
+    silent = [
+        n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
+    ]
+    if len(silent) > DEFAULT.silent * len(names):
+        said = f"{len(silent)} of {len(names)} monitors have no reading; they count as not there"
+        checks.append(note("silent monitors", said))
+    elif silent:
+        said = f"no reading of {some(silent)}"
+        checks.append(note("silent monitors", said))
+    else:
+        checks.append(fine("silent monitors", f"each of {len(names)} monitors has a reading"))
+    many = there.sum(axis=0) > 2
+    with np.errstate(invalid="ignore"):
+        high = np.where(there, values, -np.inf).max(axis=0)
+        low = np.where(there, values, np.inf).min(axis=0)
+    stuck = many & (high == low)
+    frozen = [
+        n if both else f"{n} in {'x' if x else 'y'}"
+        for n, (x, y), both in zip(names, stuck, stuck.all(axis=1), strict=True)
+        if x or y
+    ]
+    if frozen:
+        said = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
+        checks.append(note("frozen monitors", said))
+    else:
+        checks.append(fine("frozen monitors", "no monitor always reads the same"))
+    copies = _copies(ring, names, values, stuck)
+    if copies:
+        said = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
+        checks.append(note("copied monitors", said))
+    else:
+        checks.append(fine("copied monitors", "no two monitors read the same"))
+    return checks
+
+
+def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> list[str]:
+    """Signals [monitor, plane] that are equal wherever they are, in pairs; but for monitors in one
+    place, which read the same where there is no noise."""
+    seen: dict[bytes, tuple[str, float]] = {}
+    found = []
+    for m, name in enumerate(names):
+        for plane in (0, 1):
+            signal = values[:, m, plane]
+            if stuck[m, plane] or not np.count_nonzero(np.nan_to_num(signal)):
+                continue
+            if np.isfinite(signal).sum() < 2:
+                continue
+            own = f"{name} in {'xy'[plane]}", ring[name].s
+            other = seen.setdefault(signal.tobytes(), own)
+            if other != own and abs(other[1] - own[1]) > SAME_PLACE:
+                found.append(f"{other[0]} and {own[0]}")
+    return found
+
+
+def first_turns(ring: Ring, data: Measurement) -> list[Check]:
+    """What first turns have beyond that: turns that are none, beams that are lost."""
+    there = np.asarray(np.isfinite(data.readings).any(axis=3))  # [shot, turn, monitor]
+    checks = [_turns(there)]
+    if checks[0].status == "wrong":
+        return checks
+    count, turns = there.shape[2], there.shape[1]
+    last = [np.flatnonzero(own.ravel()) for own in there]
+    stops = [i for i, own in enumerate(last) if len(own) and own[-1] < turns * count - CUT]
+    if stops:
+        shot = stops[0]
+        turn, monitor = divmod(int(last[shot][-1]), count)
+        element = ring[data.monitors[monitor]]
+        others = f"; so have {len(stops) - 1} others" if len(stops) > 1 else ""
+        on = f" on turn {turn}" if turns > 1 else ""
+        said = (
+            f"shot {data.shots[shot]} has no reading behind {element.name} (s = {element.s:.2f} m)"
+            f"{on}{others}: the beam was lost there, or the monitors behind did not record; it is "
+            "used up to there"
+        )
+        checks.append(note("lost beam", said))
+    else:
+        checks.append(fine("lost beam", "every shot is read to its end"))
+    return checks
+
+
+def _turns(there: Flags) -> Check:
+    """Turns far behind the others with next to nothing in them."""
+    count = there.sum(axis=(0, 2))
+    read = np.flatnonzero(count)
+    full = count.max()
+    gaps = [i for i in range(1, len(read)) if read[i] - read[i - 1] > 1]
+    if gaps and count[read[gaps[0] :]].max() < max(STRAY * full, 1.5):
+        first, last = read[gaps[0] - 1], read[gaps[0]]
+        return wrong(
+            "turns",
+            f"nothing was read between turn {first} and turn {last}, which has {count[last]} of "
+            f"{full} readings: a wrong number in the column 'turn'; mend that row",
+        )
+    turns = f"turns {read[0]} to {read[-1]} were" if len(read) > 1 else f"turn {read[0]} was"
+    return fine("turns", f"{turns} read")
+
+
+def few(ring: Ring, data: Measurement | OrbitResponse) -> Check | None:
+    """Too few monitors for anything, if they are."""
+    if not ring.monitors:
+        return wrong(
+            "monitors", f"'{ring.name}' has no monitor; name those elements of the lattice that "
+            "are monitors",
+        )  # fmt: skip
+    if not isinstance(data, Measurement):
+        return None
+    there = np.isfinite(data.readings)
+    read = int(there.any(axis=(0, 1, 3)).sum())
+    if read < 2:
+        return wrong(
+            "monitors", f"{read} monitor was read; a trajectory needs two monitors at least, and "
+            "more to be judged: read more",
+        )  # fmt: skip
+    return None

@@ -1,0 +1,446 @@
+"""Which wrong sign, unit or order everywhere makes first turns agree: global before local.
+
+>>> judge = Judge(ring, measurement)
+>>> judge.verdicts()                    # what would make the data far better, the best first
+
+Each assumption is undone in the data, and the trajectories of all sections are fitted again: what
+counts is how well they agree with themselves, where one joins the next, and with the launches.
+Every term has its own scale, so a section that a fault spoils costs the logarithm of its misfit: a
+strong fault does not look global, and a global error is seen although a fault is there.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import Cause, Settings
+from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.observe.sections import Found, Passes, Sections, distance, openness
+
+Array = NDArray[np.float64]
+Names = tuple[str, ...]
+
+SHOTS, TURNS = 8, 3
+"""That are looked at: a global error is in each."""
+ROUGH = 1e-5
+"""m; stands for a noise that nobody states."""
+TRUSTED = 0.03
+"""Share of the launches to which a fitted one is compared: small errors of magnets and monitors of
+the first section spoil it by as much."""
+NOISE_WIDTH = np.log(3.0)
+"""A stated noise is right to a factor of three, one standard deviation."""
+ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
+"""m; first turns have an orbit of a millimetre, to a factor of ten, one standard deviation."""
+GAIN, CERTAIN = 9.0, 15.0
+"""Log evidence from which a global error is told, and from which it is certain: no healthy
+measurement of `benchmarks/doctor.py` gains as much."""
+SHARE = 0.65
+"""Of all that it changes, how much it has to change for the better: a fault's section may win much
+by chance, but then many others lose."""
+CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
+"""Factors by which chi-square of sections or launches falls with what was wrong undone: at least;
+with a unit undone; of sections where launches say the contrary. Units are powers of a thousand."""
+RIGHT = 9.0
+"""Chi-square of launches that are right then."""
+FINE = 0.1
+"""Share of the orbit that sections leave from which they agree anyhow."""
+ALIKE = 3.0
+"""Log evidence below which two assumptions explain the data alike."""
+_LAST = ("noise-from-data", "launches-unknown")  # of these others decide
+BEAM = 4
+"""Assumptions, the best ones, that are tried together with every other."""
+_TURNED = np.array([1.0, -1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Terms:
+    """How far the parts of a measurement miss one another, and their freedom.
+
+    Attributes:
+        local, joints: mean squares in units of the noise alone, of sections and of where they
+            meet; those between turns are joints too.
+        freedom: of the sections' terms.
+        launch: mean squares of launches, each plane's own, in units of noise and stated rms, by
+            the scale of the noise: see `Judge`.
+        stated: log of what the stated noise differs by, or 0 where it is not stated; log of the
+            orbit over a usual one; each in standard deviations.
+        blur: log of how little the readings tell of launches and joints: with next to none of them
+            anything agrees.
+        level, share: of the sections: see `Found`.
+        unit: chi-square per reading of a mean square of 1: of the noise as it is stated, or where
+            it is not, as the best assumption leaves it.
+    """
+
+    local: Array
+    joints: Array
+    freedom: NDArray[np.int64]
+    launch: Array
+    stated: Array
+    blur: float
+    level: float
+    share: float
+    unit: float
+
+    def cost(self, square: float) -> Array:
+        """Minus the log likelihood of each term, all scales their own, none below the noise's."""
+        return np.concatenate([
+            self.freedom / 2 * _robust(self.local / square),
+            2 * _robust(self.joints / square),
+            np.log(np.maximum(self.launch, 1.0)),  # their information differs
+            self.stated**2 / 2,
+        ])  # fmt: skip
+
+
+def _robust(misfit: Array) -> Array:
+    return np.where(misfit < 1, misfit - 1, np.log(np.maximum(misfit, 1.0)))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A global error that makes the data far better.
+
+    Attributes:
+        names: assumptions, together.
+        gain: log evidence.
+        before, after: chi-square per reading of the sections, and of the launches (NaN where none
+            is stated), [2].
+        alike: other assumptions that explain the data as well.
+    """
+
+    names: Names
+    gain: float
+    before: tuple[float, float]
+    after: tuple[float, float]
+    alike: tuple[Names, ...] = ()
+
+
+@dataclass
+class Judge:
+    """Judges the assumptions about one measurement.
+
+    Args:
+        ring: the design.
+        measurement: first turns, its monitors those of the ring.
+        known: causes that the model holds.
+    """
+
+    ring: Ring
+    measurement: Measurement
+    known: Sequence[Cause] = ()
+    _sections: dict[float, Sections] = field(default_factory=dict, repr=False)
+    _found: dict[object, tuple[object, Passes, Found]] = field(default_factory=dict, repr=False)
+    _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self.monitors = [monitor.name for monitor in self.ring.monitors]
+        self.measurement = _part(in_beam_order(self.measurement, self.monitors))
+        self.scale = _size(self.measurement)
+        self.kicks = _kicks(self.measurement.settings)
+
+    def assumed(self, names: Names) -> Measurement:
+        """The data with what is assumed undone."""
+        if names not in self._made:
+            self._made[names] = assume(self.measurement, names, self.monitors)
+        return self._made[names]
+
+    # --- one assumption -------------------------------------------------------------------------
+    def found(self, data: Measurement) -> tuple[Passes, Found]:
+        """The trajectories of the sections of a measurement."""
+        factor = self._times(data)
+        key = (id(data.readings), factor)
+        if key not in self._found:
+            self._found[key] = (data, *self._fit(data, factor))  # the data stay: so does their id
+        return self._found[key][1:]
+
+    def _times(self, data: Measurement) -> float:
+        """By what the kicks of the shots are multiplied."""
+        if data.settings is self.measurement.settings or not self.kicks.any():
+            return 1.0
+        return float(_kicks(data.settings) @ self.kicks / (self.kicks @ self.kicks))
+
+    def _fit(self, data: Measurement, times: float) -> tuple[Passes, Found]:
+        shots, turns = data.readings.shape[:2]
+        readings = data.readings.reshape(shots * turns, -1, 2)
+        read = np.isfinite(readings).any(axis=(1, 2))
+        shot, turn = (own[read] for own in np.divmod(np.arange(len(readings)), turns))
+        noise = np.full((len(data.monitors), 2), ROUGH)
+        if self.measurement.noise is not None:
+            own = self._noise(data)
+            noise = np.where(np.isfinite(own), own, np.nanmedian(own))
+        factor = _size(data) / self.scale if self.scale > 0 else 1.0
+        sigma = data.launch_sigma
+        alone = sigma is not None and bool(sigma[:, 4].any())
+        passes = Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn, alone)
+        return passes, self._section(times).fit(passes)
+
+    def _section(self, times: float) -> Sections:
+        """The sections, the shots' kicks multiplied."""
+        if 1.0 not in self._sections:
+            at = {name.casefold(): i for i, name in enumerate(self.monitors)}
+            data = self.measurement
+            places = np.array([at[self.ring[name].name.casefold()] for name in data.monitors])
+            settings = data.settings or tuple({} for _ in data.launches)
+            self._sections[1.0] = Sections(self.ring, settings, places, self.known)
+        if times not in self._sections:
+            self._sections[times] = self._sections[1.0].with_kicks(times)
+        return self._sections[times]
+
+    def _noise(self, data: Measurement) -> Array:
+        """As it was stated, monitor by monitor in the order in which the data stand now."""
+        assert self.measurement.noise is not None
+        if data.noise is None or data.noise.shape != self.measurement.noise.shape:
+            return self.measurement.noise
+        ratio = np.nanmedian(data.noise) / np.nanmedian(self.measurement.noise)
+        return np.asarray(data.noise / ratio)
+
+    def terms(self, names: Names, square: float) -> Terms:
+        """What an assumption leaves.
+
+        Args:
+            names: what is assumed, together; () for the data as stated.
+            square: of the readings' noise, in units of the stated one.
+        """
+        data = self.assumed(names)
+        passes, found = self.found(data)
+        spreads = [found.covariance[:, 1:] + found.carried[:, :-1]]
+        joints = [distance(found.start[:, 1:] - found.end[:, :-1], spreads[0]).ravel()]
+        follows = np.flatnonzero((np.diff(passes.shot) == 0) & (np.diff(passes.turn) == 1))
+        if len(follows):
+            miss = found.start[follows + 1, 0] - found.end[follows, -1]
+            spreads.append(found.covariance[follows + 1, 0] + found.carried[follows, -1])
+            joints.append(distance(miss, spreads[1]))
+        noise, unit = 0.0, 1 / square
+        orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
+        if data.noise is not None:
+            ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
+            noise, unit = float(np.log(ratio * np.sqrt(square))) / NOISE_WIDTH, ratio**2
+        backwards = "beam-backwards" in names
+        launch, blur = self._launch(data, passes, found, square, backwards)
+        times = _size(data) / self.scale
+        blur += sum(openness(own / times**2) for own in spreads)
+        return Terms(
+            found.misfit.ravel(),
+            np.concatenate(joints),
+            found.freedom.ravel(),
+            launch,
+            np.array([noise, orbit]),
+            blur,
+            found.level,
+            found.share(passes),
+            unit,
+        )
+
+    def launches(self, square: float, trusted: float) -> tuple[Array, Array]:
+        """Mean squares of fitted less stated launches, each plane's own, [shot, 2], and the misfit
+        of the sections that tell them, [shot]."""
+        passes, found = self.found(self.measurement)
+        first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
+        own, _ = self._launch(self.measurement, passes, found, square, False, trusted)
+        return own.reshape(-1, 2), found.misfit[first, 0]
+
+    def _launch(
+        self,
+        data: Measurement,
+        passes: Passes,
+        found: Found,
+        square: float,
+        backwards: bool,
+        trusted: float = TRUSTED,
+    ) -> tuple[Array, float]:
+        """Mean squares of fitted less stated launches, each plane's own, [shot * 2], and log of
+        what the readings leave open of them."""
+        if backwards:  # where the last turn ends, against the launches as they were stated
+            last = np.flatnonzero(np.append(np.diff(passes.shot) != 0, True))
+            shot, fitted = passes.shot[last], found.end[last, -1] * _TURNED
+            covariance = found.carried[last, -1] * np.outer(_TURNED, _TURNED)
+            stated, J = self.measurement.launches[shot], np.tile(np.eye(4), (len(last), 1, 1))
+            sigma = self.measurement.launch_sigma
+        else:
+            first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
+            shot, fitted = passes.shot[first], found.start[first, 0]
+            covariance = found.covariance[first, 0]
+            energy = found.energy[first, 0]
+            covariance = covariance + energy[:, :, None] * energy[:, None]
+            stated, sigma = data.launches[shot], data.launch_sigma
+            J = np.tile(np.eye(4), (len(first), 1, 1))
+            if passes.turn[first].any():
+                stated, J = self._carried(data, passes, first)
+        if sigma is None or np.isinf(sigma[shot, :4]).all():
+            return np.zeros(0), 0.0
+        own = np.minimum(sigma[shot, :4], 1e3)
+        width = trusted * np.sqrt(np.mean(fitted**2, axis=0))
+        spread = square * covariance + (J * own[:, None] ** 2) @ np.swapaxes(J, 1, 2)
+        spread = spread + np.diag(np.maximum(width, 1e-12) ** 2)
+        times = _size(data) / self.scale
+        open_ = square * covariance / (own**2 + np.maximum(width, 1e-12) ** 2)[:, None] / times**2
+        blur = openness(np.eye(4) + open_)
+        miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=1e6), -1e6, 1e6)
+        planes = [distance(miss[:, p], spread[:, p, p]) for p in (slice(0, 2), slice(2, 4))]
+        return np.stack(planes, axis=1).ravel(), blur
+
+    def _carried(
+        self, data: Measurement, passes: Passes, first: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        """Launches carried to the first turn that was read."""
+        sections = self._section(self._times(data))
+        stated, slopes = np.zeros((len(first), 5)), np.zeros((len(first), 4, 4))
+        for i, one in enumerate(first):
+            shot = passes.shot[one : one + 1]
+            turns = int(passes.turn[one])
+            x, J = sections.carried(data.launches[shot], shot, turns)
+            stated[i], slopes[i] = x[0], J[0]
+        return stated, slopes
+
+    # --- all of them ----------------------------------------------------------------------------
+    def candidates(self) -> list[Names]:
+        """What may be assumed of these data."""
+        data = self.measurement
+        names = [n for n, a in ASSUMPTIONS.items() if a.trajectory and n not in _LAST]
+        without = []
+        if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
+            without += ["launches", "slopes", "positions", "beam", "readings-doubled"]
+            without += ["readings-halved", "readings-in-km"]  # only curvature would tell
+        if not data.launches[:, 4].any():
+            without += ["energies"]
+        if not any("kick" in own for shot in data.settings for own in shot.values()):
+            without += ["settings"]
+        if len(data.monitors) < 4:
+            without += ["monitors"]
+        found: list[Names] = [(n,) for n in names if not {n, n.split("-")[0]} & set(without)]
+        return [own for own in found if self._possible(own)]
+
+    def _possible(self, names: Names) -> bool:
+        try:
+            self.assumed(names)
+        except MeasurementError:
+            return False
+        return True
+
+    def square(self, several: Iterable[Names]) -> float:
+        """Square of the readings' noise in units of the stated one: what the best of several
+        assumptions leaves."""
+        levels = [self.found(self.assumed(names))[1].level for names in several]
+        return max(float(np.nanmin(levels)), 1e-12) if np.isfinite(levels).any() else 1.0
+
+    def verdict(self) -> Verdict | None:
+        """The assumption that makes the data far better, if there is one; two together where that
+        is far better still."""
+        several = self.candidates()
+        square = self.square([(), *several])
+        stated = self.terms((), square)
+        found = [own for names in several if (own := self._judged(names, stated, square))]
+        found.sort(key=_worth, reverse=True)
+        if not found or found[0].gain < GAIN:
+            return None
+        pairs = {
+            tuple(sorted({*first.names, *second}, key=list(ASSUMPTIONS).index))
+            for first in found[:BEAM]
+            for second in several
+            if not set(first.names) & set(second)
+        } - set(several)
+        found += [
+            own for names in sorted(pairs)
+            if self._possible(names) and (own := self._judged(names, stated, square))
+        ]  # fmt: skip
+        found = [own for own in found if _worth(own) > GAIN and _believable(own, stated.share)]
+        if not found:
+            return None
+        best = max(map(_worth, found))
+        alike = [own for own in found if _worth(own) > best - ALIKE]
+        first = min(alike, key=lambda own: [list(ASSUMPTIONS).index(n) for n in own.names])
+        return replace(first, alike=tuple(own.names for own in alike if own is not first))
+
+    def _judged(self, names: Names, stated: Terms, square: float) -> Verdict | None:
+        """What an assumption gains, if it changes nearly everything that it changes for the
+        better."""
+        other = self.terms(names, square)
+        if not _widely(stated, other, square):
+            return None
+        gain = float(stated.cost(square).sum() - other.cost(square).sum())
+        gain -= max(other.blur - stated.blur, 0.0)
+        return Verdict(names, gain, _levels(stated), _levels(other))
+
+    def verdicts(self, most: int = 3) -> list[Verdict]:
+        """Global errors one after another, each with those before it undone."""
+        found: list[Verdict] = []
+        judge = self
+        while len(found) < most and (own := judge.verdict()) is not None:
+            found.append(own)
+            judge = judge.mended(own.names)
+        return found
+
+    def mended(self, names: Names) -> "Judge":
+        """The same with what is assumed undone."""
+        data = self.assumed(names)
+        sections = {1.0: self._section(self._times(data))}
+        return Judge(self.ring, data, self.known, sections)
+
+
+def certain(verdict: Verdict) -> bool:
+    """Whether the evidence leaves no doubt."""
+    return _worth(verdict) > CERTAIN
+
+
+def _worth(verdict: Verdict) -> float:
+    """Log evidence; each assumption beyond the first has to be certain by itself."""
+    return verdict.gain - CERTAIN * (len(verdict.names) - 1)
+
+
+def _widely(stated: Terms, other: Terms, square: float) -> bool:
+    """Whether nearly all of what an assumption changes becomes better."""
+    a, b = stated.cost(square), other.cost(square)
+    if len(a) != len(b):
+        return True
+    better, worse = np.maximum(a - b, 0).sum(), np.maximum(b - a, 0).sum()
+    return bool(better > SHARE * (better + worse))
+
+
+def _believable(verdict: Verdict, share: float) -> bool:
+    """Whether what was wrong is right then, and not only a little less wrong.
+
+    Args:
+        verdict: what is believed.
+        share: of the orbit that the sections leave as stated.
+    """
+    (local, launch), (local_then, launch_then) = verdict.before, verdict.after
+    local_clears, launch_clears = local / max(local_then, 1e-12), launch / max(launch_then, 1e-12)
+    if launch_then > launch and local_clears < AGAINST:
+        return False
+    unit = any("-in-" in name for name in verdict.names)
+    clear = CLEAR_UNIT if unit else CLEAR
+    if local_clears > clear or (launch_clears > clear and launch_then < RIGHT):
+        return True
+    return share < FINE and not unit  # the sections agree anyhow: curvature tells
+
+
+def _levels(terms: Terms) -> tuple[float, float]:
+    """Chi-square per reading: of the sections; of the launches, the worse plane."""
+    launch = terms.launch.reshape(-1, 2)
+    worse = float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
+    return terms.unit * terms.level, worse
+
+
+def _kicks(settings: Sequence[Settings]) -> Array:
+    """All that were set, in their order."""
+    return np.array([
+        own["kick"] for shot in settings for own in shot.values() if "kick" in own
+    ])  # fmt: skip
+
+
+def _part(data: Measurement) -> Measurement:
+    """A few shots and turns, those with the most readings."""
+    count = np.isfinite(data.readings).sum(axis=(2, 3))  # [shot, turn]
+    shots = np.sort(np.argsort(-count.sum(axis=1), kind="stable")[:SHOTS])
+    read = np.flatnonzero(count[shots].any(axis=0))
+    turns = range(int(read[min(TURNS, len(read)) - 1]) + 1)
+    return data.select(shots=[data.shots[i] for i in shots], turns=list(turns))
+
+
+def _size(data: Measurement) -> float:
+    there = data.readings[np.isfinite(data.readings)]
+    return float(np.sqrt(np.mean(there**2)))

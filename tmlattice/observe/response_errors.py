@@ -1,0 +1,147 @@
+"""Which wrong sign, unit or order everywhere makes an orbit response agree with the design.
+
+>>> judge = ResponseJudge(ring, measured)
+>>> judge.verdicts()
+
+A machine's response is its design's to a tenth or so, column by column; a wrong sign or unit
+everywhere makes nearly all columns of a plane another thing. A single bad corrector is one column,
+a single bad monitor a little of all.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.lattice import Ring
+from tmlattice.measurement import OrbitResponse
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.observe.predict import predict
+
+Array = NDArray[np.float64]
+Names = tuple[str, ...]
+
+USUAL = 0.01
+"""Mean square of what the usual errors leave of a column, in units of the column's own: a tenth."""
+GAIN = 2.5
+"""Log of the misfit that each of the changed columns has to lose in the mean."""
+SHARE = 0.8
+"""Of the columns that an assumption changes, how many it has to change for the better."""
+ALIKE = 2.0
+"""Gain below which two assumptions explain the data alike: less than the RF's column tells."""
+ANOTHER = 1.0
+"""Misfit of the typical column from which the response is of another ring."""
+
+
+@dataclass(frozen=True)
+class ResponseVerdict:
+    """A global error that makes an orbit response far better.
+
+    Attributes:
+        names: assumptions, together.
+        gain: sum over columns of the log of the misfit.
+        before, after: misfit of the typical column that is changed, 0 to 4.
+        alike: other assumptions that explain the data as well.
+    """
+
+    names: Names
+    gain: float
+    before: float
+    after: float
+    alike: tuple[Names, ...] = ()
+
+
+@dataclass(frozen=True)
+class ResponseJudge:
+    """Judges the assumptions about one orbit response.
+
+    Args:
+        ring: the design.
+        measured: its monitors those of the ring.
+
+    Raises:
+        UnknownNameError, MeasurementError: see `predict`.
+        UnstableRingError: the design has no closed orbit.
+    """
+
+    ring: Ring
+    measured: OrbitResponse
+
+    @cached_property
+    def monitors(self) -> list[str]:
+        """The ring's, in beam order."""
+        return [monitor.name for monitor in self.ring.monitors]
+
+    @cached_property
+    def design(self) -> OrbitResponse:
+        """What the design would have answered, for steps of one."""
+        data = in_beam_order(self.measured, self.monitors)
+        rf = data.rf if data.rf is None else replace(data.rf, step=data.rf.frequency * TINY)
+        ones = replace(data, kicks=np.ones(len(data.kicks)), rf=rf)
+        stepped = data.rf is not None and data.rf.orbit is not None
+        return predict(ResponseModel(self.ring, 6 if stepped else 4), ones)
+
+    def misfit(self, names: Names) -> Array:
+        """Of each column, the RF's last: |measured - design|^2 over the mean of both squares, 0
+        for equal ones, 2 for strangers, 4 for a wrong sign; NaN where nothing was read."""
+        data = assume(in_beam_order(self.measured, self.monitors), names, self.monitors)
+        read, made = [*data.response], [*(data.kicks[:, None, None] * self.design.response)]
+        rf, own = data.rf, self.design.rf
+        if rf is not None and own is not None and rf.orbit is not None and own.orbit is not None:
+            read.append(rf.orbit)
+            made.append(own.orbit * (rf.step / rf.frequency / TINY))
+        there = np.isfinite(read)
+        a, b = (np.where(there, values, 0.0) for values in (np.array(read), np.array(made)))
+        size = ((a**2).sum(axis=(1, 2)) + (b**2).sum(axis=(1, 2))) / 2
+        left = ((a - b) ** 2).sum(axis=(1, 2))
+        seen = there.any(axis=(1, 2)) & (size > 0)
+        return np.where(seen, left / np.where(seen, size, 1.0), np.nan)
+
+    def candidates(self) -> list[Names]:
+        """What may be assumed of these data."""
+        found: list[Names] = [(n,) for n, a in ASSUMPTIONS.items() if a.response]
+        if self.measured.rf is None or self.measured.rf.orbit is None:
+            found = [own for own in found if not own[0].startswith("rf")]
+        return found
+
+    def verdict(self) -> ResponseVerdict | None:
+        """The assumption that makes the data far better, if there is one."""
+        stated = self.misfit(())
+        found = []
+        for names in self.candidates():
+            other = self.misfit(names)
+            change = np.log((other + USUAL) / (stated + USUAL))
+            moved = np.abs(np.nan_to_num(change)) > np.log(2.0)
+            if moved.any() and (change[moved] < 0).mean() >= SHARE:
+                gain = -float(change[moved].sum())
+                if gain > GAIN * moved.sum():
+                    before, after = (float(np.median(own[moved])) for own in (stated, other))
+                    found.append(ResponseVerdict(names, gain, before, after))
+        if not found:
+            return None
+        best = max(own.gain for own in found)
+        alike = [own for own in found if own.gain > best - ALIKE]
+        first = alike[0]
+        return replace(first, alike=tuple(own.names for own in alike if own is not first))
+
+    def verdicts(self, most: int = 4) -> list[ResponseVerdict]:
+        """Global errors one after another, each with those before it undone."""
+        found: list[ResponseVerdict] = []
+        judge = self
+        while len(found) < most and (own := judge.verdict()) is not None:
+            found.append(own)
+            judge = judge.mended(own.names)
+        return found
+
+    def mended(self, names: Names) -> "ResponseJudge":
+        """The same with what is assumed undone."""
+        data = assume(in_beam_order(self.measured, self.monitors), names, self.monitors)
+        made = ResponseJudge(self.ring, data)
+        made.__dict__["design"] = self.design  # of the same correctors and monitors
+        return made
+
+
+TINY = 1e-6
+"""Relative step of the RF that stands for one of 1."""

@@ -1,0 +1,370 @@
+"""A turn cut into sections, each with a trajectory of its own: what holds whatever is wrong
+elsewhere.
+
+>>> sections = Sections(ring, measurement)
+>>> found = sections.fit(passes)
+>>> found.misfit                                  # chi-square of each section over its freedom
+
+A single fault spoils the section in which it sits, and the joint behind it; a wrong sign, unit or
+order spoils all. Launches are not needed: the first section tells what they were. Maps are composed
+from the layers' second-order ones, and truncated again: over a part of a turn the third order
+that is lost is far below any noise.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.layers import Layers
+from tmlattice.beam.model import Model
+from tmlattice.effects import Cause, Settings
+from tmlattice.lattice import Ring
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Places = NDArray[np.intp]
+
+_KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates; a pass without RF does not ask for tau
+WEAK = 1e-8
+"""Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
+STEPS = 6
+"""Of Newton's method: the maps are nearly linear."""
+FAR_OFF = 1e15
+"""Sigma that stand for a trajectory which cannot be followed."""
+SETTLED = 1e-2
+"""Change of the typical reading, in units of its noise, behind which there is no further step."""
+ENERGY = 5e-3
+"""Relative; rms of the energy deviations that a pass may have, in all its sections."""
+MOST = 8
+"""Monitors of a section; four coordinates leave three quarters of their readings to judge."""
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Second-order maps x -> c0 + c1 x + x c2 x of (x, px, y, py, delta), stacked.
+
+    Attributes:
+        c0, c1, c2: [..., out], [..., out, 5], [..., out, 5, 5].
+    """
+
+    c0: Array
+    c1: Array
+    c2: Array
+
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        """Images [..., out] of states [..., 5], and their slopes [..., out, 5]."""
+        bent = np.einsum("...oij,...j->...oi", self.c2, x)
+        image = self.c0 + np.einsum("...oi,...i->...o", self.c1 + bent, x)
+        return image, self.c1 + 2 * bent
+
+    def after(self, first: "Maps") -> "Maps":
+        """These after others, to second order."""
+        fed = np.einsum("...oij,...j->...oi", self.c2, first.c0)
+        slope = self.c1 + 2 * fed
+        bent = np.swapaxes(first.c1, -1, -2)[..., None, :, :] @ self.c2 @ first.c1[..., None, :, :]
+        size = first.c2.shape
+        bent = bent + (slope @ first.c2.reshape(*size[:-2], -1)).reshape(bent.shape)
+        return Maps(
+            self.c0 + np.einsum("...oi,...i->...o", self.c1 + fed, first.c0),
+            slope @ first.c1,
+            bent,
+        )
+
+    def __getitem__(self, at: Any) -> "Maps":
+        return Maps(self.c0[at], self.c1[at], self.c2[at])
+
+
+def _five(weights: Sequence[Array]) -> Maps:
+    """Stacked weights in six coordinates, as maps of five."""
+    W0, W1, W2 = weights
+    n = W1.shape[-1]
+    rows, columns = np.triu_indices(n)
+    T = np.zeros((*W2.shape[:-1], n, n))
+    T[..., rows, columns] = W2 / 2
+    T = T + np.swapaxes(T, -1, -2)
+    if W0.shape[-1] == n:
+        W0, W1, T = W0[..., _KEPT], W1[..., _KEPT, :], T[..., _KEPT, :, :]
+    return Maps(W0, W1[..., _KEPT], T[..., _KEPT, :][..., _KEPT])
+
+
+def _stacked(several: Sequence[Maps]) -> Maps:
+    return Maps(*(np.stack([getattr(own, c) for own in several]) for c in ("c0", "c1", "c2")))
+
+
+@dataclass(frozen=True)
+class Passes:
+    """What was read, pass by pass: a turn of a shot each.
+
+    Attributes:
+        readings: [pass, monitor, 2], m; NaN where nothing was read.
+        sigma: noise of a reading, m, [monitor, 2].
+        delta: relative energy deviation, [pass]; it is fitted, and this is where it starts.
+        shot, turn: of each, [pass].
+        alone: whether each has an energy of its own; else all have what the first guess lacks.
+    """
+
+    readings: Array
+    sigma: Array
+    delta: Array
+    shot: Places
+    turn: Places
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """The trajectories of all sections of all passes.
+
+    Attributes:
+        left: readings less the trajectory, in units of the noise, [pass, section, reading]; 0 where
+            nothing was read.
+        owner: the monitor of each, [section, reading]; -1 where there is none.
+        there: whether it was read, [pass, section, reading].
+        free: share of its noise that the trajectory does not take up, [pass, section, reading].
+        freedom: [pass, section].
+        misfit: chi-square over the freedom, [pass, section].
+        delta: relative energy deviation, [pass].
+        start: trajectories at the sections' starts, [pass, section, 4].
+        covariance: of these, [pass, section, 4, 4], at a known energy.
+        energy: what they change by an energy deviation's standard error, [pass, section, 4].
+        end, carried: the trajectories and covariances at the sections' ends.
+    """
+
+    left: Array
+    owner: NDArray[np.int64]
+    there: Flags
+    free: Array
+    freedom: NDArray[np.int64]
+    misfit: Array
+    delta: Array
+    start: Array
+    covariance: Array
+    energy: Array
+    end: Array
+    carried: Array
+
+    @property
+    def level(self) -> float:
+        """Mean square of the noise in units of the stated one, as most sections have it; NaN where
+        none can tell."""
+        there = self.freedom > 0
+        if not there.any():
+            return float("nan")
+        usual = (1 - 2 / (9 * self.freedom[there])) ** 3  # median of chi-square over its freedom
+        return float(np.median(self.misfit[there] / usual))
+
+    def share(self, passes: Passes) -> float:
+        """What the typical trajectory leaves of its readings: 1 where the readings follow none."""
+        owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
+        read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
+        left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
+        enough = self.freedom > 3
+        if enough.sum() < 3:
+            return float("nan")
+        count = self.there.sum(axis=2)[enough]
+        whole = (read**2).sum(axis=2)[enough] / count
+        part = (left**2).sum(axis=2)[enough] / self.freedom[enough]
+        return float(np.median(np.sqrt(part / np.maximum(whole, 1e-60))))
+
+
+def distance(miss: Array, covariance: Array) -> Array:
+    """Mean square of what is missed, in units of its covariance, [...]."""
+    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), 1e-60))
+    even = np.nan_to_num(covariance / size[..., None] / size[..., None, :], posinf=0, neginf=0)
+    miss = np.clip(np.nan_to_num(miss / size, nan=FAR_OFF), -FAR_OFF, FAR_OFF)
+    solved = np.linalg.solve(even + 1e-9 * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
+    return np.asarray(np.einsum("...i,...i->...", miss, solved) / miss.shape[-1])
+
+
+def openness(covariance: Array) -> float:
+    """Sum of the logs of their determinants' roots: how little is known, [..., n, n]."""
+    covariance = np.nan_to_num(covariance, nan=1e30, posinf=1e30, neginf=-1e30)
+    sign, log = np.linalg.slogdet(covariance)
+    diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), 1e-60)).sum(axis=-1)
+    return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: one direction hides all
+
+
+class Sections:
+    """The sections of a turn of a ring, with the settings of some shots.
+
+    Args:
+        ring: the design.
+        settings: of each shot.
+        monitors: places of those that were read among the ring's, rising.
+        known: causes that the model holds.
+
+    Attributes:
+        monitors: as given.
+        group: which settings each shot has, [shot].
+    """
+
+    def __init__(
+        self,
+        ring: Ring,
+        settings: Sequence[Settings],
+        monitors: Places,
+        known: Sequence[Cause] = (),
+    ) -> None:
+        model = Model(ring, settings, 1, known)
+        self.monitors = monitors
+        self.group = np.zeros(len(settings), dtype=np.intp)
+        for group in model.groups:
+            self.group[group.shots] = group.number
+        layers = [group.layers for group in model.groups]
+        self._steps = _stacked([_five(own.W) for own in layers])
+        self._reads = _stacked([_five(own.R)[monitors] for own in layers])
+        self._design = _five(Layers.of(model.maps).W)
+        exits = layers[0].at[monitors]
+        size = int(np.clip(len(monitors) // 12, 4, MOST))
+        count = max(len(monitors) // size, 1)
+        self._members = np.array_split(np.arange(len(monitors)), count)
+        starts = [0, *(int(exits[own[0]]) for own in self._members[1:])]
+        self._bounds = list(zip(starts, [*starts[1:], layers[0].steps], strict=True))
+        self._exits = exits
+
+    def with_kicks(self, factor: float) -> "Sections":
+        """The same with what the settings change multiplied: maps are linear in kicks."""
+        made = copy(self)
+        made.__dict__.pop("_made", None)
+        made._steps = Maps(*(
+            getattr(self._design, c)
+            + factor * (getattr(self._steps, c) - getattr(self._design, c))
+            for c in ("c0", "c1", "c2")
+        ))  # fmt: skip
+        return made
+
+    @cached_property
+    def _made(self) -> tuple[Maps, Maps]:
+        """From the start of each section to its monitors [group, monitor], and to its end [group,
+        section]: all sections side by side, step by step."""
+        groups, count = len(self._steps.c0), len(self._bounds)
+        first = np.array([start for start, _ in self._bounds])
+        length = np.array([end - start for start, end in self._bounds])
+        steps, reads = self._steps, self._reads
+        way = Maps(
+            np.zeros((groups, count, 5)),
+            np.tile(np.eye(5), (groups, count, 1, 1)),
+            np.zeros((groups, count, 5, 5, 5)),
+        )
+        section = np.concatenate([np.full(len(own), w) for w, own in enumerate(self._members)])
+        at = self._exits - first[section]  # steps into its section
+        seen = Maps(*(np.zeros_like(c) for c in (reads.c0, reads.c1, reads.c2)))
+        for step in range(int(length.max()) + 1):
+            here = np.flatnonzero(at == step)
+            if len(here):
+                now = reads[:, here].after(way[:, section[here]])
+                for name in ("c0", "c1", "c2"):
+                    getattr(seen, name)[:, here] = getattr(now, name)
+            go = np.flatnonzero(step < length)
+            if len(go):
+                moved = steps[:, first[go] + step].after(way[:, go])
+                for name in ("c0", "c1", "c2"):
+                    getattr(way, name)[:, go] = getattr(moved, name)
+        return seen, way
+
+    def fit(self, passes: Passes) -> Found:
+        """The trajectory of each section that its own readings ask for."""
+        seen, way = self._made
+        group = self.group[passes.shot]
+        width = max(len(own) for own in self._members)
+        owner = np.full((len(self._members), width), -1, dtype=np.int64)
+        for w, members in enumerate(self._members):
+            owner[w, : len(members)] = members
+        padded = owner >= 0
+        P, W = len(passes.readings), len(owner)
+        maps = seen[group[:, None, None], np.where(padded, owner, 0)]
+        data = passes.readings[:, owner]
+        there = np.isfinite(data) & padded[None, :, :, None]
+        sigma = np.where(there, passes.sigma[owner], np.inf)
+        freedom = np.maximum(np.asarray(there.sum(axis=(2, 3)), dtype=np.int64) - 4, 0)
+        x = np.zeros((P, W, 5))
+        x[..., 4] = passes.delta[:, None]
+        moved, by_energy = np.inf, np.zeros((P, W, 4))
+        with np.errstate(all="ignore"):
+            for step in range(STEPS):
+                image, slope = maps(x[:, :, None])
+                left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
+                A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
+                curvature = _held(np.swapaxes(A, -1, -2) @ A)
+                if step == STEPS - 1 or not moved > SETTLED:
+                    break
+                own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
+                back = np.linalg.solve(curvature, np.swapaxes(A, -1, -2))
+                step_4 = (back @ left[..., None])[..., 0]
+                fitted = (A @ step_4[..., None])[..., 0]
+                moved, clean = float(np.nanmedian(np.abs(fitted))), left - fitted
+                alone = own - (A @ (back @ own[..., None]))[..., 0]
+                prior = passes.delta - x[:, 0, 4]
+                change, known = _shared(clean, alone, freedom, prior, passes.alone)
+                by_energy = -(back @ own[..., None])[..., 0] / np.sqrt(known)[:, None, None]
+                step_4 = step_4 - (back @ own[..., None])[..., 0] * change[:, None, None]
+                x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
+                x[..., 4] += change[:, None]
+        whole: Array = np.nan_to_num((left**2).sum(axis=2), nan=1e30, posinf=1e30)
+        covariance = np.asarray(np.linalg.inv(curvature), dtype=float)
+        end, slope = way[group[:, None], np.arange(W)](x)
+        J = slope[..., :4, :4]
+        return Found(
+            left=left,
+            owner=np.repeat(owner, 2, axis=1),
+            there=there.reshape(P, W, -1),
+            free=1 - np.einsum("pwri,pwij,pwrj->pwr", A, covariance, A),
+            freedom=freedom,
+            misfit=whole / np.maximum(freedom, 1),
+            delta=x[:, 0, 4],
+            start=x[..., :4],
+            covariance=covariance,
+            energy=np.nan_to_num(by_energy),
+            end=end[..., :4],
+            carried=J @ covariance @ np.swapaxes(J, -1, -2),
+        )
+
+    def carried(self, launches: Array, shot: Places, turns: int) -> tuple[Array, Array]:
+        """Launches [pass, 5] of shots, carried through whole turns, and the slopes [pass, 4, 4]."""
+        _, way = self._made
+        x, J = launches.copy(), np.tile(np.eye(4), (len(launches), 1, 1))
+        for _ in range(turns):
+            for w in range(len(self._bounds)):
+                image, slope = way[self.group[shot], w](x)
+                x = np.concatenate([image[:, :4], x[:, 4:]], axis=1)
+                J = slope[:, :4, :4] @ J
+        return x, J
+
+
+def _shared(
+    left: Array, slope: Array, freedom: NDArray[np.int64], prior: Array, alone: bool
+) -> tuple[Array, Array]:
+    """What all sections of a pass, or of all passes, say together of the energy, [pass], and one
+    over its variance.
+
+    Args:
+        left, slope: of the readings, cleaned of their own trajectories, [pass, section, reading].
+        freedom: [pass, section].
+        prior: where the energy is expected to be, [pass].
+        alone: see `Passes`.
+    """
+    misfit = (left**2).sum(axis=2) / np.maximum(freedom, 1)
+    level = np.array([np.median(own[free > 0]) if free.any() else 1.0
+                      for own, free in zip(misfit, freedom, strict=True)])  # fmt: skip
+    level = np.nan_to_num(level, nan=1.0)[:, None] + 1e-12
+    weight = (freedom > 0) / np.maximum(misfit, level)  # a spoilt section says little
+    asked = np.nan_to_num((weight * (left * slope).sum(axis=2)).sum(axis=1)) + prior / ENERGY**2
+    told = np.nan_to_num((weight * (slope**2).sum(axis=2)).sum(axis=1)) + 1 / ENERGY**2
+    if alone:
+        return asked / told, told
+    return np.full(len(left), asked.sum() / told.sum()), np.full(len(left), told.sum())
+
+
+def _held(curvature: Array) -> Array:
+    """Normal equations [..., 4, 4] in which no direction is free."""
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", curvature), 0.0))
+    scale = np.where(np.isfinite(scale), scale, 0.0)
+    largest = np.maximum(scale.max(axis=-1, keepdims=True), 1e-30)
+    scale = np.maximum(scale, 1e-2 * largest)
+    held = np.nan_to_num(curvature, posinf=0.0, neginf=0.0)
+    return np.asarray(held + WEAK * scale[..., None] ** 2 * np.eye(4))
