@@ -104,7 +104,7 @@ class NameList(click.ParamType):  # type: ignore[type-arg]
 
 INPUTS = ("lattice", "measurement", "reference", "calibration", "settings_file")
 MARKS = ("monitors", "correctors", "particle")
-OUTPUTS = ("json_file", "truth", "out", "lattice_out")
+OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out")
 OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv")
 
 

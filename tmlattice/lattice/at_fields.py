@@ -17,13 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.places import Place
+from tmlattice.lattice.places import RADIUS, Place
 from tmlattice.lattice.ring import Kind
 
 KIND_OF: dict[int, Kind] = {1: "quadrupole", 2: "sextupole", 3: "octupole"}
-
-RADIUS = 0.02
-"""m; where fields of several orders are compared."""
 
 
 def strengths_of(element: Any) -> NDArray[np.complex128]:

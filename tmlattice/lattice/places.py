@@ -62,9 +62,27 @@ def source_kind(source: Any) -> Kind:
     for classes, kind in kinds:
         if isinstance(source, classes):
             return kind
+    if type(source).__name__ == "CombinedMultipole":
+        return _strongest(source)
     if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
         return "wiggler" if "wig" in str(source.id).casefold() else "matrix"
     return "drift" if source.l else "marker"
+
+
+RADIUS = 0.02
+"""m; where fields of several orders are compared."""
+
+
+def _strongest(source: Any) -> Kind:
+    """Of a combined multipole, by its strongest field at `RADIUS`; a thin one has no kind."""
+    fields = (
+        math.hypot(source.k0, source.k0s),
+        math.hypot(source.k1, source.k1s) * RADIUS,
+        math.hypot(source.k2, source.k2s) * RADIUS**2 / 2,
+    )
+    order = fields.index(max(fields)) if source.l and any(fields) else 0
+    kinds: tuple[Kind, ...] = ("multipole", "quadrupole", "sextupole")
+    return kinds[order]
 
 
 def place_elements(
