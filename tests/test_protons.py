@@ -128,7 +128,8 @@ def test_the_particle_may_be_said(ring, tmp_path):
     assert load_ring(tmp_path / "ring.json").mass == ELECTRON_GEV
     words = ["info", "ring.json", "--json", "info.json"]
     for more, mass in (([], ELECTRON_GEV), (["--particle", "proton"], PROTON_GEV)):
-        tmlattice(*words, *more, cwd=tmp_path, check=0)
+        done = tmlattice(*words, *more, cwd=tmp_path, check=0)
+        assert ("particles of 0.938272 GeV" in " ".join(done.stdout.split())) == bool(more)
         assert json.loads((tmp_path / "info.json").read_text())["mass_gev"] == mass
     with pytest.raises(UnknownNameError, match="no particle 'prton'; did you mean 'proton'"):
         load_ring(tmp_path / "ring.json", particle="prton")
