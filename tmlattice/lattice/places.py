@@ -1,5 +1,6 @@
 """From OCELOT objects in beam order to named elements: what all lattice readers share."""
 
+import copy
 import logging
 import math
 import warnings
@@ -67,6 +68,17 @@ def source_kind(source: Any) -> Kind:
     if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
         return "wiggler" if "wig" in str(source.id).casefold() else "matrix"
     return "drift" if source.l else "marker"
+
+
+def halves(source: Any) -> tuple[Any, Any]:
+    """The two halves of an OCELOT element; a bend's edges stay at its ends."""
+    first, second = (copy.deepcopy(source) for _ in range(2))
+    first.l = second.l = source.l / 2
+    if hasattr(source, "e1"):
+        first.angle = second.angle = source.angle / 2
+        first.e2 = first.fintx = first.h_pole2 = 0.0
+        second.e1 = second.fint = second.h_pole1 = 0.0
+    return first, second
 
 
 RADIUS = 0.02
