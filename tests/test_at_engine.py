@@ -5,7 +5,6 @@ state (x, px, y, py), since a drift of AT is x += L px on energy.
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -571,13 +570,16 @@ def test_what_at_cannot_build_is_named(tmp_path, element):
 
 
 @pytest.mark.parametrize(
-    ("kind", "wrong"), [("bend", "dx"), ("hcorrector", "dy"), ("octupole", "roll")]
+    ("kind", "wrong"), [("solenoid", "dx"), ("hcorrector", "dy"), ("bend", "middle")]
 )
 def test_what_at_cannot_make_wrong_is_not_passed_over(small_ring, kind, wrong):
     builder = Builder(6e9, 10, 0.05, False, 0.0)
     bend = next(e for e in small_ring.elements if e.kind == "bend")
     element = replace(bend, kind=kind, name="it")
-    if kind == "octupole":
-        element = replace(element, source=SimpleNamespace(k3=1.0))
+    build = Build()
+    if wrong == "middle":
+        build.add_gradient("middle", normal=1e-3)
+    else:
+        setattr(build, wrong, 1e-3)
     with pytest.raises(LatticeError, match=f"'it' with another {wrong}"):
-        builder.pieces(element, Build(**{wrong: 1e-3}), {})
+        builder.pieces(element, build, {})

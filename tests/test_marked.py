@@ -64,6 +64,18 @@ def test_coils_in_drifts_markers_and_sextupoles_kick_where_they_are(file):
     assert np.abs(both[0][0]).max() < 1e-12  # the first stands before them
 
 
+def test_a_trim_coil_of_a_bend_leaves_the_bend_as_it_is(file):
+    plain, ring = load_ring(file), load_ring(file, monitors="POS", correctors="B")
+    assert ring.counts()["bend"] == 2 * plain.counts()["bend"]
+    np.testing.assert_allclose(ring_matrix(ring), ring_matrix(plain), rtol=0, atol=1e-11)
+    assert ring["b_h::2"].s == pytest.approx(plain["b::2"].s)
+    assert ring.pieces("b::2") == ("b::2", "b_2::2")
+    start = np.array([[1e-5, 0, 1e-5, 0, 0, 0]])
+    kick = [{"b_h::0": {"kick": 1e-5}}]
+    both = [engine(ring).track(start, settings=kick)[0, 0] for engine in (AtEngine, OcelotEngine)]
+    np.testing.assert_allclose(both[0], both[1], rtol=0, atol=1e-9)
+
+
 def test_marked_ring_is_measured_and_kept(file, tmp_path):
     ring = load_ring(file, monitors="POS", correctors="SF")
     assert simulate(ring, shots=1, amplitude=1e-5).measurement().readings.shape == (1, 1, 16, 2)

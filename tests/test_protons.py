@@ -10,9 +10,9 @@ from command import tmlattice
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, UnknownNameError
 from tmlattice.lattice import save_ring
-from tmlattice.lattice.ring import PROTON_GEV
+from tmlattice.lattice.ring import ELECTRON_GEV, PROTON_GEV
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.ocelot_engine import OcelotEngine
 from tmlattice.machine.response import simulate_response
@@ -96,14 +96,17 @@ def at_compaction(engine):
     return (ends[1] - ends[0]) / 2e-4 / lattice.circumference
 
 
-def test_many_turns_with_the_cavity_agree_between_the_engines(ring):
+@pytest.mark.parametrize("energy", [ENERGY, 2.5])
+def test_many_turns_with_the_cavity_are_stable_above_and_below_transition(ring, energy):
     launches = np.zeros((2, 6))
     launches[0, 0], launches[1, 5] = 1e-4, 1e-4
-    a, b = (engine(ring).track(launches, 200) for engine in (AtEngine, OcelotEngine))
+    own = replace(ring, energy=energy)
+    a, b = (engine(own).track(launches, 200) for engine in (AtEngine, OcelotEngine))
     np.testing.assert_allclose(a, b, rtol=0, atol=2e-6)
     # an energy off by 1e-4 swings: over the turns it comes back from the other side
-    energy = b[1, :, :, 0].mean(axis=1)
-    assert energy.min() < -0.5 * energy.max() < 0
+    orbit = b[1, :, :, 0].mean(axis=1)
+    assert orbit.min() < -0.5 * orbit.max() < 0
+    assert np.abs(orbit).max() < 1.5 * np.abs(orbit[:5]).max()
 
 
 def test_info_is_per_momentum_and_of_the_path(ring, tmp_path):
@@ -117,6 +120,19 @@ def test_info_is_per_momentum_and_of_the_path(ring, tmp_path):
     exits = at.get_refpts(lattice, "qf::*") + 1
     up, down = (at.find_orbit4(lattice, delta, exits)[1][:, 0] for delta in (1e-4, -1e-4))
     assert facts["dispersion_max"][0] == pytest.approx((up - down).max() / 2e-4, rel=1e-3)
+
+
+def test_the_particle_may_be_said(ring, tmp_path):
+    silent = replace(ring, mass=ELECTRON_GEV)
+    save_ring(silent, tmp_path / "ring.json")
+    assert load_ring(tmp_path / "ring.json").mass == ELECTRON_GEV
+    words = ["info", "ring.json", "--json", "info.json"]
+    for more, mass in (([], ELECTRON_GEV), (["--particle", "proton"], PROTON_GEV)):
+        done = tmlattice(*words, *more, cwd=tmp_path, check=0)
+        assert ("particles of 0.938272 GeV" in " ".join(done.stdout.split())) == bool(more)
+        assert json.loads((tmp_path / "info.json").read_text())["mass_gev"] == mass
+    with pytest.raises(UnknownNameError, match="no particle 'prton'; did you mean 'proton'"):
+        load_ring(tmp_path / "ring.json", particle="prton")
 
 
 def test_protons_do_not_radiate(ring):

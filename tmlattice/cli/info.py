@@ -78,9 +78,11 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
 
 
 def _print(facts: dict[str, Any]) -> None:
+    heavy = facts["mass_gev"] > 1e-3
+    particle = f" (particles of {facts['mass_gev']:.6g} GeV)" if heavy else ""
     screen = console()
     screen.print(
-        f"{facts['lattice']}: {facts['length']:.4f} m, {facts['energy_gev']:g} GeV, "
+        f"{facts['lattice']}: {facts['length']:.4f} m, {facts['energy_gev']:g} GeV{particle}, "
         f"{facts['layers']} magnets, bends sum to {facts['bend_angle']:.9f} rad"
     )
     counts = table("elements", "count")

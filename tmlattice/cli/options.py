@@ -103,7 +103,8 @@ class NameList(click.ParamType):  # type: ignore[type-arg]
 
 
 INPUTS = ("lattice", "measurement", "reference", "calibration", "settings_file")
-OUTPUTS = ("json_file", "truth", "out", "lattice_out")
+MARKS = ("monitors", "correctors", "particle")
+OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out")
 OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv")
 
 
@@ -128,7 +129,7 @@ class Careful(click.Command):
         return super().invoke(ctx)
 
 
-def _remember(context: click.Context, option: click.Parameter, value: tuple[str, ...]) -> None:
+def _remember(context: click.Context, option: click.Parameter, value: Any) -> None:
     context.meta[f"tmlattice.{option.name}"] = value
 
 
@@ -147,7 +148,7 @@ def open_ring(
     from tmlattice.lattice import load_ring
     from tmlattice.lattice.checks import need_monitors, no_whole_turn
 
-    ring = load_ring(lattice, sequence, energy, *marks())
+    ring = load_ring(lattice, sequence, energy, **marks())
     if read:
         need_monitors(ring)
     if told := no_whole_turn(ring):
@@ -155,10 +156,11 @@ def open_ring(
     return ring
 
 
-def marks() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What `--monitors` and `--correctors` of the running command say."""
+def marks() -> dict[str, Any]:
+    """What `--monitors`, `--correctors` and `--particle` of the running command say, if they do."""
     meta = click.get_current_context().meta
-    return meta.get("tmlattice.mark_monitors", ()), meta.get("tmlattice.mark_correctors", ())
+    said = {name: meta.get(f"tmlattice.mark_{name}") for name in MARKS}
+    return {name: value for name, value in said.items() if value}
 
 
 def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -171,6 +173,9 @@ def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
                      expose_value=False, callback=_remember,
                      help="Elements that are monitors although the file has them as markers or "
                      "drifts, such as 'BPM*'; several with commas."),
+        click.option("--particle", "mark_particle", type=click.Choice(["electron", "proton"]),
+                     expose_value=False, callback=_remember,
+                     help="Else what the lattice states."),
         click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
                      help="Beam energy; else what the lattice states."),
         click.option("--sequence", metavar="NAME",

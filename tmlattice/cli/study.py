@@ -111,12 +111,11 @@ def tune_fit(
     from tmlattice.fitting.study import study_tune_fit, summarise
 
     chosen = tuple(name.strip() for name in methods.split(","))
-    monitors, correctors = marks()
     with ExitStack() as files:
         path = files.enter_context(output_file(json_file)) if json_file else None
         cases = study_tune_fit(
             lattice, chosen, progress=not quiet, folder=out, scheduler=scheduler,
-            workers=workers, monitors=monitors, correctors=correctors, **options,
+            workers=workers, **marks(), **options,
         )  # fmt: skip
         cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
         summary = {

@@ -40,7 +40,7 @@ is told which magnets changed: nothing else can be better."""
 
 UNSTABLE = "the perturbed ring is unstable"
 
-_LATTICE = ("lattice", "sequence", "energy", "monitors", "correctors")
+_LATTICE = ("lattice", "sequence", "energy", "monitors", "correctors", "particle")
 
 NEW_AMPLITUDE = 5.0
 """New launches, for the prediction, have this many times the fitted launch's amplitude."""
@@ -287,6 +287,7 @@ def study_tune_fit(
     energy: float | None = None,
     monitors: Sequence[str] = (),
     correctors: Sequence[str] = (),
+    particle: str | None = None,
     progress: bool = True,
     **options: Any,
 ) -> list[Case]:
@@ -302,7 +303,7 @@ def study_tune_fit(
         scheduler: address of a Dask scheduler; None: local processes.
         workers: local processes; 1: this one; else one a core.
         folder: where every case is written as it ends, and read from when the study goes on.
-        sequence, energy, monitors, correctors: see `load_ring`.
+        sequence, energy, monitors, correctors, particle: see `load_ring`.
         progress: show a bar where there is a terminal.
         options: of `run_case`.
 
@@ -316,8 +317,8 @@ def study_tune_fit(
     unknown = [m for m in methods if m not in METHODS]
     if unknown or not methods:
         raise TmlatticeError(f"no method '{', '.join(unknown)}'; there are {', '.join(METHODS)}")
-    marks = (tuple(monitors), tuple(correctors)) if monitors or correctors else ()
-    where = (lattice, sequence, energy, *marks)
+    marks = (tuple(monitors), tuple(correctors), particle)
+    where = (lattice, sequence, energy, *(marks if any(marks) else ()))
     ring = load_ring(*where)
     need_monitors(ring)
     names = faults(ring, magnets, kind)

@@ -9,7 +9,6 @@ A magnet of one field is OCELOT's quadrupole, sextupole or octupole; with severa
 its class or MADType where it has that field, else its strongest field at 2 cm from the axis.
 """
 
-import copy
 import math
 from collections import Counter
 from typing import Any
@@ -17,13 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.places import Place
+from tmlattice.lattice.places import RADIUS, Place, halves
 from tmlattice.lattice.ring import Kind
 
 KIND_OF: dict[int, Kind] = {1: "quadrupole", 2: "sextupole", 3: "octupole"}
-
-RADIUS = 0.02
-"""m; where fields of several orders are compared."""
 
 
 def strengths_of(element: Any) -> NDArray[np.complex128]:
@@ -170,11 +166,7 @@ def with_coils(element: Any, family: str, source: Any) -> list[Place]:
     others = np.array([strengths[0], 1j * strengths[1].imag, 1j * strengths[2].imag])
     if not others.any():
         return [(family, "bend", source)]
-    first, second = (copy.deepcopy(source) for _ in range(2))
-    for half in (first, second):
-        half.l, half.angle = source.l / 2, source.angle / 2
-    first.e2 = first.fintx = first.h_pole2 = 0.0
-    second.e1 = second.fint = second.h_pole1 = 0.0
+    first, second = halves(source)
     name = f"{family}_coil"
     coil: Place = (name, "multipole", _combined(source.l * others, 0.0, source.tilt, name))
     return [(family, "bend", first), coil, (f"{family}_2", "bend", second)]

@@ -2,13 +2,14 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice import stored
 from tmlattice.lattice.marked import marked
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.ring import PARTICLES, Ring
 
 AT_SUFFIXES = (".mat", ".m", ".repr")
 MADX_SUFFIXES = (".seq", ".madx", ".lte")
@@ -32,6 +33,7 @@ def load_ring(
     energy: float | None = None,
     monitors: str | Sequence[str] | None = None,
     correctors: str | Sequence[str] | None = None,
+    particle: str | None = None,
 ) -> Ring:
     """The ring of a built-in lattice or of a lattice file.
 
@@ -47,11 +49,17 @@ def load_ring(
         energy: GeV; else what the file states.
         monitors, correctors: patterns of names, such as "BPM*", of elements that are monitors or
             correctors although the file does not say so: see `marked`.
+        particle: "electron" or "proton"; else what the file states, an electron where it is silent.
 
     Raises:
         LatticeError: no such file, it cannot be read, or it holds no ring.
     """
-    return marked(_loaded(name_or_path, sequence, energy), monitors, correctors)
+    ring = marked(_loaded(name_or_path, sequence, energy), monitors, correctors)
+    if particle is None:
+        return ring
+    if particle not in PARTICLES:
+        raise unknown_name("particle", particle, PARTICLES)
+    return replace(ring, mass=PARTICLES[particle])
 
 
 def _loaded(name_or_path: str | Path, sequence: str | None, energy: float | None) -> Ring:

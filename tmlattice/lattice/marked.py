@@ -6,18 +6,17 @@ Many lattice files have their monitors as plain markers, and correctors as coils
 >>> load_ring("ring.mat", correctors=["COR*", "S[FD]*"])      # coils in the sextupoles too
 """
 
-import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
 from tmlattice.errors import LatticeError, unknown_name
-from tmlattice.lattice.places import Place, corrector_pair, place_elements
+from tmlattice.lattice.places import Place, corrector_pair, halves, place_elements
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
 
 _WAY = frozenset({"marker", "drift"})
 _CORRECTORS = frozenset({"hcorrector", "vcorrector"})
-_SPLIT = frozenset({"quadrupole", "sextupole", "octupole", "multipole"})
+_SPLIT = frozenset({"quadrupole", "bend", "sextupole", "octupole", "multipole"})
 
 
 def marked(
@@ -28,7 +27,7 @@ def marked(
     """The ring with more monitors and correctors.
 
     A marker or drift becomes a monitor, read in its middle, under its own name. A marker, drift or
-    monitor gets a corrector of each plane in its place, NAME_h and NAME_v; a straight magnet is cut
+    monitor gets a corrector of each plane in its place, NAME_h and NAME_v; a magnet is cut
     into halves NAME and NAME_2 with them in between, so that the coil kicks in its middle. What is
     a monitor or corrector already stays as it is.
 
@@ -101,11 +100,9 @@ def _made(element: Element, monitor: bool, coil: bool) -> list[Place]:
         raise LatticeError(f"'{element.name}' has errors, and cannot be cut for a corrector's coil")
     if kind == "drift":
         return corrector_pair(family, length)
-    halves = [copy.deepcopy(element.source) for _ in range(2)]
-    for half in halves:
-        half.l = length / 2
+    first, second = halves(element.source)
     return [
-        (family, kind, halves[0]),
+        (family, kind, first),
         *corrector_pair(family, 0.0),
-        (f"{family}_2", kind, halves[1]),
+        (f"{family}_2", kind, second),
     ]

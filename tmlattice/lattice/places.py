@@ -1,5 +1,6 @@
 """From OCELOT objects in beam order to named elements: what all lattice readers share."""
 
+import copy
 import logging
 import math
 import warnings
@@ -62,9 +63,38 @@ def source_kind(source: Any) -> Kind:
     for classes, kind in kinds:
         if isinstance(source, classes):
             return kind
+    if type(source).__name__ == "CombinedMultipole":
+        return _strongest(source)
     if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
         return "wiggler" if "wig" in str(source.id).casefold() else "matrix"
     return "drift" if source.l else "marker"
+
+
+def halves(source: Any) -> tuple[Any, Any]:
+    """The two halves of an OCELOT element; a bend's edges stay at its ends."""
+    first, second = (copy.deepcopy(source) for _ in range(2))
+    first.l = second.l = source.l / 2
+    if hasattr(source, "e1"):
+        first.angle = second.angle = source.angle / 2
+        first.e2 = first.fintx = first.h_pole2 = 0.0
+        second.e1 = second.fint = second.h_pole1 = 0.0
+    return first, second
+
+
+RADIUS = 0.02
+"""m; where fields of several orders are compared."""
+
+
+def _strongest(source: Any) -> Kind:
+    """Of a combined multipole, by its strongest field at `RADIUS`; a thin one has no kind."""
+    fields = (
+        math.hypot(source.k0, source.k0s),
+        math.hypot(source.k1, source.k1s) * RADIUS,
+        math.hypot(source.k2, source.k2s) * RADIUS**2 / 2,
+    )
+    order = fields.index(max(fields)) if source.l and any(fields) else 0
+    kinds: tuple[Kind, ...] = ("multipole", "quadrupole", "sextupole")
+    return kinds[order]
 
 
 def place_elements(

@@ -186,6 +186,7 @@ Element.source = _Made()
 ELECTRON_GEV = 0.51099895069e-3
 PROTON_GEV = 0.93827208943
 """Rest energies, GeV. Source: CODATA 2022."""
+PARTICLES = {"electron": ELECTRON_GEV, "proton": PROTON_GEV}
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,6 @@ CLOSE = 1e-6
 Row = dict[str, Any]
 
 
-def is_tfs(path: Path) -> bool:
-    """Whether a file begins as MAD-X's tables do."""
-    with path.open("rb") as file:
-        return file.read(256).lstrip()[:2] in (b"@ ", b"* ")
-
-
 def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     """The ring of a table of MAD-X.
 

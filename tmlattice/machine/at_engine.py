@@ -11,7 +11,7 @@ Launches are OCELOT's (x, px, y, py, tau, p); AT tracks (x, px, y, py, delta, ct
 are the same: px = Px / p0, no angle. From p = dE / (p0 c) follows delta = P / p0 - 1 through
 E^2 = (P c)^2 + (m c^2)^2. tau = c t - s / beta0 and ct have the same sign, positive for a late
 particle; AT takes the speed of light for all particles: its ct is the way, beta0 c t, and what the
-velocity adds stands at the end of the line where it counts (protons).
+velocity adds stands before the cavities and at the end, where it counts (protons).
 """
 
 import copy
@@ -25,21 +25,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import c as SPEED_OF_LIGHT
 
-from tmlattice.beam.rf import rf_of
+from tmlattice.beam.rf import RELATIVISTIC, Rf, rf_of, stable_phase
 from tmlattice.effects import Cause, RingEffect, check, find
 from tmlattice.effects.build import Build
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.ring import NO_ERRORS, Ring
 from tmlattice.machine import at_orbit
-from tmlattice.machine.at_elements import ELECTRON, NOTHING, SWAPPED, Builder, expected_loss
+from tmlattice.machine.at_elements import (
+    ELECTRON,
+    NOTHING,
+    SWAPPED,
+    Builder,
+    errors_of,
+    expected_loss,
+)
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
 """What is set on purpose, by element: {"kick": rad}, {"k1_relative": 1}, {"k2_relative": 1},
 and {"rf": {"frequency_relative": 1}}."""
-
-RELATIVISTIC = 1e3
-"""Above this gamma particles of other energies are as fast, to a millionth."""
 
 TURNS_AT_ONCE = 2**22
 """AT's result is cut into blocks of so many states, so that many turns fit into memory."""
@@ -55,7 +59,8 @@ SET_ON: Mapping[str, frozenset[str]] = {
 class AtEngine:
     """A ring with its causes as a line of AT elements.
 
-    Causes of the same effect on the same element add up. A thin kick sits on the design axis,
+    Causes of the same effect on the same element add up, and to what the ring's own elements have
+    wrong (`Element.errors`). A thin kick sits on the design axis,
     whatever the offset and roll of its magnet.
 
     Args:
@@ -107,21 +112,36 @@ class AtEngine:
         self._builder = Builder(ring.energy * 1e9, steps, aperture, self._bends > 0, self._wigglers)
         self._line: list[Any] = []
         self._places: list[slice] = []  # of each element of the ring, in the line
-        nothing: Mapping[str, float] = {}
-        for i, element in enumerate(ring.elements):
-            pieces = self._builder.pieces(element, self._wrong.get(i, NOTHING), nothing)
-            self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
-            self._line += pieces
-        self._line.append(at.Marker("rf_at_the_end"))
-        if ring.gamma < RELATIVISTIC:  # AT's ct is the way: what the velocity adds
-            matrix = np.eye(6, order="F")
-            matrix[5, 4] = -ring.length / ring.gamma**2
-            self._line.append(at.M66("velocity", matrix))
+        rf = rf_of(ring, harmonic, voltage)
+        self._build(rf.places)
         self._monitors = np.array(
             [i for i, e in enumerate(self._line) if isinstance(e, at.Monitor)], dtype=np.uint32
         )
         self.expected_loss = expected_loss(ring, self._bends, self._wigglers)
-        self._set_rf(harmonic, voltage)
+        self._set_rf(rf)
+
+    def _build(self, cavities: Sequence[int]) -> None:
+        """The line. AT's ct is the way: what the velocity of slower particles adds stands before
+        the cavities, which feel it."""
+        nothing: Mapping[str, float] = {}
+        way = 0.0
+
+        def velocity() -> list[Any]:
+            if self.ring.gamma > RELATIVISTIC:
+                return []
+            matrix = np.eye(6, order="F")
+            matrix[5, 4] = -way / self.ring.gamma**2
+            return [at.M66("velocity", matrix)]
+
+        for i, element in enumerate(self.ring.elements):
+            if i in cavities:
+                self._line += velocity()
+                way = 0.0
+            pieces = self._builder.pieces(element, self._wrong.get(i, NOTHING), nothing)
+            self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
+            self._line += pieces
+            way += element.length
+        self._line += [*velocity(), at.Marker("rf_at_the_end")]
 
     def _loss(self, kind: str) -> float:
         """The scale of the loss in all elements of a kind."""
@@ -131,9 +151,8 @@ class AtEngine:
             raise LatticeError(f"AT gives every {kind} the same share of its expected loss")
         return scales.pop() if scales else 0.0
 
-    def _set_rf(self, harmonic: int | None, voltage: float | None) -> None:
-        rf = rf_of(self.ring, harmonic, voltage)
-        behind = self._places[-1].stop  # the marker at the end
+    def _set_rf(self, rf: Rf) -> None:
+        behind = len(self._line) - 1  # the marker at the end
         self._cavities = [
             self._places[i].start if i < len(self._places) else behind for i in rf.places
         ]
@@ -258,8 +277,8 @@ class AtEngine:
     def _cavity(self, there: Any, frequency_relative: float) -> Any:
         length = getattr(there, "Length", 0.0)
         frequency = self._harmonic * SPEED_OF_LIGHT / self.ring.length * (1 + frequency_relative)
-        # Above transition a late particle has too much energy: the field falls with ct.
-        phase = np.arcsin(self.expected_loss / self._voltage)
+        # Above transition a late particle has too much energy: the field falls with ct there.
+        phase = stable_phase(self.ring, float(np.arcsin(self.expected_loss / self._voltage)))
         energy = self.ring.energy * 1e9 * self.ring.beta**2  # dP / P = dE / (beta^2 E)
         return at.RFCavity(
             "rf",
@@ -332,7 +351,7 @@ def _check_setting(name: str, what: Iterable[str], known: Iterable[str]) -> None
 
 
 def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
-    """What is wrong with the elements, by place in the ring."""
+    """What is wrong with the elements, in the ring itself and by causes, by place in the ring."""
     causes = list(causes)
     check(ring, causes)
     amounts: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
@@ -341,10 +360,12 @@ def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
         if isinstance(effect, RingEffect):
             for i in effect.members(ring, cause.element):
                 amounts[i][effect.name] += cause.amount
-    wrong = {i: Build() for i in amounts}
+    wrong = {
+        i: errors_of(e, ring.energy) for i, e in enumerate(ring.elements) if e.errors != NO_ERRORS
+    }
     for i, own in amounts.items():
         for name, amount in own.items():
             effect = find(name)
             assert isinstance(effect, RingEffect)
-            effect.build(wrong[i], amount)
+            effect.build(wrong.setdefault(i, Build()), amount)
     return wrong
