@@ -30,6 +30,7 @@ check: $(VENV)/installed
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/diagnosis.py
+	$(BIN)/python benchmarks/rings.py
 
 docs: $(VENV)/installed
 	$(BIN)/mkdocs build --strict

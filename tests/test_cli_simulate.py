@@ -177,3 +177,19 @@ def test_effects_as_json(folder):
         }  # fmt: skip
     code, text = run("effects", "--json", "nowhere/effects.json")
     assert (code, "cannot write" in text) == (2, True)
+
+
+def test_a_measurement_that_is_there_is_kept_unless_forced(folder):
+    code, text = run(*QUICK, "--out", "day", "-q")
+    assert code == 0, text
+    before = {p.name: p.read_bytes() for p in (folder / "day").iterdir()}
+    for more in ([], ["--kind", "orbit-response", "--corrector", "ch::0"]):
+        code, text = run(*QUICK[:2], *more, "--seed", 2, "--out", "day", "--truth", "t.json", "-q")
+        assert code == 2
+        assert "'day' holds a measurement already" in text
+        assert "--force" in text
+        assert {p.name: p.read_bytes() for p in (folder / "day").iterdir()} == before
+        assert not (folder / "t.json").exists()
+    code, text = run(*QUICK, "--seed", 2, "--out", "day", "--force", "-q")
+    assert code == 0, text
+    assert (folder / "day" / "readings.csv").read_bytes() != before["readings.csv"]

@@ -136,7 +136,7 @@ def test_page_opens_offline_and_holds_its_figures(outcome):
     assert not {"script", "link", "iframe", "object"} & set(parser.tags)
     assert not re.search(r"https?://|url\(|@import", html)
     for words in ("QD::5", "named", "set or repair the gradient of QD::5", "as designed",
-                  "with the same remedy", "The gap", "Provenance", "false_alarm"):  # fmt: skip
+                  "the remedy is the same", "The gap", "Provenance", "false_alarm"):  # fmt: skip
         assert words in html
 
 
@@ -240,8 +240,7 @@ def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, sch
         ("located", ["no effect of the catalogue explains it", "Next: Look at what stands there",
                      "(bpm::5, QD::5, end_5)", "cannot be put into the lattice"]),
         ("nothing", ["No error is seen", "Would have been seen", "wrong strength of a quadrupole"]),
-        ("distributed", ["all along the ring", "--background all", "--reference",
-                         "Suspects, not findings"]),
+        ("distributed", ["all along the ring", "a fault that small errors hide", "--reference"]),
     ],
 )  # fmt: skip
 def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):
@@ -261,7 +260,7 @@ def test_report_says_how_much_is_closed_and_how_surely(diagnoses):
     text = " ".join(report_text(diagnoses["named"]).split())
     found = re.search(r"([\d.]+) % of the gap .* \(95 % interval ([\d.]+) to ([\d.]+) %\)", text)
     closed, low, high = map(float, found.groups())
-    assert 90 < low < closed < high < 110  # a gap of three times the noise
+    assert 90 < low < closed <= high <= 100  # a gap of three times the noise
     assert closed == pytest.approx(100 * diagnoses["named"].gap["closed"], abs=0.06)
 
 

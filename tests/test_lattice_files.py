@@ -87,6 +87,9 @@ ELEMENTS = {
     "weak bend with a sextupole": at.Dipole(
         "b", 1.0, 5e-3, 0.0, PolynomB=[0, 0, 12.0], NumIntSteps=400,
     ),
+    "hardly bent sextupole with a gradient": at.Dipole(
+        "b", 0.4, 1e-4, 0.0, PolynomB=[0, -0.5, 12.0], NumIntSteps=400,
+    ),
     "quadrupole": at.Quadrupole("q", 0.5, -0.8, NumIntSteps=400),
     "skew quadrupole": at.Quadrupole("q", 0.5, 0.0, PolynomA=[0, 0.7], NumIntSteps=400),
     "half-skew quadrupole": at.Quadrupole("q", 0.5, 0.4, PolynomA=[0, -0.7], NumIntSteps=400),
@@ -98,7 +101,23 @@ ELEMENTS = {
     "skew sextupole": at.Sextupole(
         "s", 0.3, 0.0, PolynomA=[0, 0, 25.0], PolynomB=[0, 0, 0], NumIntSteps=400
     ),
+    "sextupole with skew and gradient coils": at.Sextupole(
+        "s", 0.3, 25.0, PolynomA=[0, 0.02, 3.0], PolynomB=[0, -0.03, 25.0], NumIntSteps=400
+    ),
+    "quadrupole with every field": at.Quadrupole(
+        "q", 0.4, 1.2, PolynomA=[2e-4, 0.05, -4.0], PolynomB=[-1e-4, 1.2, 9.0], NumIntSteps=400
+    ),
+    "sextupole with corrector coils": at.Sextupole(
+        "s", 0.3, 25.0, KickAngle=[2e-4, -1e-4], NumIntSteps=400
+    ),
+    "rolled sextupole with coils": at.Sextupole(
+        "s", 0.3, 25.0, PolynomA=[1e-4, 0.3, 0], PolynomB=[2e-4, 0, 25.0], NumIntSteps=400
+    ),
+    "defocusing quadrupole with a skew trim": at.Quadrupole(
+        "q", 0.5, -0.8, PolynomA=[0, 0.01], NumIntSteps=400
+    ),
     "thin multipole": at.ThinMultipole("t", [0.0, 0.2, 3.0], [0.0, -0.3, 4.0]),
+    "thin multipole that kicks": at.ThinMultipole("t", [1e-4, 0.2, 3.0], [2e-4, -0.3, 4.0]),
     "vertical corrector": at.Corrector("v", 0.3, [0.0, 2e-4]),
     "horizontal corrector": at.Corrector("h", 0.0, [2e-4, 0.0]),
     "corrector of both planes": at.Corrector("hv", 0.3, [2e-4, -1e-4]),
@@ -108,7 +127,8 @@ ELEMENTS = {
 psi = 0.3
 turn = np.eye(6)
 turn[:4, :4] = np.kron([[np.cos(psi), np.sin(psi)], [-np.sin(psi), np.cos(psi)]], np.eye(2))
-ELEMENTS["rolled quadrupole"].R1, ELEMENTS["rolled quadrupole"].R2 = turn, turn.T
+for rolled in ("rolled quadrupole", "rolled sextupole with coils"):
+    ELEMENTS[rolled].R1, ELEMENTS[rolled].R2 = turn, turn.T
 
 
 @pytest.mark.filterwarnings("ignore:.*beyond its first-order matrix")
@@ -119,11 +139,11 @@ def test_element_moves_a_particle_as_in_at(what):
     A strong bend is compared to first order: AT leaves out second-order terms of its edges and of
     curvature times gradient, which OCELOT has.
     """
-    from tmlattice import element_map
+    from tmlattice.maps.magnets import way_map
 
     lattice = at.Lattice([ELEMENTS[what].deepcopy()], energy=ENERGY * 1e9, periodicity=1)
     ring = ring_from_at(lattice, what)
-    map_ = element_map(ring.elements[0], ENERGY)
+    map_ = way_map(ring.elements, ENERGY)
     big, tolerance = (1e-7, 1e-13) if what.startswith("bend") else (1e-4, 5e-10)
     starts = np.array([[big, 0, 0, 0], [0, big, 0, 0], [0, 0, big, 0], [0, 0, 0, big],
                        [big, -big, big, big], [0, 0, 0, 0]])  # fmt: skip
@@ -185,7 +205,7 @@ def test_what_is_left_out_is_warned_of_once():
         ring_from_at(lattice, "x")
     assert len(caught) == 1
     assert "(2)" in str(caught[0].message)
-    assert "higher orders" in str(caught[0].message)
+    assert "above the sextupole" in str(caught[0].message)
 
 
 def test_madx_tunes_vs_at_reading_and_kinds(tmp_path):
@@ -198,7 +218,7 @@ def test_madx_tunes_vs_at_reading_and_kinds(tmp_path):
             element.NumIntSteps = 100  # AT's default of 10 is 1e-6 off in these strong magnets
     np.testing.assert_allclose(tunes(ring_matrix(ring)), at.get_tune(lattice), rtol=0, atol=1e-7)
     counts = ring.counts()
-    wanted = {"quadrupole": 16, "bend": 16, "sextupole": 16, "hcorrector": 16, "vcorrector": 8,
+    wanted = {"quadrupole": 16, "bend": 16, "sextupole": 16, "hcorrector": 16, "vcorrector": 16,
               "monitor": 16, "marker": 8, "cavity": 8}  # fmt: skip
     assert {kind: counts[kind] for kind in wanted} == wanted
     assert ring.length == pytest.approx(64.0)
@@ -283,7 +303,7 @@ def test_files_with_no_ring_end_in_one_sentence(tmp_path):
     with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
         load_ring(write(tmp_path, "e.mat", "no matlab"))
     with pytest.raises(LatticeError, match="no lattice file that can be read"):
-        load_ring(write(tmp_path, "f.lte", ""))
+        load_ring(write(tmp_path, "f.xyz", ""))
 
 
 @pytest.fixture(scope="module")

@@ -82,7 +82,7 @@ VALID = jsonschema.Draft202012Validator(schema("measurement"))
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(measurements())
 def test_trajectory_reads_back_bit_by_bit(tmp_path, measurement):
-    write_measurement(tmp_path / "m", measurement)
+    write_measurement(tmp_path / "m", measurement, force=True)
     same(measurement, read_measurement(tmp_path / "m"))
     document = json.loads((tmp_path / "m" / "measurement.json").read_text(encoding="utf-8"))
     VALID.validate(document)
@@ -100,7 +100,7 @@ def test_orbit_response_reads_back_bit_by_bit(tmp_path, response, orbit, kicks, 
     step = RfStep(499664399.423, 3840, -3000.0, orbit) if rf else None
     given = OrbitResponse(("h,1", "v", "w::1"), tuple("xyx"), kicks, ("a", "b"), response,
                           ((1e-6, 2e-6)), step, "petra3", 6.0)  # fmt: skip
-    write_measurement(tmp_path / "m", given)
+    write_measurement(tmp_path / "m", given, force=True)
     read = read_measurement(tmp_path / "m")
     same(given, read)
     if step is None:
@@ -481,7 +481,7 @@ def test_stopped_writer_leaves_the_old_folder(folder):
     before = {p.name: p.read_bytes() for p in there.iterdir()}
 
     def fail():
-        with measurement_writer(there, ["a"]) as writer:
+        with measurement_writer(there, ["a"], force=True) as writer:
             writer.add(0, np.zeros(5), None, None, np.zeros((1, 1, 2)))
             writer.add(0, np.zeros(5), None, None, np.zeros((1, 1, 2)))
 

@@ -99,6 +99,27 @@ def test_millimetres_taken_for_metres_are_refused(tmp_path, ring_data):
     np.testing.assert_allclose(m.readings, 1e-3 * ring_data, rtol=1e-7)
 
 
+def test_a_turn_by_turn_files_unit_can_be_said(tmp_path, ring_data):
+    written(tmp_path / "b.sdds", ring_data, "lhc")
+    m = read_measurement(tmp_path / "b.sdds", turn_by_turn="lhc", unit="mm")
+    np.testing.assert_allclose(m.readings, 1e-3 * ring_data, rtol=1e-7)
+
+
+def test_more_turns_than_a_file_states_are_read(tmp_path, ring_data, monkeypatch):
+    """As of the SPS: 201 columns where 200 turns are stated; monitors of one plane each."""
+    import turn_by_turn as tbt
+
+    x = pd.DataFrame(ring_data[0, :, :2, 0].T, index=["BPH.1", "BPH.2"])
+    y = pd.DataFrame(ring_data[0, :, 2:, 1].T, index=["BPV.1"])
+    stated = tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 29, bunch_ids=[0])
+    monkeypatch.setattr(tbt, "read", lambda path, datatype: stated)
+    (tmp_path / "a.sdds").touch()
+    m = read_turn_by_turn(tmp_path / "a.sdds", "sps", unit="mm")
+    assert m.readings.shape == (1, 30, 3, 2)
+    np.testing.assert_allclose(m.readings[0, :, 2, 1], 1e-3 * ring_data[0, :, 2, 1])
+    assert np.isnan(m.readings[0, :, 2, 0]).all()
+
+
 def test_turn_by_turn_files_that_cannot_be_read(tmp_path, ring_data):
     with pytest.raises(MeasurementError, match="no turn-by-turn file"):
         read_turn_by_turn(tmp_path / "nothing.sdds")

@@ -397,7 +397,7 @@ def test_options_that_have_no_meaning(tmp_path, measured):
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("ring.mat", "does not end in .json"), ("nowhere/ring.json", "cannot write")],
+    [("ring.mat", "names no format; end it in .json"), ("nowhere/ring.json", "cannot write")],
 )
 def test_the_lattice_s_place_is_checked_before_the_work(
     tmp_path, measured, monkeypatch, name, said

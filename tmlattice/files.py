@@ -52,13 +52,21 @@ def output_folder(folder: Path) -> Iterator[Path]:
 def output_file(path: Path) -> Iterator[Path]:
     """A temporary path in the file's folder, moved to `path` when all went well.
 
+    What a link points to is replaced, not the link; a device or a pipe is written to.
+
     Raises:
         OutputError: the folder is not there or cannot be written.
     """
-    path = path.absolute()
+    path = path.resolve() if path.is_symlink() else path.absolute()
     try:
         if path.is_dir():
             raise OutputError(f"'{path}' is a folder; name a file")
+        if path.exists() and not path.is_file():
+            with tempfile.TemporaryDirectory(prefix="tmlattice-") as folder:
+                yield Path(folder) / path.name
+                with (Path(folder) / path.name).open("rb") as made, path.open("wb") as device:
+                    shutil.copyfileobj(made, device)
+            return
         descriptor, name = tempfile.mkstemp(prefix=".tmlattice-", dir=path.parent)
         os.close(descriptor)
     except OSError as error:

@@ -19,7 +19,8 @@ def among_small_errors(small_ring):
     ]
     small = {"quadrupole_gradient": 5e-3, "quadrupole_offset_y": 1e-5}
     data = simulate(small_ring, causes, background=small, **SHOTS).measurement()
-    return causes, diagnose(small_ring, data, max_effects=3)
+    # told that there are no small errors, so that nothing explains the data
+    return causes, diagnose(small_ring, data, max_effects=3, background={})
 
 
 def test_strong_faults_among_small_errors_are_suspects_and_no_findings(
@@ -42,6 +43,15 @@ def test_page_lists_suspects(among_small_errors):
     html = page(among_small_errors[1], [])
     assert "Not findings" in html
     assert "end_3" in html
+
+
+def test_small_errors_that_explain_all_leave_suspects(small_ring):
+    small = {"quadrupole_gradient": 0.02, "quadrupole_offset_x": 1e-4}
+    data = simulate(small_ring, [], background=small, **SHOTS).measurement()
+    result = diagnose(small_ring, data)
+    assert result.verdict == "distributed"
+    assert result.suspects
+    assert all(one.statistic >= 9 for one in result.suspects)  # three sigma, looked at alone
 
 
 def test_named_verdict_has_no_suspects(small_ring):

@@ -28,8 +28,6 @@ from tmlattice.maps.taylor import second_derivatives
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-ELECTRON_GEV = 0.51099895069 * 1e-3
-"""Electron mass, CODATA 2022: scipy's table of constants takes 0.2 s to import."""
 KICK = 1e-4
 """Of the central differences of a corrector's map, rad; the maps are linear in the kick."""
 CORRECTORS = {"hcorrector": "x", "vcorrector": "y"}
@@ -140,8 +138,7 @@ class ResponseModel:
     @property
     def slip(self) -> float:
         """d (c T) / d (relative frequency) of the RF's turn T = harmonic / frequency, m."""
-        gamma = self.ring.energy / ELECTRON_GEV
-        return -self.ring.length / float(np.sqrt(1 - gamma**-2))
+        return -self.ring.length / self.ring.beta
 
     @cached_property
     def correctors(self) -> tuple[str, ...]:

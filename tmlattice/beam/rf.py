@@ -1,9 +1,10 @@
 """The RF of a ring: where its cavities are, their voltage and frequency, and what they give.
 
 A cavity gives a particle p += V / (p0 c) sin(phase - 2 pi f tau / c): above transition, where a
-late particle (tau > 0) has too much energy, it must be given less. The phase makes good what the
-design orbit loses. A frequency other than the ring's own slips against the turns by
-L df / (f + df) each: on the first one it meets the beam at the design's phase.
+late particle (tau > 0) has too much energy, it must be given less; below, where it has too little,
+pi - phase gives it more. The phase makes good what the design orbit loses. A frequency other than
+the ring's own slips against the turns by L df / (f + df) each: on the first one it meets the beam
+at the design's phase.
 
 What a lattice does not say comes from a rule. The harmonic number is the one nearest to 499.65 MHz,
 the frequency of most light sources (a circumference that fits 500 MHz fits it too, unless it is
@@ -22,10 +23,13 @@ from numpy.typing import NDArray
 from tmlattice.effects import Settings, expected_loss
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import Ring
+from tmlattice.maps import ring_maps
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 FREQUENCY = 499.65e6
 """Hz; where neither a cavity nor the caller says otherwise."""
+RELATIVISTIC = 1e3
+"""Above this gamma particles of other energies are as fast, to a millionth."""
 OVERVOLTAGE = 4.0
 """Voltage of the RF over the loss of a turn, where no cavity says otherwise."""
 
@@ -51,8 +55,8 @@ class Rf:
         return self.own or loss > 0 or frequency != 0
 
     def frequency(self, ring: Ring) -> float:
-        """Hz, of a beam at the speed of light on the design orbit."""
-        return float(self.harmonic * SPEED_OF_LIGHT / ring.length)
+        """Hz, of a beam on the design orbit; that of light for electrons, at their energies."""
+        return float(self.harmonic * speed_of(ring) / ring.length)
 
 
 def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None) -> Rf:
@@ -70,14 +74,36 @@ def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None)
     sources = [elements[i].source for i in cavities]
     if harmonic is None:
         known = [f for f in (float(getattr(s, "freq", 0.0)) for s in sources) if f]
-        harmonic = round((known[0] if known else FREQUENCY) * ring.length / SPEED_OF_LIGHT)
+        harmonic = round((known[0] if known else FREQUENCY) * ring.length / speed_of(ring))
     if voltage is None:
         voltage = 1e9 * sum(float(getattr(s, "v", 0.0)) for s in sources)  # OCELOT's are GV
         if not voltage:
-            loss = sum(expected_loss(e, ring.energy) for e in elements)
+            loss = sum(expected_loss(e, ring.energy) for e in elements) if ring.radiates else 0.0
             voltage = OVERVOLTAGE * loss * ring.energy * 1e9
     places = tuple(cavities or named[:1] or [len(elements)])
     return Rf(places, max(harmonic, 1), voltage, bool(cavities))
+
+
+def stable_phase(ring: Ring, phase: float) -> float:
+    """The phase, or below transition the other one of the same gain.
+
+    A turn's time grows with the energy by R_tau,p and by what the dispersion does, to first order.
+    Electrons are above transition in every ring.
+    """
+    if ring.gamma > RELATIVISTIC:
+        return phase
+    maps = ring_maps(ring, 6)
+    turn = np.eye(6)
+    for own in (*maps.W1, maps.closing.coefficients[1]):
+        turn = own @ turn
+    dispersion = np.linalg.solve(np.eye(4) - turn[:4, :4], turn[:4, 5])
+    late = turn[4, :4] @ dispersion + turn[4, 5]
+    return phase if late > 0 else float(np.pi) - phase
+
+
+def speed_of(ring: Ring) -> float:
+    """m/s; that of light where particles are as fast to 1e-6, as the lattices of electrons say."""
+    return SPEED_OF_LIGHT * (ring.beta if ring.beta < 1 - 1e-6 else 1.0)
 
 
 def frequency_of(settings: Settings) -> float:
@@ -124,15 +150,16 @@ def cavities(
     """
     if not rf.on(loss, frequency) or rf.voltage == 0:
         return NO_RF
-    crest = rf.voltage / (ring.energy * 1e9)
+    crest = rf.voltage / (ring.energy * 1e9 * ring.beta)
     if loss >= crest:
         raise LatticeError(
             f"an RF of {rf.voltage / 1e6:.3g} MV cannot make good a loss of "
             f"{loss * ring.energy * 1e3:.3g} MeV a turn; give the ring's cavities their voltage"
         )
-    wave = 2 * np.pi * rf.harmonic / ring.length * (1 + frequency)
-    slip = ring.length * frequency / (1 + frequency)
+    wave = 2 * np.pi * rf.harmonic / ring.length * ring.beta * (1 + frequency)
+    slip = ring.length / ring.beta * frequency / (1 + frequency)
     end = len(ring.magnets) + 1
     exits = [int(layer_of[i]) if i < len(ring.elements) else end for i in rf.places]
-    values = np.array([crest / len(exits), np.arcsin(max(loss, 0.0) / crest), wave, slip])
+    phase = stable_phase(ring, float(np.arcsin(max(loss, 0.0) / crest)))
+    values = np.array([crest / len(exits), phase, wave, slip])
     return Cavities(np.array(exits, dtype=np.int64), values)

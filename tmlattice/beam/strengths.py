@@ -40,7 +40,7 @@ class Strength:
         name: of the magnet.
         attribute: k1 or k2.
         elements: what the layer is made of; the magnet is the last.
-        energy: GeV.
+        energy: `Ring.map_energy`, GeV.
     """
 
     layer: int
@@ -77,7 +77,7 @@ def strengths_of(ring: Ring, kinds: Sequence[str] = ("quadrupole", "sextupole"))
         TmlatticeError: the ring has none.
     """
     found = [
-        Strength(k, e[-1].name, ATTRIBUTES[e[-1].kind], e, ring.energy)
+        Strength(k, e[-1].name, ATTRIBUTES[e[-1].kind], e, ring.map_energy)
         for k, e in enumerate(layer_elements(ring))
         if e[-1].kind in kinds and getattr(e[-1], ATTRIBUTES[e[-1].kind]) != 0
     ]

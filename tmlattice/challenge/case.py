@@ -100,7 +100,7 @@ def write_case(folder: Path, case: Case, truth: Truth) -> None:
     for name in ("fit", "heldout", "reference"):
         measurement = getattr(case, name)
         if measurement is not None:
-            write_measurement(own / name, measurement)
+            write_measurement(own / name, measurement, force=True)
     _write_truth(folder / "truth", truth)
     document = {
         "format": PUBLIC,

@@ -70,6 +70,7 @@ def make(
     amount: float | None = None,
     signal: tuple[float, float] = SIGNAL,
     background: Mapping[str, float | None] | None = None,
+    told: bool = False,
     progress: bool = True,
 ) -> dict[str, int]:
     """Make a challenge; cases that are there already are kept.
@@ -88,6 +89,7 @@ def make(
         signal: smallest and largest signal to noise.
         background: tier B, rms of the small errors by effect (None: the catalogue's own); every
             usual one if not given.
+        told: the diagnosis is told those sizes; else it has to learn them.
         progress: show a bar where there is a terminal.
 
     Returns:
@@ -117,6 +119,8 @@ def make(
         "signal": list(signal),
         "background": rms,
     }
+    if tier == "B":
+        public["told"] = told
     if (folder / "challenge.json").exists():
         if read_set(folder) != public:
             raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
@@ -131,7 +135,18 @@ def make(
         if name in there:
             continue
         draw = CaseDraw(
-            ring, lattice, tier, seed, number, reference, shots, chosen, amount, signal, rms
+            ring,
+            lattice,
+            tier,
+            seed,
+            number,
+            reference,
+            shots,
+            chosen,
+            amount,
+            signal,
+            rms,
+            told,
         )
         case, truth = draw.make(name)
         write_case(folder, case, truth)
@@ -158,6 +173,7 @@ class CaseDraw:
         amount: float | None = None,
         signal: tuple[float, float] = SIGNAL,
         background: Mapping[str, float] | None = None,
+        told: bool = False,
     ) -> None:
         self.ring, self.lattice, self.tier = ring, lattice, tier
         self.effects = names(effects)
@@ -176,6 +192,7 @@ class CaseDraw:
         before = self._draw_shots(shots, self.seed + 1)
         self.before = before if reference else None
         self.background = dict(background or {})
+        self.told = told
         self.small = draw_background(ring, self.background, self.seed)
         self.unreachable: list[Drawn] = []
 
@@ -199,7 +216,7 @@ class CaseDraw:
             settings = (*self.before.settings, *settings)
             before = len(self.before)
         options: dict[str, Any] = {}
-        if self.background:
+        if self.background and self.told:
             options["background"] = self.background
         causes: list[Cause] = []
         unknown: dict[str, Any] | None = None

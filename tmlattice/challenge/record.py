@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.diagnosis.remedies import leading, remedies_of
+from tmlattice.diagnosis.remedies import leading, pieces_of, remedies_of
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
@@ -115,7 +115,8 @@ def one_remedy(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | No
     if result["verdict"] != "named" or len(result["findings"]) != 1:
         return False
     told, true = result["findings"][0]["remedy"], leading(ring, cause)
-    return (told["effect"], told["element"]) == (true.effect, true.element)
+    places = (pieces_of(ring, name) for name in (told["element"], true.element))
+    return told["effect"] == true.effect and next(places) == next(places)
 
 
 def oracle_one_remedy(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
@@ -128,13 +129,14 @@ def oracle_one_remedy(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bo
     if not oracle["detected"] or first is None or first.probability < DEFAULT.mass:
         return False
     true = leading(ring, cause)
-    return (first.effect, first.element) == (true.effect, true.element)
+    return (first.effect, first.pieces) == (true.effect, pieces_of(ring, true.element))
 
 
 def column(result: Mapping[str, Any], cause: Cause) -> str:
     """The column of the confusion table."""
     if not result["findings"]:
-        return "unknown" if result["verdict"] == "distributed" else "nothing"
+        refused = result["verdict"] == "distributed" and not result.get("priors")
+        return "unknown" if refused else "nothing"
     finding = result["findings"][0]
     if finding["effect"] is None:
         return "unknown"

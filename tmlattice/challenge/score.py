@@ -169,7 +169,8 @@ def row_of(
 def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
     findings = list(answer["findings"])
     first = findings[0] if findings else None
-    row: Row = {"detected": bool(findings) or answer["verdict"] == "distributed"}
+    small = bool(answer.get("priors"))  # errors everywhere are no fault
+    row: Row = {"detected": bool(findings) or (answer["verdict"] == "distributed" and not small)}
     if len(truth.causes) == 1:
         return row | finding_row(first, truth.causes[0], places)
     if truth.unknown is not None and truth.unknown.get("element"):
@@ -181,6 +182,8 @@ def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
 def _refused(result: Mapping[str, Any]) -> bool:
     """Whether something is there and the catalogue is said not to hold it."""
     unnamed = any(finding["effect"] is None for finding in result["findings"])
+    if result.get("priors") and not result["findings"]:
+        return False
     return result["verdict"] in REFUSED or unnamed
 
 

@@ -68,6 +68,7 @@ def _cluster_options(function: Any) -> Any:
 )
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
 @background_option("Tier B: small errors everywhere")
+@click.option("--told", is_flag=True, help="Tier B: the diagnosis is told those sizes.")
 @quiet_option
 def make(
     tier: str,

@@ -7,10 +7,12 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
     assume_option,
     console,
     json_option,
     lattice_options,
+    open_ring,
     quiet_option,
 )
 
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 WRONG = 1
 
 
-@click.command("check")
+@click.command("check", cls=Careful)
 @click.argument("lattice")
 @click.argument("measurement", type=FILE)
 @lattice_options
@@ -54,11 +56,10 @@ def check(
 
     with output_file(json_file) if json_file else nullcontext() as path:
         from tmlattice.diagnosis.doctor import check_data
-        from tmlattice.lattice import load_ring
         from tmlattice.measurement import read_measurement
 
         data = read_measurement(measurement)
-        ring = load_ring(lattice, sequence, energy)
+        ring = open_ring(lattice, sequence, energy)
         try:
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
         except (MeasurementError, UnknownNameError) as error:

@@ -12,6 +12,7 @@ from tmlattice.cli.challenge import challenge
 from tmlattice.cli.check import check
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
+from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
 from tmlattice.cli.predict import predict
 from tmlattice.cli.reproduce import reproduce
@@ -30,14 +31,16 @@ def tmlattice() -> None:
     """The gap between the model of a storage ring and the ring itself.
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
-    .repr), MAD-X (.seq, .madx) or the package's own JSON. OCELOT's files are Python code and are
-    run, and AT's .m and .repr are evaluated: load only files that you trust.
+    .repr), MAD-X (.seq, .madx, or a TWISS table: .tfs, .twiss, .dat), elegant (.lte), Xsuite
+    (.json) or the package's own JSON. OCELOT's files are Python code and are run, and AT's .m and
+    .repr, MAD-X's and elegant's are evaluated: load only files that you trust.
     """
 
 
 tmlattice.add_command(tune_fit)
 tmlattice.add_command(info)
 tmlattice.add_command(study)
+tmlattice.add_command(import_files)
 tmlattice.add_command(simulate)
 tmlattice.add_command(effects)
 tmlattice.add_command(check)

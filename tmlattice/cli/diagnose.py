@@ -9,12 +9,14 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
     NameList,
     assume_option,
     background_option,
     console,
     json_option,
     lattice_options,
+    open_ring,
     quiet_option,
     trajectories,
 )
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from tmlattice.measurement import Measurement
 
 
-@click.command("diagnose")
+@click.command("diagnose", cls=Careful)
 @click.argument("lattice")
 @click.argument("measurement", type=FILE)
 @lattice_options
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="A measurement of the same machine before the fault: static errors cancel.",
 )
-@background_option("Small errors that the machine has everywhere")
+@background_option("Small errors everywhere (not given: the data say)")
 @assume_option
 @click.option(
     "--max-effects",
@@ -81,8 +83,17 @@ if TYPE_CHECKING:
     "--lattice-out",
     type=FILE,
     metavar="FILE",
-    help="Of an orbit response: the ring with its errors, in the package's JSON; FILE"
-    ".calibration.json beside it holds what monitors and correctors do (`tmlattice predict`).",
+    help="The ring as found, with its errors: .json (the package's own), .at.json (AT), .madx or "
+    ".seq (MAD-X), .py (OCELOT). FILE.calibration.json beside it holds what monitors and "
+    "correctors do (`tmlattice predict`).",
+)
+@click.option(
+    "--repaired-out",
+    type=FILE,
+    metavar="FILE",
+    help="The ring repaired, in the same formats: the design with the settings that, loaded into "
+    "the machine as found, make it the design again (a quadrupole that gives 20 % less is told "
+    "25 % more). What no setting mends is printed.",
 )
 @json_option
 @click.option(
@@ -102,6 +113,7 @@ def diagnose(
     effects: tuple[str, ...] | None,
     network: Path | None,
     lattice_out: Path | None,
+    repaired_out: Path | None,
     missing: bool,
     assumed: tuple[str, ...],
     json_file: Path | None,
@@ -124,7 +136,6 @@ def diagnose(
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
         from tmlattice.effects import background_rms, names
-        from tmlattice.lattice import load_ring
 
         if effects is not None:
             names(effects)  # a wrong name is known before the work
@@ -140,13 +151,16 @@ def diagnose(
             )  # fmt: skip
             options["missing"] = missing
         else:
-            _refuse("first turns", lattice_out=lattice_out, missing=missing)
+            _refuse("first turns", missing=missing)
             before = None if reference is None else trajectories(reference, "; give first turns")
             options |= {"reference": before, "background": dict(background) or None}
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
-        ring = load_ring(lattice, sequence, energy)
-        if lattice_out:
-            _check_lattice_out(ring, lattice_out)
+        ring = open_ring(lattice, sequence, energy)
+        if lattice_out and lattice_out == repaired_out:
+            raise click.UsageError(f"--lattice-out and --repaired-out are both '{lattice_out}'")
+        for option, path in (("lattice", lattice_out), ("repaired", repaired_out)):
+            if path:
+                _check_out(ring, f"--{option}-out", path)
         with _progress(quiet) as progress:
             where = str(measurement) if reference is None else f"{measurement} or {reference}"
             result = _diagnosed(
@@ -157,11 +171,12 @@ def diagnose(
                 assert isinstance(data, Measurement)
                 progress("network")
                 reading = _weights(ring, network, data, assumed)
-            _write(result, str(measurement), folder, extra, lattice_out, progress)
+            _write(result, str(measurement), folder, extra, progress)
+            written = _write_rings(result, lattice_out, repaired_out)
             if folder and reading:
                 _write_weights(reading, folder)
     if not quiet:
-        _print(result, out, json_file, lattice_out)
+        _print(result, out, json_file, written)
         if reading:
             _print_weights(ring, reading)
 
@@ -171,25 +186,42 @@ def _write(
     measurement: str,
     folder: Path | None,
     extra: Path | None,
-    lattice_out: Path | None,
     progress: Callable[[str], None],
 ) -> None:
     """What was asked for."""
     from tmlattice.files import write_json
-    from tmlattice.lattice import save_ring
-    from tmlattice.observe.calibration import write_calibration
 
     document = result.as_json()
     document["provenance"] = {**document["provenance"], "measurement": measurement}
-    if lattice_out:
-        save_ring(result.repaired, lattice_out)
-        write_calibration(calibration_beside(lattice_out), result.calibration)
     if folder:
         progress("figures")
         _write_folder(result, folder, document["provenance"])
         write_json(folder / "diagnosis.json", document)
     if extra:
         write_json(extra, document)
+
+
+def _write_rings(
+    result: "Diagnosis", lattice_out: Path | None, repaired_out: Path | None
+) -> dict[str, tuple[str, ...]]:
+    """The ring as found and the ring repaired: the files, with what they do not hold."""
+    from tmlattice.lattice import write_ring
+    from tmlattice.observe.calibration import write_calibration
+    from tmlattice.report.remedies import by_hand_text
+
+    written: dict[str, tuple[str, ...]] = {}
+    if lattice_out:
+        written[str(lattice_out)] = write_ring(result.as_found, lattice_out)
+        if result.calibration or result.kind != "trajectory":
+            beside = calibration_beside(lattice_out)
+            write_calibration(beside, result.calibration)
+            written[str(beside)] = ()
+    if repaired_out:
+        ring, by_hand = result.repair()
+        told = write_ring(ring, repaired_out)
+        more = by_hand_text(result.ring, by_hand)
+        written[str(repaired_out)] = (*told, more) if more else told
+    return written
 
 
 def _refuse(kind: str, **given: Any) -> None:
@@ -199,19 +231,20 @@ def _refuse(kind: str, **given: Any) -> None:
             raise click.UsageError(f"--{name.replace('_', '-')} has no meaning for {kind}")
 
 
-def _check_lattice_out(ring: "Ring", path: Path) -> None:
+def _check_out(ring: "Ring", option: str, path: Path) -> None:
     """Whether the ring can be written there, before minutes of work."""
     from tempfile import TemporaryDirectory
 
     from tmlattice.files import check_writable
-    from tmlattice.lattice import save_ring
+    from tmlattice.lattice import write_ring
+    from tmlattice.lattice.write import SUFFIXES, knows
 
-    if path.suffix.lower() != ".json":
-        raise click.UsageError(f"--lattice-out '{path}' does not end in .json; name a .json file")
+    if not knows(path):
+        raise click.UsageError(f"{option} '{path}' names no format; end it in {SUFFIXES}")
     for file in (path, calibration_beside(path)):
         check_writable(file)
     with TemporaryDirectory() as folder:
-        save_ring(ring, Path(folder) / path.name)
+        write_ring(ring, Path(folder) / path.name)
 
 
 def calibration_beside(lattice: Path) -> Path:
@@ -293,7 +326,10 @@ def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any])
 
 
 def _print(
-    result: "Diagnosis", out: Path | None, json_file: Path | None, lattice_out: Path | None
+    result: "Diagnosis",
+    out: Path | None,
+    json_file: Path | None,
+    rings: dict[str, tuple[str, ...]],
 ) -> None:
     from tmlattice.report.plain import report_text
 
@@ -315,7 +351,9 @@ def _print(
     screen.print(f"\n{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s")
     written = [f"{out}/: report.html, report.txt, diagnosis.json, figures"] if out else []
     written += [str(json_file)] if json_file else []
-    if lattice_out:
-        written += [str(lattice_out), str(calibration_beside(lattice_out))]
+    written += rings
     if written:
         screen.print(f"written: {'; '.join(written)}", soft_wrap=True)
+    for file, told in rings.items():
+        for sentence in told:
+            screen.print(f"{file}: {sentence}", soft_wrap=True)

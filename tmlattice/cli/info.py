@@ -5,10 +5,18 @@ from typing import Any
 
 import click
 
-from tmlattice.cli.options import console, json_option, lattice_argument, quiet_option, table
+from tmlattice.cli.options import (
+    Careful,
+    console,
+    json_option,
+    lattice_argument,
+    open_ring,
+    quiet_option,
+    table,
+)
 
 
-@click.command("info")
+@click.command("info", cls=Careful)
 @lattice_argument
 @json_option
 @quiet_option
@@ -32,19 +40,20 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
     from tmlattice import __version__
     from tmlattice.beam.chain import Chain
     from tmlattice.errors import UnstableRingError
-    from tmlattice.lattice import load_ring
     from tmlattice.optics import off_momentum, twiss
 
-    ring = load_ring(lattice, sequence, energy)
+    ring = open_ring(lattice, sequence, energy, read=False)
     facts: dict[str, Any] = {
         "format": "tmlattice-info",
         "version": 1,
         "package": __version__,
         "lattice": ring.name,
         "energy_gev": ring.energy,
+        "mass_gev": ring.mass,
         "length": ring.length,
         "counts": dict(sorted(ring.counts().items())),
         "layers": len(ring.magnets),
+        "magnets_in_pieces": len(ring.slices),
         "bend_angle": sum(e.angle for e in ring.elements if e.kind == "bend"),
         "tunes": None,
         "chromaticity": None,
@@ -58,24 +67,30 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
         energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
-        facts["chromaticity"] = energy_effects.chromaticity.tolist()
-        facts["dispersion_max"] = abs(energy_effects.dispersion).max(axis=0).tolist()
-        facts["momentum_compaction"] = energy_effects.momentum_compaction
+        # per momentum, not per energy dE / (p0 c) = beta delta; and of the path, not of its time
+        beta, lag = (1.0, 0.0) if ring.gamma > 1e3 else (ring.beta, ring.gamma**-2)
+        facts["chromaticity"] = (beta * energy_effects.chromaticity).tolist()
+        facts["dispersion_max"] = (beta * abs(energy_effects.dispersion)).max(axis=0).tolist()
+        facts["momentum_compaction"] = beta**2 * energy_effects.momentum_compaction + lag
     except UnstableRingError as error:
         facts["problem"] = str(error)
     return facts
 
 
 def _print(facts: dict[str, Any]) -> None:
+    heavy = facts["mass_gev"] > 1e-3
+    particle = f" (particles of {facts['mass_gev']:.6g} GeV)" if heavy else ""
     screen = console()
     screen.print(
-        f"{facts['lattice']}: {facts['length']:.4f} m, {facts['energy_gev']:g} GeV, "
+        f"{facts['lattice']}: {facts['length']:.4f} m, {facts['energy_gev']:g} GeV{particle}, "
         f"{facts['layers']} magnets, bends sum to {facts['bend_angle']:.9f} rad"
     )
     counts = table("elements", "count")
     for kind, count in facts["counts"].items():
         counts.add_row(kind, str(count))
     screen.print(counts)
+    if facts["magnets_in_pieces"]:
+        screen.print(f"{facts['magnets_in_pieces']} magnets stand in two pieces or more")
     if facts["tunes"] is not None:
         optics = table("optics", "x", "y")
         rows = [

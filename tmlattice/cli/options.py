@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
 
 FILE = click.Path(path_type=Path)
@@ -80,7 +81,7 @@ def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[...
         type=BackgroundText(),
         multiple=True,
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
-        "one.",
+        "one, or `none`.",
     )
 
 
@@ -101,9 +102,80 @@ class NameList(click.ParamType):  # type: ignore[type-arg]
         return names
 
 
+INPUTS = ("lattice", "measurement", "reference", "calibration", "settings_file")
+MARKS = ("monitors", "correctors", "particle")
+OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out")
+OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv")
+
+
+class Careful(click.Command):
+    """A command that does not write over what it reads."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run it, unless an output is an input.
+
+        Raises:
+            OutputError: it is.
+        """
+        from tmlattice.files import OutputError
+
+        given = [Path(str(ctx.params[name])) for name in INPUTS if ctx.params.get(name)]
+        read = {path.resolve() for path in given if path.exists()}
+        read |= {path.resolve() / name for path in given for name in OF_MEASUREMENTS}
+        for name in OUTPUTS:
+            out = ctx.params.get(name)
+            if out and Path(out).resolve() in read and not Path(out).is_dir():
+                raise OutputError(f"'{out}' is read, and would be written over; name another file")
+        return super().invoke(ctx)
+
+
+def _remember(context: click.Context, option: click.Parameter, value: Any) -> None:
+    context.meta[f"tmlattice.{option.name}"] = value
+
+
+def open_ring(
+    lattice: str, sequence: str | None, energy: float | None, read: bool = True
+) -> "Ring":
+    """The ring that a command's lattice options name; a part of a ring is told.
+
+    Args:
+        lattice, sequence, energy: see `load_ring`.
+        read: the command needs monitors.
+
+    Raises:
+        LatticeError: no such ring, or one without monitors.
+    """
+    from tmlattice.lattice import load_ring
+    from tmlattice.lattice.checks import need_monitors, no_whole_turn
+
+    ring = load_ring(lattice, sequence, energy, **marks())
+    if read:
+        need_monitors(ring)
+    if told := no_whole_turn(ring):
+        click.echo(f"tmlattice: warning: {told}", err=True)
+    return ring
+
+
+def marks() -> dict[str, Any]:
+    """What `--monitors`, `--correctors` and `--particle` of the running command say, if they do."""
+    meta = click.get_current_context().meta
+    said = {name: meta.get(f"tmlattice.mark_{name}") for name in MARKS}
+    return {name: value for name, value in said.items() if value}
+
+
 def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Which sequence of the lattice, at which energy."""
+    """Which sequence of the lattice, at which energy, and what is a monitor or a corrector."""
     for decorate in (
+        click.option("--correctors", "mark_correctors", multiple=True, metavar="PATTERN",
+                     expose_value=False, callback=_remember,
+                     help="Elements that are correctors too, such as 'COR*'; see --monitors."),
+        click.option("--monitors", "mark_monitors", multiple=True, metavar="PATTERN",
+                     expose_value=False, callback=_remember,
+                     help="Elements that are monitors although the file has them as markers or "
+                     "drifts, such as 'BPM*'; several with commas."),
+        click.option("--particle", "mark_particle", type=click.Choice(["electron", "proton"]),
+                     expose_value=False, callback=_remember,
+                     help="Else what the lattice states."),
         click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
                      help="Beam energy; else what the lattice states."),
         click.option("--sequence", metavar="NAME",

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import FILE, console, lattice_options, quiet_option
+from tmlattice.cli.options import FILE, Careful, console, lattice_options, open_ring, quiet_option
 
 
-@click.command("predict")
+@click.command("predict", cls=Careful)
 @click.argument("lattice")
 @lattice_options
 @click.option(
@@ -43,14 +43,13 @@ def predict(
     change x, y in m. It is linear in the kick.
     """
     from tmlattice.files import output_file
-    from tmlattice.lattice import load_ring
     from tmlattice.measurement.write import write_response_table
     from tmlattice.observe.calibration import calibrated_response, read_calibration
 
     if kick == 0 or not abs(kick) < float("inf"):
         raise click.BadParameter(f"a kick of {kick:g} rad; it is finite and not zero")
     with output_file(out) as file:
-        ring = load_ring(lattice, sequence, energy)
+        ring = open_ring(lattice, sequence, energy)
         causes = read_calibration(calibration, ring) if calibration else []
         columns, response = calibrated_response(ring, causes, correctors or None)
         monitors = [monitor.name for monitor in ring.monitors]

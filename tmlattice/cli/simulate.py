@@ -10,9 +10,11 @@ import click
 from tmlattice.cli.options import (
     FILE,
     LAUNCH_SIGMA,
+    Careful,
     background_option,
     console,
     lattice_argument,
+    open_ring,
     quiet_option,
     table,
 )
@@ -44,7 +46,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
         return words[0], words[1] if len(words) == 3 else None, amount
 
 
-@click.command("simulate")
+@click.command("simulate", cls=Careful)
 @lattice_argument
 @click.option(
     "--effect",
@@ -151,6 +153,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     metavar="FILE",
     help="Write the causes there; never inside a measurement folder.",
 )
+@click.option("--force", is_flag=True, help="Replace a measurement that --out holds already.")
 @quiet_option
 @click.pass_context
 def simulate(
@@ -171,6 +174,7 @@ def simulate(
     one_sided: bool,
     out: Path,
     truth: Path | None,
+    force: bool,
     quiet: bool,
     **options: Any,
 ) -> None:
@@ -183,19 +187,20 @@ def simulate(
     """
     from tmlattice.effects import Cause, find
     from tmlattice.files import output_file
-    from tmlattice.lattice import load_ring
     from tmlattice.machine import simulate as run
     from tmlattice.measurement import write_truth
+    from tmlattice.measurement.write import check_free
 
+    check_free(out, force)
     if truth is not None:
         _check_apart(truth, out)
     _check_options(context, kind)
-    ring = load_ring(lattice, sequence, energy)
+    ring = open_ring(lattice, sequence, energy)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
     if kind == "orbit-response":
         _response(
-            ring, causes, out, truth, quiet,
+            ring, causes, out, truth, force, quiet,
             background=dict(background), correctors=correctors or None, kick=kick, rf_step=rf_step,
             one_sided=one_sided, engine=options["engine"], seed=options["seed"],
             machine_seed=options["machine_seed"], **({} if noise is None else {"noise": noise}),
@@ -212,7 +217,7 @@ def simulate(
     with ExitStack() as both:  # the folder and the truth, or neither
         if truth is not None:
             write_truth(both.enter_context(output_file(truth)), **simulation.truth())
-        simulation.write(out, jobs, progress=not quiet)
+        simulation.write(out, jobs, progress=not quiet, force=force)
     if quiet:
         return
     screen = console()
@@ -246,7 +251,13 @@ def _check_options(context: click.Context, kind: str) -> None:
 
 
 def _response(
-    ring: Any, causes: list[Any], out: Path, truth: Path | None, quiet: bool, **options: Any
+    ring: Any,
+    causes: list[Any],
+    out: Path,
+    truth: Path | None,
+    force: bool,
+    quiet: bool,
+    **options: Any,
 ) -> None:
     from tmlattice.files import output_file
     from tmlattice.machine.response import simulate_response
@@ -257,7 +268,7 @@ def _response(
         simulation = simulate_response(ring, causes, progress=not quiet, **options)
         if file is not None:
             write_truth(file, **simulation.truth())
-        write_measurement(out, simulation.measured)
+        write_measurement(out, simulation.measured, force)
     if quiet:
         return
     measured, screen = simulation.measured, console()

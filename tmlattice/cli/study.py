@@ -11,6 +11,8 @@ from tmlattice.cli.options import (
     console,
     json_option,
     lattice_argument,
+    marks,
+    open_ring,
     quiet_option,
     recipe_options,
     table,
@@ -113,7 +115,7 @@ def tune_fit(
         path = files.enter_context(output_file(json_file)) if json_file else None
         cases = study_tune_fit(
             lattice, chosen, progress=not quiet, folder=out, scheduler=scheduler,
-            workers=workers, **options,
+            workers=workers, **marks(), **options,
         )  # fmt: skip
         cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
         summary = {
@@ -209,10 +211,9 @@ def localisation(
     from tmlattice import __version__
     from tmlattice.challenge.localisation import study_localisation, summarise
     from tmlattice.files import output_file, write_json
-    from tmlattice.lattice import load_ring
 
     with output_file(json_file) if json_file else nullcontext() as path:
-        ring = load_ring(lattice, sequence, energy)
+        ring = open_ring(lattice, sequence, energy)
         cases = list(study_localisation(ring, progress=not quiet, **options))
         rows = summarise(cases)
         if path:
@@ -266,10 +267,9 @@ def _draw(lattice: str, options: dict[str, Any], cases: list[Any], out: Path) ->
     import matplotlib.pyplot as plt
 
     from tmlattice.files import output_file
-    from tmlattice.lattice import load_ring
     from tmlattice.plots import plot_study
 
-    ring = load_ring(lattice, options["sequence"], options["energy"])
+    ring = open_ring(lattice, options["sequence"], options["energy"])
     figure = plot_study(ring, cases)
     with output_file(out / "study.png") as path:
         figure.savefig(path, dpi=150, format="png")

@@ -10,9 +10,11 @@ from click.core import ParameterSource
 from tmlattice.cli.options import (
     FILE,
     REGULARIZATIONS,
+    Careful,
     console,
     json_option,
     lattice_argument,
+    open_ring,
     quiet_option,
     recipe_options,
     table,
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from tmlattice.measurement import Measurement
 
 
-@click.command("tune-fit")
+@click.command("tune-fit", cls=Careful)
 @lattice_argument
 @click.option(
     "--magnet",
@@ -81,17 +83,16 @@ def tune_fit(
         folder = files.enter_context(output_folder(out))
         extra = files.enter_context(output_file(json_file)) if json_file else None
         from tmlattice.fitting import tune_fit as run
-        from tmlattice.lattice import load_ring
         from tmlattice.network import save_network
 
         if measurement is None:
-            ring = load_ring(lattice, sequence, energy)
+            ring = open_ring(lattice, sequence, energy)
             outcome = run(ring, progress=not quiet, **options)
         else:
             data = trajectories(
                 measurement, "; tune-fit takes a trajectory, the first turn of a beam"
             )
-            ring = load_ring(lattice, sequence, energy)
+            ring = open_ring(lattice, sequence, energy)
             outcome = _fit(ring, data, measurement, quiet, options)
         _draw(outcome, folder)
         result = outcome.as_json()

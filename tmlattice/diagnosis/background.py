@@ -8,23 +8,29 @@ prior still stands about zero.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import Cause
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
+from tmlattice.inference.sizes import Sizes, learn_sizes
 from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
+from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 
 Array = NDArray[np.float64]
 
 ROUNDS = 2
 """Linearisations: about the design, and about the likeliest errors."""
+
+ROWS = 1600
+"""Readings from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +40,22 @@ class SmallErrors:
     Attributes:
         problem: with those amounts in its model, and in its data what the signatures make of them.
         before: launches alone, in this model.
+        plain: without them, with the noise as learnt.
         hypotheses, rms: of every error.
+        sizes: rms by effect.
+        open: relative error of each size that was learnt; large where the readings hardly see it.
+        evidence: log evidence that the sizes learnt have over no small errors; None: they were
+            told.
     """
 
     problem: FirstTurns
     before: Fit
+    plain: FirstTurns
     hypotheses: tuple[Hypothesis, ...]
     rms: Array
+    sizes: Mapping[str, float]
+    open: Mapping[str, float] = field(default_factory=dict)
+    evidence: float | None = None
 
     def estimate(self, explained: Fit, whitening: Whitening) -> list[Cause]:
         """The likeliest small errors beside an explanation, which was found in this whitening."""
@@ -56,6 +71,37 @@ class SmallErrors:
         assert self.problem.spread is not None
         amounts = np.array([cause.amount for cause in estimate]) / self.rms
         return np.asarray(np.einsum("e,esrp->srp", amounts, self.problem.spread, optimize=True))
+
+    def unknown(self, explained: Fit, seen: FirstTurns, other: FirstTurns) -> Array:
+        """Covariance of what is still not known of other shots, once these have been explained.
+
+        Of the small errors what the readings leave open, and of the amounts of the causes: as in
+        universal kriging (Matheron 1969), whose drift launches and amounts are.
+
+        Args:
+            explained: the fit of these shots.
+            seen: its problem, in whose whitening it was found.
+            other: of the other shots, with the small errors of this explanation in its model.
+
+        Returns:
+            [shot * reading * 2] twice, m^2.
+        """
+        assert self.problem.spread is not None
+        point = other.at(explained.causes, other.data.launches)
+        *_, there = background_signatures(other.model, point.view, point.nuisances, self.sizes)
+        there = there.reshape(len(there), -1)
+        here = self.problem.spread.reshape(len(there), -1)
+        shared = (there.T @ here).reshape(-1, *seen.valid.shape)
+        rows = explained.projection.out(seen.whitening.signature(shared))  # [other reading, row]
+        unknown = there.T @ there - rows @ rows.T
+        slopes = [explained.slopes.get((c.effect, c.element)) for c in explained.causes]
+        for_each = [i for i, slope in enumerate(slopes) if slope is not None]
+        if for_each:
+            seen_by = np.array([slope.row for slope in slopes if slope is not None])
+            drift = np.array([other.metres(other.slope(point, i)) for i in for_each])
+            drift -= seen_by @ rows.T
+            unknown += drift.T @ explained.covariance[np.ix_(for_each, for_each)] @ drift
+        return np.asarray(unknown)
 
 
 def background_signatures(
@@ -84,6 +130,9 @@ def small_errors(
     launches: Array,
     causes: Sequence[Cause] = (),
     estimate: Sequence[Cause] = (),
+    *,
+    learn: bool = False,
+    noisy: bool = False,
 ) -> SmallErrors:
     """The background of a machine as these data show it.
 
@@ -95,8 +144,11 @@ def small_errors(
         launches: first guess, [shot, 5].
         causes: what was found already: small errors act along the orbit that it makes.
         estimate: the likeliest small errors beside it.
+        learn: the sizes are learnt from the data; `rms` is where that starts.
+        noisy: so is the noise, which is a guess.
     """
     fixed, data = tuple(causes), plain.data
+    evidence, errors, opened = None, dict[str, float](), plain.open
     for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
         alone = fit(replace(plain, model=model, fixed=fixed), (), launches)
@@ -105,12 +157,61 @@ def small_errors(
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
         moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
         shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
-        problem = replace(plain, model=model, data=shifted, fixed=fixed, spread=spread, white=None)
+        if learn:
+            found, names = _sizes(shifted, alone, hypotheses, spread, noisy)
+            if evidence is None:
+                evidence = found.log_evidence
+            errors = dict(zip(names, found.error.tolist(), strict=True))
+            factor = dict(zip(names, found.scale, strict=True))
+            each = np.array([factor[name] for name, _ in hypotheses])
+            rms = {name: float(size * factor.get(name, 1.0)) for name, size in rms.items()}
+            scale, spread = each * scale, each[:, None, None, None] * spread
+            if noisy:
+                data, shifted = (
+                    replace(some, sigma=some.sigma * found.noise) for some in (data, shifted)
+                )
+            opened = (np.array([names.index(name) for name, _ in hypotheses]), found.covariance)
+        problem = replace(
+            plain, model=model, data=shifted, fixed=fixed, spread=spread, white=None, open=opened
+        )
         explained = fit(problem, (), alone.nuisances)
         launches = explained.nuisances
         problem = replace(problem, fixed=())
-        small = SmallErrors(problem, explained, tuple(hypotheses), scale)
+        small = SmallErrors(
+            problem, explained, replace(plain, data=data, white=None, open=opened),
+            tuple(hypotheses), scale,
+            rms, errors, evidence,
+        )  # fmt: skip
         estimate = small.estimate(explained, problem.whitening)
     if fixed:
         small = replace(small, before=fit(problem, (), launches))
     return small
+
+
+def _sizes(
+    data: Data, alone: Fit, hypotheses: Sequence[Hypothesis], spread: Array, noisy: bool
+) -> tuple[Sizes, list[str]]:
+    """Sizes from as many shots as it takes, and the effects that they are of, in their order.
+
+    A fault is no small error: shots of a reference come first.
+    """
+    per_shot = data.valid[0].size
+    shots = np.argsort(data.active, kind="stable")[: max(ROWS // per_shot, 1)]
+    some = data.of_shots(shots)
+    keep = np.zeros(some.valid.shape, dtype=bool)  # of many turns not all
+    keep[:, :: -(-len(shots) * per_shot // ROWS)] = True
+    some = some.without(~keep)
+    plain = Whitening(some)
+    paths = alone.point.view
+    left = np.where(some.valid, some.readings - paths.readings[shots], 0.0)
+    rows = plain.residual(left, alone.nuisances[shots])
+    launch = np.linalg.qr(block_diag(*plain.launch(paths.launch[shots])))[0]
+    signatures = plain.signature(spread[:, shots])
+    there = (plain.signature(some.valid.astype(float)) > 0) | launch.any(axis=1)
+    names = list(dict.fromkeys(name for name, _ in hypotheses))
+    belongs = np.array([names.index(name) for name, _ in hypotheses])
+    planes = np.zeros((2, *some.valid.shape))
+    planes[0, ..., 0], planes[1, ..., 1] = 1.0, 1.0
+    noise = [(plain.signature(plane) > 0)[there] for plane in planes] if noisy else []
+    families = [signatures[belongs == k][:, there] for k in range(len(names))]
+    return learn_sizes(rows[there], launch[there], families, noise), names

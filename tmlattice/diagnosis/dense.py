@@ -24,10 +24,11 @@ from tmlattice.diagnosis.state import (
     begin,
     bend,
     by_columns,
+    forbid,
     jump,
     linear,
-    one_round,
     rms_of,
+    settle,
 )
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.observe.orbit_response import ResponseData, Split
@@ -37,16 +38,15 @@ Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
-HELPS, SPOILS = 0.995, 1.25
-"""A step is kept where its judge falls to the first, the rms over both planes falls, and none
-(in-plane, coupling, RF) rises above the second; the RF's has some 25 readings, so 14 % of its
-own."""
+MISSED = np.array([1.005, 1.005, 1.05])
+"""A step is kept where without it one of the judges (in-plane, coupling, RF) rises above this, and
+they do not fall together; the RF's has some 25 readings, so 14 % of its own."""
+HELPS = 0.995
+"""To what far monitors' misfit has to fall where each column has a number of its own."""
 NOISY = 1.5
 """Chi2 per reading that is noise, or nearly."""
-LATE = 3
-"""Rounds of a refused family that the columns want."""
-NEAR = 3.0
-"""A refused family that the columns want: numbers beyond so many trusted changes start there."""
+FIRST, ROUGH = 4, 0.03
+"""Rounds of each block after a family came in, or went, and what one has to gain for another."""
 
 
 class Chi2(NamedTuple):
@@ -207,74 +207,83 @@ def fit_steps(
     most: int = len(STEPS),
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> DenseFit:
-    """Explore which families help, then fit those to all correctors but the held-out ones.
+    """All families together, those taken out again that nobody needs, the rest fitted to all
+    correctors but the held-out ones.
 
-    Held-out correctors cannot say whether fitted ones have calibrations of their own, for each has
-    its kick fitted: of families whose numbers are columns', and which they refused, each column's
-    far monitors are asked, with the number that its near ones give.
+    Families need one another: monitors' gains, say, help nobody before the gradients are there. So
+    each is judged by what is lost without it, everything else settled anew: the same work with it
+    and without it.
 
     Args:
         data, split: what was measured, and who judges.
-        trials: families, in the order in which they are tried.
+        trials: families, in the order in which they come in.
         most: steps that are kept at most.
         progress: called with each step's name.
     """
     design = state = begin(data, split)
     before = score(design, split.held)
-    steps = [Step.scored("design", 0, before)]
-    refused: list[Step] = []
-    inner = _inner(state)
-    columns = [f for trial in trials for f in trial.families if f.per == "column"]
-    again = [Trial((f,), LATE * (f.block == 0), LATE * f.block) for f in columns]
-    for trial, late in [*((t, False) for t in trials), *((t, True) for t in again)]:
-        if len(steps) > most or any(state.allows(f.name) for f in trial.families):
-            continue
-        title = ", ".join(family.title for family in trial.families)
-        progress(title)
-        if late and not _wanted(state, trial.families[0]):
-            continue
-        state, then = _tried(state, trial, late=late)
-        now = _inner(then)
+    steps: dict[Trial, Step] = {}
+    for trial in trials:
+        progress(_title(trial))
+        state = bend(state) if trial.own else state
+        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
         count = sum(family.count(data) for family in trial.families)
-        step = Step.scored(title, count, score(then, split.held))
-        judge = trial.families[0].block
-        helps = late or (
-            now[judge] < HELPS * inner[judge] and np.hypot(*now[:2]) < np.hypot(*inner[:2])
-        )
-        good = bool(helps and (now < SPOILS * inner).all())
-        log.info("%s: inner %s -> %s, kept %s", title, inner, now, good)
-        if good:
-            steps.append(step)
-            inner, state = now, then
-            refused = [old for old in refused if old.effect != title]
+        steps[trial] = Step.scored(_title(trial), count, score(state, split.held))
+    progress("all together")
+    state = settle(bend(jump(state)))
+    worth: dict[Trial, float] = {}
+    refused = []
+    for trial in reversed(trials):
+        progress(f"without {_title(trial)}")
+        without = settle(forbid(state, trial.families), most=FIRST, gain=ROUGH)
+        needed = _needed(state, without, trial)
+        if needed > 0:
+            worth[trial] = needed
         else:
-            refused.append(replace(step, kept=False))
-            own = tuple(family.name for family in trial.families)
-            learnt = {k: g for k, g in then.groups.items() if not k.startswith(own)}
-            state = replace(state, groups=learnt)
+            state = without
+            refused.append(replace(steps.pop(trial), kept=False))
+    for trial in sorted(worth, key=lambda t: worth[t])[: max(len(worth) - most, 0)]:
+        state = forbid(state, trial.families)
+        refused.append(replace(steps.pop(trial), kept=False))
     progress("result")
-    state = bend(jump(replace(state, exploring=False)))
-    for block in (1, 0, 0):
-        state = one_round(state, block)
+    state = settle(bend(jump(replace(state, exploring=False))))
     after = score(state, split.held)
-    steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
-    return DenseFit(design, state, tuple(steps), tuple(refused), (before, after))
+    kept = [Step.scored("design", 0, before), *steps.values()]
+    kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
+    return DenseFit(design, state, tuple(kept), tuple(reversed(refused)), (before, after))
+
+
+def _title(trial: Trial) -> str:
+    return ", ".join(family.title for family in trial.families)
+
+
+def _blocks(trial: Trial) -> list[int]:
+    return [1] * (trial.across > 0) + [0] * (trial.own > 0)
 
 
 def _inner(state: State) -> Array:
-    """What chooses: in-plane, coupling and dispersion rms of correctors held out for it."""
-    said = score(state, state.split.inner, state.split.inner_rf)
-    return np.array([said.in_plane, said.coupling, said.dispersion])
+    """What chooses: in-plane, coupling and dispersion rms of correctors held out for it; each half
+    of their monitors gives the kick once."""
+    other = replace(state, split=replace(state.split, half=~state.split.half))
+    said = [score(one, state.split.inner, state.split.inner_rf) for one in (state, other)]
+    rms = [[one.in_plane, one.coupling, one.dispersion] for one in said]
+    return np.asarray(np.sqrt(np.mean(np.square(rms), axis=0)))
 
 
-def _tried(state: State, trial: Trial, *, late: bool) -> tuple[State, State]:
-    """The state, with the steps' finite size where it stands; and the same with the families."""
-    if trial.own:
-        state = bend(state)
-    then = jump(allow(state, trial.families), NEAR if late else None)
-    for block in [1] * trial.across + [0] * trial.own:
-        then = one_round(then, block)
-    return state, then
+def _needed(state: State, without: State, trial: Trial) -> float:
+    """By how much worse the judge is without a trial's families, relative; 0: not needed.
+
+    Held-out correctors cannot say whether fitted ones have calibrations of their own, for each has
+    its kick fitted: of families whose numbers are columns' each column's far monitors are asked,
+    with the number that its near ones give.
+    """
+    now, gone = _inner(state), _inner(without)
+    log.info("without %s: inner %s -> %s", _title(trial), now, gone)
+    worse = gone / np.maximum(now, 1e-300)
+    if (worse > MISSED).any() and np.log(worse).sum() > 0:
+        return float(worse.max())
+    columns = [family for family in trial.families if family.per == "column"]
+    return 1.0 if any(_wanted(without, family) for family in columns) else 0.0
 
 
 def _wanted(state: State, family: Family) -> bool:

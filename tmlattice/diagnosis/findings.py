@@ -11,7 +11,7 @@ from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.remedies import credible as credible_remedies
 from tmlattice.diagnosis.remedies import remedies_of, remedy_of
-from tmlattice.diagnosis.result import VERDICTS, Finding, Member
+from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis
@@ -126,9 +126,9 @@ def with_consequences(
     """
     if not findings:
         return ()
-    told = consequences(ring, causes)
+    told = consequences(ring, faults_of(findings, causes))
     return tuple(
-        replace(f, consequences=told.get((f.effect, f.element)) if f.effect else None)
+        replace(f, consequences=told.get((f.remedy.effect, f.remedy.element)) if f.remedy else None)
         for f in findings
     )
 
@@ -165,8 +165,8 @@ def verdict_of(
     more, far_more = judgement.noise
     if explanation.full and left < judgement.false_alarm:
         said = (
-            f"as many as {len(findings)} causes do not explain the data: small errors everywhere; "
-            "state their rms as a background, or give a reference from before the fault"
+            f"as many as {len(findings)} causes do not explain the data; a reference from before "
+            "the fault would cancel what was there anyway"
         )
         return "distributed", (), (said,)
     if not findings:

@@ -159,8 +159,13 @@ def _with_noise(data: Data, start: Fit) -> tuple[Data, tuple[float, float], bool
             )
         data = data.with_sigma(np.where(np.isfinite(found), found, np.nanmean(found)))
     data = data.with_sigma(np.ones(2))  # where nothing was read
+    return data, noise_of(data), estimated
+
+
+def noise_of(data: Data) -> tuple[float, float]:
+    """rms noise of a reading, m, (x, y); NaN for a plane without readings."""
     x, y = (_rms(data.sigma[..., p][data.valid[..., p]]) for p in (0, 1))
-    return data, (x, y), estimated
+    return x, y
 
 
 def _above_the_floor(

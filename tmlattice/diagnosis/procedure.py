@@ -8,14 +8,14 @@
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
-from tmlattice.diagnosis.background import SmallErrors, small_errors
+from tmlattice.diagnosis.background import SmallErrors
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     credible,
@@ -26,21 +26,22 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.prepare import Prepared, prepare, same_monitors
+from tmlattice.diagnosis.prepare import Prepared, noise_of, prepare, same_monitors
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
+from tmlattice.diagnosis.strategy import freedom, sought
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.effects import Cause, apply, background_rms, find
+from tmlattice.effects import Cause, apply, background_rms
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.newton import Fit, Outcome
+from tmlattice.inference.newton import Outcome
 from tmlattice.inference.scan import FreeScan
-from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.inference.search import Explanation, Search
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
-from tmlattice.observe.data import Data, of_measurement
+from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
 
 Array = NDArray[np.float64]
@@ -70,8 +71,8 @@ def diagnose(
         measurement: first turns, or a few turns, of one or more shots.
         reference: of the same machine before the fault: static errors cancel.
         background: small errors that the machine has everywhere, rms by effect (None: the
-            catalogue's own; "all": every usual one). With a reference and no background given,
-            every usual one.
+            catalogue's own; "all": every usual one; empty, or "none": there are none). Not given:
+            whether there are any, and how large they are, the data say.
         holdout: share of the shots that the fit does not see, for the gap.
         heldout: those shots themselves, instead of a share.
         effects: names of those that may be the cause; else all usual ones of the catalogue.
@@ -93,7 +94,7 @@ def diagnose(
     begun = time.perf_counter()
     options = {
         "reference": reference is not None,
-        "background": dict(background or {}),
+        "background": None if background is None else dict(background),
         "holdout": holdout,
         "effects": None if effects is None else list(effects),
         "max_effects": max_effects,
@@ -110,20 +111,15 @@ def diagnose(
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
             said.append("one shot: none is held out, so nobody judges the gap")
-    if reference is not None and background is None:
-        background = {"all": None}
     progress("model")
     ready = prepare(ring, measurement, reference, radiation, effects, judgement)
     search = Search(ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress)
-    rms = background_rms(background or {})
-    if rms:
-        small, explanation = _among_small_errors(ring, ready, search, rms)
-    else:
-        progress("scan")
-        small, explanation = None, explain(search, ready.before)
+    rms = None if background is None else background_rms(background)
+    found = sought(ring, ready, search, rms)
+    small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, seed)
+    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
     repaired = apply(ring, told.causes)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
     return Diagnosis(
@@ -154,6 +150,8 @@ def diagnose(
         repaired=repaired,
         causes=told.causes,
         errors=_errors(explanation)[: len(told.causes)],
+        priors={} if small is None else small.sizes,
+        prior_errors={} if small is None else small.open,
         view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
     )
 
@@ -162,51 +160,6 @@ def _version() -> str:
     from tmlattice import __version__
 
     return __version__
-
-
-# --- the search ----
-def _among_small_errors(
-    ring: Ring, ready: Prepared, search: Search, rms: Mapping[str, float]
-) -> tuple[SmallErrors, Explanation]:
-    """The background, taken again along the orbit of what is found where that misleads."""
-    few = min(2, search.most)  # two findings say already whether it has to be taken again
-    search.progress("background")
-    small = small_errors(ring, ready.problem, ready.known, rms, ready.before.nuisances)
-    narrow = replace(search, problem=small.problem, most=few, names_first=True)
-    search.progress("scan")
-    explanation = explain(narrow, small.before)
-    for _ in range(ready.problem.judgement.retaken):
-        if not _misled(explanation):
-            break
-        search.progress("background with what was found")
-        found = explanation.fit
-        errors = small.estimate(found, turns_of(explanation).whitening)
-        clear = [named.detection.statistic for named in explanation.named]
-        strongest = found.causes[int(np.argmax(clear))]  # the others may be the background's
-        small = small_errors(
-            ring, ready.problem, ready.known, rms, found.nuisances, [strongest], errors
-        )
-        explanation = explain(replace(narrow, problem=small.problem), small.before)
-    if explanation.full and search.most > 1:
-        explanation = explain(replace(search, problem=small.problem), small.before)
-    return small, explanation
-
-
-def _misled(explanation: Explanation) -> bool:
-    """Whether a fault is so strong that small errors along its orbit look like further faults."""
-    if not explanation.fit.causes:
-        return False
-    freedom = _freedom(turns_of(explanation).data, explanation.fit)
-    return explanation.count > 1 or bool(chi2.sf(explanation.fit.chi2, freedom) < 0.01)
-
-
-def _freedom(data: Data, result: Fit) -> int:
-    """Degrees of freedom: readings and priors, less what was fitted."""
-    free = data.launch_sigma > 0
-    priors = int((free & np.isfinite(data.launch_sigma)).sum())
-    amounts = sum(not find(cause.effect).discrete for cause in result.causes)
-    kicks = sum(len(values) for values in result.kicks.values())
-    return max(int(data.valid.sum()) + priors - int(free.sum()) - amounts - kicks, 1)
 
 
 # --- what is told ----
@@ -249,12 +202,14 @@ def _told(
 ) -> _Told:
     result, problem, left = explanation.fit, turns_of(explanation), explanation.left
     findings = findings_of(ring, explanation, ready.dead, judgement)
-    p_value = float(chi2.sf(result.chi2, _freedom(problem.data, result)))
+    p_value = float(chi2.sf(result.chi2, freedom(problem.data, result)))
     verdict, standing, said = verdict_of(explanation, findings, p_value, ready.estimated, judgement)
+    if verdict == "nothing" and small is not None and small.evidence is not None:
+        verdict = "distributed"  # the gap has a cause: many small ones
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         result, left = explanation.before, explanation.first_kicks
         problem = ready.problem if small is None else small.problem
-        p_value = float(chi2.sf(result.chi2, _freedom(problem.data, result)))
+        p_value = float(chi2.sf(result.chi2, freedom(problem.data, result)))
     elif result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     fits = [explanation.before, result] if result.causes or result.kicks else [explanation.before]
@@ -279,23 +234,30 @@ def _held_out(
     ready: Prepared,
     told: _Told,
     small: SmallErrors | None,
-    seed: int,
+    explanation: Explanation,
 ) -> Gap:
-    """The gap on shots that the fit did not see: the design's, each finding added, the last's."""
-    other = of_measurement(ring, heldout).with_sigma(np.array(ready.noise))
+    """The gap on shots that the fit did not see: the design's; with the small errors in it, as the
+    fit without causes leaves them; with the findings, one by one where there are no small errors.
+    """
+    noise = ready.noise if small is None else noise_of(small.problem.data)
+    other = of_measurement(ring, heldout).with_sigma(np.array(noise))
     dropped = ready.problem.valid & ~told.problem.valid
     other = same_monitors(other, ready.problem.data, dropped)
-    steps: list[tuple[Cause, ...]] = [told.causes[:i] for i in range(len(told.causes) + 1)]
-    there = [ready.known] * len(steps)
-    if small is not None:  # the small errors too, as each explanation leaves them
-        steps = [(), told.causes] if told.causes else [()]
-        there = [(*ready.known, *errors) for errors in told.estimates[: len(steps)]]
-    scored = []
-    for causes, known in zip(steps, there, strict=True):
-        model = Model(ring, other.settings, other.turns, known)
-        problem = FirstTurns(model=model, data=other, places={}, fixed=causes)
-        scored.append(judged(problem, other.launches))
-    return held_out_gap(scored, seed)
+
+    def problem(known: Sequence[Cause], causes: tuple[Cause, ...]) -> FirstTurns:
+        model = Model(ring, other.settings, other.turns, [*ready.known, *known])
+        return FirstTurns(model=model, data=other, places={}, fixed=causes)
+
+    if small is None:
+        steps = [told.causes[:i] for i in range(len(told.causes) + 1)]
+        return held_out_gap([judged(problem((), step), other.launches) for step in steps])
+    scored = [judged(problem((), ()), other.launches)]
+    seen_by = (small.problem, turns_of(explanation))
+    fits = (explanation.before, explanation.fit)[: len(told.estimates)]
+    for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
+        unknown = small.unknown(one, seen, problem(errors, ()))
+        scored.append(judged(problem(errors, one.causes), other.launches, unknown))
+    return held_out_gap(scored, since=max(len(scored) - 2, 0))
 
 
 def _left_out(

@@ -2,7 +2,7 @@
 
 A thin gradient in the middle of a quadrupole and a wrong strength of it are two hypotheses and one
 line in a logbook: the gradient of that magnet. Which effects share a remedy at an element, and in
-which amount, the catalogue says (`Effect.stands_for`).
+which amount, the catalogue says (`Effect.stands_for`). A magnet that stands in pieces is one.
 
 >>> remedy = remedies_of(ring, rivals, probability)[0]
 >>> remedy.action, remedy.amount, remedy.probability
@@ -41,8 +41,11 @@ class Remedy:
 
     Attributes:
         effect, element: that the remedy is named for; None for the beam.
+        pieces: of the magnet that the element is a piece of, or the element alone; empty for the
+            beam.
         kind: of the element; of a family that of its members.
-        amount, amount_sigma: in that effect's unit, of the likeliest explanation that shares it.
+        amount, amount_sigma: in that effect's unit: its own where it is among the explanations,
+            else that of the likeliest one.
         probability: of all explanations that share it.
         mechanisms: their effects with their probabilities, the likeliest first.
         strength: of the magnet, designed and found, where the effect scales one.
@@ -50,6 +53,7 @@ class Remedy:
 
     effect: str
     element: str | None
+    pieces: tuple[str, ...]
     kind: Kind | None
     amount: float
     amount_sigma: float | None
@@ -58,9 +62,14 @@ class Remedy:
     strength: Strength | None
 
     @property
+    def cause(self) -> Cause:
+        """What is told to be wrong."""
+        return Cause(self.effect, self.element, self.amount)
+
+    @property
     def action(self) -> str:
         """What to do, in words."""
-        return action(self.effect, self.element)
+        return action(self.effect, self.pieces)
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -70,6 +79,7 @@ class Remedy:
             "check": effect.to_check,
             "effect": self.effect,
             "element": self.element,
+            "pieces": list(self.pieces),
             "quantity": effect.quantity or effect.words,
             "amount": self.amount,
             "amount_sigma": self.amount_sigma,
@@ -80,9 +90,16 @@ class Remedy:
         }
 
 
-def action(effect: str, element: str | None) -> str:
+def action(effect: str, pieces: Sequence[str]) -> str:
     """What takes an effect away, in words."""
-    return find(effect).remedy.replace("{}", element or "the ring")
+    return find(effect).remedy.replace("{}", " + ".join(pieces) or "the ring")
+
+
+def pieces_of(ring: Ring, name: str | None) -> tuple[str, ...]:
+    """Of the magnet that an element is a piece of; a family's name, or an element's, alone."""
+    if name is None:
+        return ()
+    return ring.pieces(name) if _is_element(ring, name) else (name,)
 
 
 def leading(ring: Ring, cause: Cause) -> Cause:
@@ -96,7 +113,7 @@ def leading(ring: Ring, cause: Cause) -> Cause:
 def remedy_of(ring: Ring, cause: Cause) -> str:
     """What takes a cause away, in words: the same for causes that one adjustment takes away."""
     lead = leading(ring, cause)
-    return action(lead.effect, lead.element)
+    return action(lead.effect, pieces_of(ring, lead.element))
 
 
 def remedies_of(
@@ -116,28 +133,40 @@ def remedies_of(
     Returns:
         That of the first one first, the others by falling probability.
     """
-    found: dict[tuple[str, str | None], Remedy] = {}
+    found: dict[tuple[str, tuple[str, ...]], Remedy] = {}
     for cause, share in zip(causes, np.asarray(probability).tolist(), strict=True):
         lead = leading(ring, cause)
-        key = (lead.effect, lead.element)
+        key = (lead.effect, pieces_of(ring, lead.element))
         own = ((cause.effect, share),)
         if key in found:
             known = found[key]
-            found[key] = replace(
-                known, probability=known.probability + share, mechanisms=known.mechanisms + own
+            known = replace(
+                known, probability=known.probability + share, mechanisms=_more(known, *own)
             )
+            thin = known.effect not in [effect for effect, _ in found[key].mechanisms]
+            if thin and cause.effect == lead.effect and lead.element == known.element:
+                # its own fit is better than a thin one converted
+                known = replace(known, amount=lead.amount, strength=_strength(ring, lead))
+            found[key] = known
             continue
         error = None
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
         found[key] = Remedy(
-            lead.effect, lead.element, _kind(ring, lead.element), lead.amount, error, share, own,
-            _strength(ring, lead),
+            lead.effect, lead.element, key[1], _kind(ring, lead.element), lead.amount, error, share,
+            own, _strength(ring, lead),
         )  # fmt: skip
     if not found:
         return ()
     first, *rest = found.values()
     return (first, *sorted(rest, key=lambda remedy: -remedy.probability))
+
+
+def _more(known: Remedy, mechanism: tuple[str, float]) -> tuple[tuple[str, float], ...]:
+    """Mechanisms with one more, those of the same effect (in other pieces) added up."""
+    shares = dict(known.mechanisms)
+    shares[mechanism[0]] = shares.get(mechanism[0], 0.0) + mechanism[1]
+    return tuple(shares.items())
 
 
 def credible(remedies: Sequence[Remedy], mass: float) -> tuple[Remedy, ...]:
@@ -179,14 +208,17 @@ def undone(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]
     """The ring with the settings that take causes away, and the causes that no setting does.
 
     With the causes in it, a magnet of the returned ring acts as the given ring's does: a quadrupole
-    that gives 20 % less than it is told is told 25 % more. What has to be moved, turned or mended,
-    and what is wrong with monitors or the beam, is handed back.
+    that gives 20 % less than it is told is told 25 % more. What has to be moved, turned, calibrated
+    or mended, and what is wrong with monitors or the beam, is handed back; known physics that is no
+    fault is passed over.
     """
     settings: dict[int, Element] = {}
     by_hand: list[Cause] = []
     for cause in reversed(causes):  # the last that acts is undone first
         effect = find(cause.effect)
-        if not isinstance(effect, RingEffect) or effect.natural:
+        if effect.natural:
+            continue
+        if not isinstance(effect, RingEffect) or effect.acts_on_settings:
             by_hand.append(cause)
             continue
         places = effect.members(ring, cause.element)

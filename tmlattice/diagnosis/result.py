@@ -1,7 +1,7 @@
 """What a diagnosis says, whatever was measured: findings with what else each could be, amounts with
 errors, the gap, and the file format."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.remedies import Remedy
-from tmlattice.effects import Cause
+from tmlattice.diagnosis.remedies import Remedy, undone
+from tmlattice.effects import Cause, apply
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
@@ -133,6 +133,12 @@ class Finding:
         }
 
 
+def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """The causes, those of findings as their remedies name them."""
+    named = {(f.effect, f.element): f.remedy.cause for f in findings if f.remedy is not None}
+    return tuple(named.get((cause.effect, cause.element), cause) for cause in causes)
+
+
 @dataclass(frozen=True, eq=False)
 class TrajectoryView:
     """What only trajectories have, for plots.
@@ -186,15 +192,17 @@ class Diagnosis:
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options as used, seed, seconds.
         ring: the design.
-        repaired: the ring with the named causes in it; monitors and correctors are in
-            `calibration`.
+        repaired: the model repaired, which is the ring as found: the design with the named causes
+            in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
         view: what figures need; it says what was measured.
         steps: of a dense fit, those kept; the first is the design's, the last the result's.
         refused: those that did not help.
         bad_monitors: names of those left out.
-        priors: rms of the families' priors, as the data have them, by name.
+        priors: rms of small errors, as the data have them or as they were told, by family.
+        prior_errors: relative error of those that were learnt; above one half the readings hardly
+            see the family.
         degenerate: what the data alone do not settle, in words.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
@@ -224,6 +232,7 @@ class Diagnosis:
     refused: "tuple[Step, ...]" = ()
     bad_monitors: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
+    prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
@@ -270,8 +279,32 @@ class Diagnosis:
         raise KeyError((effect, element))
 
     @property
+    def faults(self) -> tuple[Cause, ...]:
+        """The causes, those of findings as their remedies name them: a thin gradient that explains
+        a quadrupole's is the quadrupole's own."""
+        return faults_of(self.findings, self.causes)
+
+    @property
+    def as_found(self) -> Ring:
+        """The design with the faults in it: the machine as it is."""
+        faults = self.faults
+        return self.repaired if faults == self.causes else apply(self.ring, faults)
+
+    def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
+        """The design with the settings that take the faults away, and what settings do not mend.
+
+        Loaded into the machine as it was found, these settings make it the design again: see
+        `remedies.undone`.
+        """
+        return undone(self.ring, self.faults)
+
+    @property
     def gap(self) -> dict[str, Any]:
-        """Before and after on the fit's readings and on held-out ones."""
+        """Before and after on the fit's readings and on held-out ones.
+
+        Where there are small errors and findings, before is with the small errors alone; the
+        design's own is the first of the steps.
+        """
 
         def both(before: Misfit, after: Misfit) -> dict[str, Any]:
             return {"before": dict(vars(before)), "after": dict(vars(after))}
@@ -280,7 +313,7 @@ class Diagnosis:
         heldout = None
         if gap is not None:
             heldout = {
-                **both(gap.misfits[0], gap.misfits[-1]),
+                **both(gap.misfits[gap.since], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
                 "monitors": "odd" if self.kind == "trajectory" else "half",
                 "steps": [dict(vars(m)) for m in gap.misfits],
@@ -311,6 +344,7 @@ class Diagnosis:
             "bad_monitors": list(self.bad_monitors),
             "degenerate": list(self.degenerate),
             "priors": dict(self.priors),
+            "prior_errors": dict(self.prior_errors),
             "errors": [
                 {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
                 for c, s in zip(self.causes, self.errors, strict=True)

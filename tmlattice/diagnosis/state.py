@@ -1,7 +1,7 @@
 """The state of a dense fit of an orbit response, and what may happen to it.
 
 Everything that is fitted is one frozen `State`; what happens to it is a function that gives another
-one: `bend`, `allow`, `jump`, `one_round`, `look`.
+one: `bend`, `allow`, `jump`, `settle`, `look`.
 """
 
 import logging
@@ -28,6 +28,13 @@ FEW = 4
 """Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
 TYPICAL = 10.0
 """The median misfit of all columns counts as so many readings of each one's own."""
+ROUNDS = 12
+"""Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
+GAIN = 3e-3
+"""Share of the cost that a round has to gain for another one."""
+RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
+"""How often a round that went astray is repeated; by what trust falls then and grows else, and to
+how much at most."""
 ALONE = 0.3
 """A column whose misfit falls to this share by its own number has no other error to speak of."""
 
@@ -102,6 +109,15 @@ def allow(state: State, families: Sequence[Family]) -> State:
     return replace(
         state, families=(*state.families, *families), values={**new, **state.values}
     )  # fmt: skip
+
+
+def forbid(state: State, families: Sequence[Family]) -> State:
+    """Without some families; numbers that no other family moves go back to zero."""
+    names = [family.name for family in families]
+    left = tuple(family for family in state.families if family.name not in names)
+    values = {f.variable: state.values[f.variable] for f in left}
+    groups = {k: g for k, g in state.groups.items() if not k.startswith(tuple(names))}
+    return replace(state, families=left, groups=groups).moved(values)
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
@@ -216,20 +232,85 @@ def linear(state: State, block: int) -> Linear:
     )  # fmt: skip
 
 
-def one_round(state: State, block: int) -> State:
-    """Linearise the readings of one block, solve, move, and look at what is left."""
-    if not state.of_block(block):
-        return state
+class Moved(NamedTuple):
+    """A state after a round, and the cost that the round was to lessen, before and after."""
+
+    state: State
+    before: float
+    after: float
+
+
+def one_round(state: State, block: int, bold: float = 1.0) -> Moved:
+    """Linearise the readings of one block, solve, and move.
+
+    Args:
+        state: where it stands.
+        block: 0 in-plane, 1 coupling.
+        bold: factor of every trusted change: small where the last rounds went astray.
+    """
     there = linear(state, block)
-    found = solve(there.normal, there.groups, there.start, there.trust)
+    found = solve(there.normal, there.groups, there.start, bold * there.trust)
     family = {f.variable: f for f in state.families}
     values = {name: family[name].bounded(found.values[at]) for name, at in there.where.items()}
     groups = {group.name: group for group in found.groups}
-    state = replace(state, groups={**state.groups, **groups}).moved({**state.values, **values})
-    for seen in (0, 1):
-        if state.of_block(seen):
-            state = look(state, seen)
-    log.info("lacking %s m", np.median(state.lacking, axis=1))
+    weights = weight(state, block)
+    then = replace(state, groups={**state.groups, **groups}).moved({**state.values, **values})
+
+    def cost(at: State) -> float:
+        left = np.where(weights > 0, state.data.pick(at.at.left, block), 0.0)
+        penalty = sum(
+            _penalty([g for g in found.groups if g.basis[rows].any()], rows, at.values[name])
+            for name, rows in there.where.items()
+        )
+        return float(np.sum(weights * left**2)) + penalty
+
+    return Moved(then, cost(state), cost(then))
+
+
+def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
+    """What the priors of one variable, which add up, ask for its values."""
+    spread = np.concatenate([group.basis[rows] * group.scale for group in groups], axis=1)
+    return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
+
+
+def settle(
+    state: State, blocks: Sequence[int] = (1, 0), most: int = ROUNDS, gain: float = GAIN
+) -> State:
+    """Rounds until none gains any more, none of which may make things worse.
+
+    As Levenberg and Marquardt have it, but that what is trusted is a change of each number by
+    itself: a round that went astray is taken back and repeated with less trust.
+
+    Args:
+        state: where it stands.
+        blocks: that move, in this order.
+        most: rounds of each block.
+        gain: share of the cost that a round has to gain for another one.
+    """
+    bold = dict.fromkeys(blocks, 1.0)
+    for turn in range(most):
+        gained = 0.0
+        for block in blocks:
+            if not state.of_block(block):
+                continue
+            for _ in range(RETRIES):
+                moved = one_round(state, block, bold[block])
+                if moved.after <= moved.before:
+                    break
+                bold[block] /= ASTRAY
+            if moved.after > moved.before:
+                continue
+            bold[block] = min(BOLDER * bold[block], BOLDEST)
+            gained = max(gained, (moved.before - moved.after) / max(moved.after, 1e-300))
+            state = moved.state
+            for seen in (0, 1):
+                if state.of_block(seen):
+                    state = look(state, seen)
+        log.info(
+            "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
+        )
+        if gained < gain:
+            break
     return state
 
 

@@ -1,7 +1,8 @@
-"""Where to look first when nothing explains the data: suspects, not findings.
+"""Where to look first when no few causes explain the data: suspects, not findings.
 
-On a `distributed` verdict what the search found stands no longer, yet what explained most is where
-a fault would be, if there is one among small errors everywhere.
+On a `distributed` verdict what the search found stands no longer, or small errors everywhere
+explain the data and nothing stands out; yet what the scan sees most of is where a fault would be,
+if there is one among them.
 
 >>> [(one.kind, one.element) for one in suspects(ring, explanation, judgement)]
 """
@@ -20,8 +21,8 @@ from tmlattice.lattice import Ring
 MOST = 3
 """Suspects of each kind."""
 
-LOOKED_AT = 400
-"""Leading hypotheses of a scan that may add a suspect."""
+FLOOR = 9.0
+"""Fall of chi-square from which on a hypothesis is suspect: 3 sigma of one looked at alone."""
 
 SuspectKind = Literal["monitor", "corrector", "section"]
 
@@ -37,6 +38,8 @@ class Suspect:
         where: from the last monitor before to the first one behind, m.
         near: the names of those monitors.
         statistic: fall of chi-square by it.
+        threshold: of the whole scan. What exceeds it and is no finding is less likely to be a fault
+            than a large one of the small errors everywhere.
     """
 
     kind: SuspectKind
@@ -45,6 +48,7 @@ class Suspect:
     where: tuple[float, float]
     near: tuple[str, ...]
     statistic: float
+    threshold: float
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -55,6 +59,7 @@ class Suspect:
             "where": {"s_from": self.where[0], "s_to": self.where[1]},
             "near": list(self.near),
             "statistic": self.statistic,
+            "threshold": self.threshold,
         }
 
 
@@ -72,7 +77,8 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
     """
     found: dict[tuple[SuspectKind, object], Suspect] = {}
     places = {element.name: element for element in ring.elements}
-    for effect, name, statistic in _candidates(ring, explanation, judgement):
+    threshold = explanation.scan.threshold(judgement.false_alarm)
+    for effect, name, statistic in _candidates(ring, explanation):
         if name not in places:
             continue  # the beam, or a family: no place to look at
         element = places[name]
@@ -84,11 +90,11 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
         elif element.kind in ("hcorrector", "vcorrector"):
             kind, key = "corrector", name
         if (kind, key) not in found and sum(k == kind for k, _ in found) < MOST:
-            found[kind, key] = Suspect(kind, effect, name, where, near, statistic)
+            found[kind, key] = Suspect(kind, effect, name, where, near, statistic, threshold)
     return tuple(found.values())
 
 
-def _candidates(ring: Ring, explanation: Explanation, judgement: Judgement) -> Iterator[Candidate]:
+def _candidates(ring: Ring, explanation: Explanation) -> Iterator[Candidate]:
     """By falling statistic: of the search, then of the scan of what it leaves."""
     told: list[Candidate] = [
         (cause.effect, cause.element, named.detection.statistic)
@@ -99,9 +105,8 @@ def _candidates(ring: Ring, explanation: Explanation, judgement: Judgement) -> I
     told += [(None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()]
     yield from sorted(told, key=lambda candidate: -candidate[2])
     scan = explanation.scan
-    threshold = scan.threshold(judgement.false_alarm)
-    for i in np.argsort(-scan.statistic)[:LOOKED_AT]:
-        if scan.statistic[i] < threshold:
+    for i in np.argsort(-scan.statistic):
+        if scan.statistic[i] < FLOOR:
             break
         effect, name = scan.hypotheses[int(i)]
         if name is not None:

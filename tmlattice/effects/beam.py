@@ -23,7 +23,7 @@ class EnergyOffset(LaunchEffect):
     shifts = 5
     unit = "relative"
     sign = "p of the launch += amount, common to all shots"
-    quantity = "energy"
+    quantity = "energy deviation"
     remedy = "match the energy of the beam to the ring"
     to_check = (
         "Compare the injector's energy with the field of the ring's bends, which all may be off by "

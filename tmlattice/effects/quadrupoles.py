@@ -140,7 +140,7 @@ class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
     error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
-    quantity = "horizontal position"
+    quantity = "horizontal displacement"
     remedy = "move {} back horizontally"
     to_check = "Survey its horizontal position against its neighbours; look at its supports."
     background = 1e-4
@@ -157,7 +157,7 @@ class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
     error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
-    quantity = "vertical position"
+    quantity = "vertical displacement"
     remedy = "move {} back vertically"
     to_check = "Survey its height against its neighbours; look at its supports and its girder."
     background = 1e-4

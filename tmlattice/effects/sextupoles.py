@@ -44,7 +44,7 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     error = "dx"
     unit = "m"
     sign = "x of the magnet's centre"
-    quantity = "horizontal position"
+    quantity = "horizontal displacement"
     remedy = "move {} back horizontally"
     to_check = "Survey its horizontal position against the quadrupoles beside it."
     background = 1e-4
@@ -62,7 +62,7 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     error = "dy"
     unit = "m"
     sign = "y of the magnet's centre"
-    quantity = "vertical position"
+    quantity = "vertical displacement"
     remedy = "move {} back vertically"
     to_check = "Survey its height against the quadrupoles beside it."
     background = 1e-4

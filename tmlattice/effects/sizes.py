@@ -13,13 +13,18 @@ def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
 
     Args:
         wanted: effect -> rms, or None for the catalogue's own; "all" -> a scale of the
-            catalogue's (None: 1) for every effect that has one. Named effects win over "all".
+            catalogue's (None: 1) for every effect that has one; "none" alone: none at all. Named
+            effects win over "all".
 
     Raises:
         EffectError: an effect that has no usual size, or a negative rms.
         UnknownNameError: no such effect.
     """
     wanted = dict(wanted)
+    if "none" in wanted:
+        if len(wanted) > 1:
+            raise EffectError("'none' says that there are no small errors; name it alone")
+        return {}
     chosen: dict[str, float] = {}
     if "all" in wanted:
         scale = wanted.pop("all")

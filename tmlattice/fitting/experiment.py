@@ -224,7 +224,7 @@ def tune_fit(
     name = middle_of_first_arc(ring).name if magnet is None else ring[magnet].name
     with watch.stage("compile"):
         for element in {e.kind: e for e in ring.elements}.values():
-            element_map(element, ring.energy)  # OCELOT compiles some of its own code
+            element_map(element, ring.map_energy)  # OCELOT compiles some of its own code
     with watch.stage("maps"):
         machine = perturbed_ring(ring, name, change)
         network = TaylorNetwork.from_ring(ring)
@@ -299,7 +299,7 @@ def tune_fit_measurement(
     dimension = 6 if measurement.launches[:, 4].any() else 4
     with watch.stage("compile"):
         for element in {e.kind: e for e in ring.elements}.values():
-            element_map(element, ring.energy, dimension)
+            element_map(element, ring.map_energy, dimension)
     with watch.stage("maps"):
         network = TaylorNetwork.from_ring(ring, dimension)
         design_tunes = matrix_tunes(ring_matrix(ring))

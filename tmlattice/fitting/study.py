@@ -25,6 +25,7 @@ from tmlattice.files import output_file, write_json
 from tmlattice.fitting.experiment import DEFAULT_LAUNCH, network_tunes, perturbed_ring
 from tmlattice.fitting.methods import fine_tune
 from tmlattice.lattice import Element, Ring, load_ring
+from tmlattice.lattice.checks import need_monitors
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
@@ -39,7 +40,7 @@ is told which magnets changed: nothing else can be better."""
 
 UNSTABLE = "the perturbed ring is unstable"
 
-_LATTICE = ("lattice", "sequence", "energy")
+_LATTICE = ("lattice", "sequence", "energy", "monitors", "correctors", "particle")
 
 NEW_AMPLITUDE = 5.0
 """New launches, for the prediction, have this many times the fitted launch's amplitude."""
@@ -284,6 +285,9 @@ def study_tune_fit(
     folder: Path | None = None,
     sequence: str | None = None,
     energy: float | None = None,
+    monitors: Sequence[str] = (),
+    correctors: Sequence[str] = (),
+    particle: str | None = None,
     progress: bool = True,
     **options: Any,
 ) -> list[Case]:
@@ -299,7 +303,7 @@ def study_tune_fit(
         scheduler: address of a Dask scheduler; None: local processes.
         workers: local processes; 1: this one; else one a core.
         folder: where every case is written as it ends, and read from when the study goes on.
-        sequence, energy: see `load_ring`.
+        sequence, energy, monitors, correctors, particle: see `load_ring`.
         progress: show a bar where there is a terminal.
         options: of `run_case`.
 
@@ -313,12 +317,15 @@ def study_tune_fit(
     unknown = [m for m in methods if m not in METHODS]
     if unknown or not methods:
         raise TmlatticeError(f"no method '{', '.join(unknown)}'; there are {', '.join(METHODS)}")
-    names = faults(load_ring(lattice, sequence, energy), magnets, kind)
+    marks = (tuple(monitors), tuple(correctors), particle)
+    where = (lattice, sequence, energy, *(marks if any(marks) else ()))
+    ring = load_ring(*where)
+    need_monitors(ring)
+    names = faults(ring, magnets, kind)
     jobs = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
-    where = (lattice, sequence, energy)
     with nullcontext() if folder is not None else TemporaryDirectory() as temporary:
         if folder is not None:
-            _open_folder(folder, {**dict(zip(_LATTICE, where, strict=True)), **options})
+            _open_folder(folder, {**dict(zip(_LATTICE, where, strict=False)), **options})
         results = run_batch(
             _work,
             {_name_of(job): partial(tuple, (where, job, options)) for job in jobs},

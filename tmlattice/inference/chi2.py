@@ -1,10 +1,10 @@
-"""Tails of the chi-square distribution, without scipy.stats, whose import takes half a second."""
+"""Tails of chi-square and Student's t, without scipy.stats, whose import takes half a second."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc, chdtri, stdtr, stdtrit
 
 
 def sf(statistic: ArrayLike, freedom: ArrayLike) -> Any:
@@ -14,6 +14,25 @@ def sf(statistic: ArrayLike, freedom: ArrayLike) -> Any:
     """
     tail = chdtrc(freedom, np.maximum(statistic, 0.0))
     return np.where(np.asarray(freedom) > 0, tail, np.nan)[()]
+
+
+def known(square: float, freedom: float) -> float:
+    """The chi-square of one degree that is as rare as the square of Student's t.
+
+    Args:
+        square: of an amount over its error, whose variance is itself an estimate.
+        freedom: degrees of that estimate; infinite: it is known.
+    """
+    if not np.isfinite(freedom):
+        return square
+    return float(chdtri(1, max(2 * stdtr(freedom, -np.sqrt(square)), 1e-300)))
+
+
+def estimated(square: float, freedom: float) -> float:
+    """The square of Student's t that is as rare as this chi-square of one degree: see `known`."""
+    if not np.isfinite(freedom):
+        return square
+    return float(stdtrit(freedom, max(0.5 * chdtrc(1, square), 1e-300)) ** 2)
 
 
 def isf(rate: ArrayLike, freedom: ArrayLike) -> Any:

@@ -1,7 +1,8 @@
 """How far the gap between model and measurement shrinks, judged on readings that no fit saw.
 
-closed = 1 - (r_after^2 - sigma^2) / (r_before^2 - sigma^2), where sigma^2 is the variance of a
-reading and of what the refitted nuisances predict for it.
+closed = 1 - (r_after^2 - v) / (r_before^2 - v), where v is the variance that the noise of readings
+makes of what is left, refitted nuisances included. Its interval says what the noise of these
+readings leaves open of it.
 """
 
 from collections.abc import Sequence
@@ -12,15 +13,93 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-DRAWS = 400
-
 
 @dataclass(frozen=True)
 class Misfit:
-    """What a model leaves: rms in m, and chi-square per degree of freedom."""
+    """What a model leaves.
+
+    Attributes:
+        rms: m.
+        chi2_per_dof: per reading, in the covariance that the model expects.
+        expected: the rms that the model expects, m: of noise, of refitted nuisances, and of what is
+            not known of the model; None where nobody asked.
+    """
 
     rms: float
     chi2_per_dof: float
+    expected: float | None = None
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a model leaves of readings that no fit saw, some of them correlated.
+
+    Attributes:
+        residual: readings less model, [reading], m.
+        noise: covariance that the noise of readings makes of that, [reading, reading], m^2.
+        covariance: the same with what is not known of the model; None: nothing more.
+    """
+
+    residual: Array
+    noise: Array
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True)
+class Half:
+    """Readings of one half of the monitors.
+
+    Attributes:
+        left: less the model, [reading], m.
+        slopes: d reading / d nuisance, [reading, nuisance].
+        sigma: noise, [reading], m.
+    """
+
+    left: Array
+    slopes: Array
+    sigma: Array
+
+
+def other_half(
+    gives: Half, scored: Half, off: Array, known: Array, unknown: Array | None = None
+) -> Left:
+    """What a model leaves of one half where the other one gives the nuisances.
+
+    Args:
+        gives, scored: the halves.
+        off: nuisances as known beforehand less those that the model stands at, [nuisance].
+        known: precision of that, [nuisance]; 0 where nothing is known.
+        unknown: covariance of what is not known of the model, readings of both halves, those that
+            give first, [reading, reading], m^2; None: nothing.
+    """
+    # by the noise alone: nuisances so fitted take up what else is wrong near these readings
+    weighed = gives.slopes / gives.sigma[:, None] ** 2
+    information = gives.slopes.T @ weighed + np.diag(known)
+    size = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    inverse = np.linalg.pinv(information / size[:, None] / size) / size[:, None] / size
+    gain = inverse @ weighed.T  # nuisance per reading
+    moved = gain @ gives.left + inverse @ (known * off)
+    errors = (gain * gives.sigma**2) @ gain.T + (inverse * known) @ inverse
+    noise = np.diag(scored.sigma**2) + scored.slopes @ errors @ scored.slopes.T
+    whole = None
+    if unknown is not None:
+        takes = np.hstack([-scored.slopes @ gain, np.eye(len(scored.left))])
+        whole = noise + takes @ unknown @ takes.T
+    return Left(scored.left - scored.slopes @ moved, noise, whole)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """All held-out readings of one model.
+
+    Attributes:
+        residuals: readings less model, NaN where not scored, [shot, reading, 2], m.
+        parts: those that are scored, in groups without correlation with one another; empty where
+            the model has no answer.
+    """
+
+    residuals: Array
+    parts: tuple[Left, ...]
 
 
 @dataclass(frozen=True)
@@ -30,30 +109,31 @@ class Gap:
     Attributes:
         misfits: of each model, in the order asked for.
         residuals: readings less model, NaN where not scored, [model, shot, reading, 2], m.
-        closed: share of the first model's gap that the last one closes; None where there is
-            one model only, or the first has no gap beyond the noise.
-        interval: of `closed`, 95 %, by bootstrap over shots and monitors.
+        closed: share of the gap of model `since` that the last one closes; None where that is the
+            last one itself, or has no gap beyond the noise.
+        interval: of `closed`, 95 %.
+        since: index of the model with which the last one is compared.
     """
 
     misfits: tuple[Misfit, ...]
     residuals: Array
     closed: float | None
     interval: tuple[float, float] | None
+    since: int = 0
 
 
-def held_out_gap(judged: Sequence[tuple[Array, Array]], seed: int = 0) -> Gap:
+def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
     """The gap of a series of models on readings that no fit saw.
 
     Args:
-        judged: by model, the first the design's: what it leaves, NaN where not scored, and the rms
-            to expect of that, both [shot, reading, 2], m.
-        seed: of the bootstrap.
+        judged: by model, the first the design's.
+        since: the model whose gap is closed by the last one.
     """
-    misfits = tuple(misfit(residual, sigma) for residual, sigma in judged)
+    misfits = tuple(_misfit(model.parts) for model in judged)
     closed, interval = None, None
-    if len(judged) > 1:
-        closed, interval = _closed(*judged[0], *judged[-1], seed)
-    return Gap(misfits, np.array([residual for residual, _ in judged]), closed, interval)
+    if since < len(judged) - 1 and judged[since].parts and judged[-1].parts:
+        closed, interval = _closed(judged[since].parts, judged[-1].parts)
+    return Gap(misfits, np.array([model.residuals for model in judged]), closed, interval, since)
 
 
 def misfit(residual: Array, sigma: Array) -> Misfit:
@@ -65,29 +145,40 @@ def misfit(residual: Array, sigma: Array) -> Misfit:
     return Misfit(float(np.sqrt((r**2).mean())), float(((r / s) ** 2).mean()))
 
 
+def _misfit(parts: Sequence[Left]) -> Misfit:
+    count = sum(len(part.residual) for part in parts)
+    if not count:
+        return Misfit(np.nan, np.nan)
+    square = chi2 = expected = 0.0
+    for part in parts:
+        covariance = part.noise if part.covariance is None else part.covariance
+        square += float(part.residual @ part.residual)
+        chi2 += float(part.residual @ np.linalg.solve(covariance, part.residual))
+        expected += float(np.trace(covariance))
+    return Misfit(float(np.sqrt(square / count)), chi2 / count, float(np.sqrt(expected / count)))
+
+
 def _closed(
-    before: Array, sigma_before: Array, after: Array, sigma_after: Array, seed: int
+    before: Sequence[Left], after: Sequence[Left]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    valid = np.isfinite(before) & np.isfinite(after)
-    squares = [
-        np.where(valid, np.nan_to_num(r) ** 2 - s**2, 0.0).sum(axis=2)
-        for r, s in ((before, sigma_before), (after, sigma_after))
-    ]  # [shot, reading]
-    counts = valid.sum(axis=2)
-    spread = np.where(valid, 2 * sigma_before**4, 0.0).sum()
-    total = squares[0].sum()
-    if total < 5 * np.sqrt(spread):
+    """The noise is the same in both, so that much of it goes out of their ratio."""
+    top = bottom = spread_top = spread_bottom = shared = 0.0
+    for one, other in zip(before, after, strict=True):
+        if len(one.residual) != len(other.residual):
+            return None, None  # the beam is lost in one of them
+        V = other.noise
+        twice = float(np.vdot(V, V))
+        moved_one, moved_other = V @ one.residual, V @ other.residual
+        bottom += float(one.residual @ one.residual - np.trace(one.noise))
+        top += float(other.residual @ other.residual - np.trace(V))
+        # of what is left without noise, the noise being taken out of its estimate
+        spread_bottom += 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
+        spread_top += 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
+        shared += 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
+    if bottom < 5 * np.sqrt(spread_bottom):
         return None, None
-    closed = float(1 - squares[1].sum() / total)
-    random = np.random.default_rng([seed, 2])
-    shots = len(squares[0])
-    draws = []
-    columns = np.flatnonzero(counts.any(axis=0))
-    for _ in range(DRAWS):
-        s = random.integers(0, shots, shots)
-        m = columns[random.integers(0, len(columns), len(columns))]
-        top, bottom = (q[s][:, m].sum() for q in (squares[1], squares[0]))
-        if bottom > 0:
-            draws.append(1 - top / bottom)
-    low, high = np.quantile(draws, [0.025, 0.975]) if draws else (np.nan, np.nan)
-    return closed, (float(low), float(high))
+    left = max(top, 0.0) / bottom
+    variance = (spread_top + left**2 * spread_bottom - 2 * left * shared) / bottom**2
+    width = 1.96 * float(np.sqrt(max(variance, 0.0)))
+    closed = 1 - left
+    return float(closed), (float(closed - width), float(min(closed + width, 1.0)))

@@ -100,6 +100,11 @@ class Problem(ABC):
     def metric(self, point: Point) -> Metric:
         """Products of signatures about a point."""
 
+    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
+        """Degrees of freedom with which the variance of readings along a hypothesis is known;
+        infinite where nothing of it was learnt from them."""
+        return np.inf
+
     @abstractmethod
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those that sit between the same monitors."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.rivals import Detection, Rival, rivals
@@ -242,6 +243,14 @@ def _options(search: Search, state: State, look: Look) -> list[Option]:
     statistic = float(look.named.statistic.max(initial=0.0))
     rate = judge.rate("named")
     detection = Detection(statistic, look.named.threshold(rate), look.named.p_value(statistic))
+    if detection.p_value < rate:
+        top = look.named.hypotheses[int(look.named.statistic.argmax())]
+        freedom = problem.certainty(state.fit.point, top)
+        detection = Detection(
+            statistic,
+            chi2.estimated(detection.threshold, freedom),
+            look.named.p_value(chi2.known(statistic, freedom)),
+        )
     if detection.p_value < rate or (search.by_evidence and statistic > 0):
         tried = rivals(problem, state.fit, look.named, search.hypotheses)
         if tried and (search.by_evidence or tried[0].fit.chi2 < state.fit.chi2):

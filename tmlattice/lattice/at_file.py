@@ -2,13 +2,14 @@
 
 Each AT element becomes an OCELOT element of the same first- and second-order physics:
 
-- `PolynomB[n]` is k_n / n! and a complex strength B + i A = |k| exp(-i (n + 1) tilt), so a skew
-  quadrupole (A) is one tilted by -pi / 4. A multipole is known by its strengths, then by MADType.
+- `PolynomB[n]` is k_n / n! and `PolynomA[n]` is k_ns / n!: see `at_fields`. Fields of one order
+  are a tilted magnet, a skew quadrupole (A > 0) one tilted by -pi / 4; of several, a combined one.
 - A bend keeps its edges (angles, gap, fringe integrals, pole curvature), k1 and k2. The nonlinear
   fringes of quadrupoles are of third order and left out. To second order OCELOT's bend is the
   fuller one: AT's has no product of curvature and gradient, and edges of first order.
 - Wigglers made of thin bends of alternating sign become one matrix each (`_merge_wigglers`).
-- A corrector's plane is its MADType (HKICKER, VKICKER), else its kick, else its name.
+- A corrector kicks px += KickAngle[0], py += KickAngle[1]. It has one plane where its MADType
+  (HKICKER, VKICKER) or its name says so; else it is two correctors in one place, NAME_h and NAME_v.
 - A cavity is a drift to the maps; over several turns it gives what its voltage says.
 
 Coordinates of a matrix element are turned from AT's (.., delta, ct) into OCELOT's (.., tau, p):
@@ -20,7 +21,9 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,16 +32,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.places import place_elements
-from tmlattice.lattice.ring import Kind, Ring
+from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
+from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
+from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-ELECTRON_GEV = 0.51099895e-3
-
 _VERTICAL = re.compile(r"^(f?v|c[hy]?v|pcv|pkv|c_?y|ky)|vcor|vkick|vcm|_v(_|\d|$)", re.IGNORECASE)
+_HORIZONTAL = re.compile(r"^(f?h|c[vx]?h|pch|pkh|c_?x|kx)|hcor|hkick|hcm|_h(_|\d|$)", re.IGNORECASE)
 
 THIN_BEND = 0.1
 """m; a bend not longer than this may be a slice of a wiggler."""
@@ -65,7 +68,8 @@ def read_at(
 
     options = {"use": sequence} if sequence else {}
     try:
-        lattice = at.load_lattice(str(path), **options)
+        with quiet_at():
+            lattice = at.load_lattice(str(path), **options)
     except Exception as error:  # each of AT's readers fails in its own way
         said = " ".join(str(error).split()) or type(error).__name__
         raise LatticeError(
@@ -73,6 +77,16 @@ def read_at(
             "save_lattice, or name its variable with sequence="
         ) from error
     return ring_from_at(lattice, name, energy)
+
+
+@contextmanager
+def quiet_at() -> Iterator[None]:
+    """What AT warns of stays in the log: it is about AT's tracking, or about words of a file."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        yield
+    for warning in told:
+        log.info("AT: %s", warning.message)
 
 
 def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
@@ -93,45 +107,25 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         second, which are left out.
     """
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
+    rest = float(lattice.particle.rest_energy) / 1e9
+    light = rest < 2 * ELECTRON_GEV  # an electron, or AT's particle that is as fast as light
+    design = Ring(name, (), energy_gev, mass=ELECTRON_GEV if light else rest)
     left_out: Counter[str] = Counter()
-    converted: list[tuple[str, Kind, Any]] = []
-    known: dict[int, tuple[str, Kind, Any]] = {}
+    converted: list[Place] = []
+    known: dict[int, list[Place]] = {}
     for element in lattice:
         if id(element) not in known:
             family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
-            kind, source = _convert(element, family, energy_gev, left_out)
-            known[id(element)] = (family, kind, source)
-        converted.append(known[id(element)])
+            known[id(element)] = _places(element, family, design.map_energy, left_out)
+        converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     if left_out:
         what = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
         warnings.warn(f"'{name}': left out of the model: {what}", stacklevel=3)
-    merged = _merge_wigglers(converted, energy_gev) * max(1, int(lattice.periodicity))
+    merged = _merge_wigglers(converted, design.map_energy) * max(1, int(lattice.periodicity))
     families, kinds, sources = zip(*merged, strict=True)
-    return Ring(name, place_elements(families, sources, kinds), energy_gev)
-
-
-def _strengths(element: Any) -> NDArray[np.complex128]:
-    """B + i A of the orders that AT uses, scaled, [order]."""
-    B = np.atleast_1d(np.asarray(getattr(element, "PolynomB", [0.0]), dtype=float))
-    A = np.atleast_1d(np.asarray(getattr(element, "PolynomA", [0.0]), dtype=float))
-    orders = max(len(B), len(A))
-    total = np.zeros(orders, dtype=complex)
-    total[: len(B)] += B
-    total[: len(A)] += 1j * A
-    highest = int(getattr(element, "MaxOrder", orders - 1))
-    total[highest + 1 :] = 0.0
-    total *= float(getattr(element, "FieldScaling", 1.0))
-    return total
-
-
-def _normal(strength: complex, order: int) -> tuple[float, float]:
-    """Derivative strength k_n and tilt of B + i A: signed and upright where A is zero."""
-    if strength.imag == 0.0:
-        return strength.real * math.factorial(order), 0.0
-    tilt = -math.atan2(strength.imag, strength.real) / (order + 1)
-    return abs(strength) * math.factorial(order), tilt
+    return replace(design, elements=place_elements(families, sources, kinds))
 
 
 def _roll(element: Any, left_out: Counter[str]) -> float:
@@ -152,15 +146,30 @@ def _roll(element: Any, left_out: Counter[str]) -> float:
     return roll
 
 
-def _convert(element: Any, family: str, energy: float, left_out: Counter[str]) -> tuple[Kind, Any]:
+def _places(element: Any, family: str, energy: float, left_out: Counter[str]) -> list[Place]:
+    """What one AT element is in the ring: one element, but for correctors of both planes and bends
+    with coils."""
+    import at
+
+    mad = str(getattr(element, "MADType", "")).upper()
+    mad = mad or str(getattr(element, "origin", "")).upper()
+    if isinstance(element, at.Corrector):
+        return _correctors(element, family, mad)
+    kind, source = _convert(element, family, mad, energy, left_out)
+    if kind == "bend":
+        return with_coils(element, family, source)
+    return [(family, kind, source)]
+
+
+def _convert(
+    element: Any, family: str, mad: str, energy: float, left_out: Counter[str]
+) -> tuple[Kind, Any]:
     """Kind and OCELOT element of one AT element."""
     import at
 
     from tmlattice.lattice.ocelot import elements as ocelot
 
     length = float(getattr(element, "Length", 0.0))
-    mad = str(getattr(element, "MADType", "")).upper()
-    mad = mad or str(getattr(element, "origin", "")).upper()
     roll = _roll(element, left_out)
     if isinstance(element, at.RFCavity):
         voltage, frequency = (float(getattr(element, k, 0.0)) for k in ("Voltage", "Frequency"))
@@ -171,17 +180,17 @@ def _convert(element: Any, family: str, energy: float, left_out: Counter[str]) -
         return "monitor", ocelot.Monitor(l=length, eid=family)
     if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
         return "monitor", ocelot.Monitor(l=length, eid=family)  # lattices from before the class
-    if isinstance(element, at.Corrector):
-        return _corrector(element, family, length, mad)
     if isinstance(element, at.M66):
         return _matrix(np.asarray(element.M66, dtype=float), family, length, energy)
     if isinstance(element, at.ThinMultipole) and not isinstance(element, at.Multipole):
-        return _thin(element, family, roll, left_out)
-    if isinstance(element, at.Dipole) or getattr(element, "BendingAngle", False):
-        return _bend(element, family, length, roll, left_out)
+        return thin(element, family, mad, roll, left_out)
+    if getattr(element, "BendingAngle", 0.0) or (
+        isinstance(element, at.Dipole) and not element.PassMethod.startswith("Str")
+    ):
+        return bend(element, family, length, roll, left_out)
     if isinstance(element, at.Multipole):
-        return _straight(element, family, length, mad, roll, left_out)
-    if isinstance(element, at.Drift | at.Marker) or "Identity" in element.PassMethod:
+        return straight(element, family, length, mad, roll, left_out)
+    if isinstance(element, at.Drift | at.Marker | at.Aperture) or "Identity" in element.PassMethod:
         if length:
             return "drift", ocelot.Drift(l=length, eid=family)
         return "marker", ocelot.Marker(eid=family)
@@ -193,23 +202,23 @@ def _convert(element: Any, family: str, energy: float, left_out: Counter[str]) -
     return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source
 
 
-def _corrector(element: Any, family: str, length: float, mad: str) -> tuple[Kind, Any]:
-    """One plane by MADType, else by its kick, else by name (horizontal when nothing tells)."""
-    from tmlattice.lattice.ocelot import elements as ocelot
-
-    x, y = (float(k) for k in np.asarray(element.KickAngle, dtype=float).ravel()[:2])
+def _correctors(element: Any, family: str, mad: str) -> list[Place]:
+    """One corrector where something tells its plane, else one of each plane."""
+    kicks = np.zeros(2)
+    given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
+    kicks[: len(given)] = given
+    x, y = kicks.tolist()
+    names = (str(element.FamName), family)
+    horizontal = mad == "HKICKER" or any(_HORIZONTAL.search(name) for name in names)
+    vertical = mad == "VKICKER" or any(_VERTICAL.search(name) for name in names)
+    length = float(getattr(element, "Length", 0.0))
     if mad in ("HKICKER", "VKICKER"):
-        vertical = mad == "VKICKER"
-    elif x != 0.0 or y != 0.0:
-        vertical = abs(y) > abs(x)
-    else:
-        vertical = any(_VERTICAL.search(n) for n in (str(element.FamName), family))
-    cls = ocelot.Vcor if vertical else ocelot.Hcor
-    source = cls(l=length, angle=y if vertical else x, eid=family)
-    if x != 0.0 and y != 0.0:  # both planes kick: OCELOT has it as a tilted horizontal one
-        source = ocelot.Hcor(l=length, angle=math.hypot(x, y), eid=family)
-        source.tilt = math.atan2(y, x)
-    return ("vcorrector" if vertical else "hcorrector"), source
+        horizontal, vertical = mad == "HKICKER", mad == "VKICKER"
+    if horizontal and not vertical and y == 0.0:
+        return [corrector(family, "h", length, x)]
+    if vertical and not horizontal and x == 0.0:
+        return [corrector(family, "v", length, y)]
+    return corrector_pair(family, length, x, y)
 
 
 def _matrix(r: Array, family: str, length: float, energy: float) -> tuple[Kind, Any]:
@@ -226,99 +235,7 @@ def _matrix(r: Array, family: str, length: float, energy: float) -> tuple[Kind, 
     return ("wiggler" if "wig" in family else "matrix"), source
 
 
-def _thin(element: Any, family: str, roll: float, left_out: Counter[str]) -> tuple[Kind, Any]:
-    """A kick px -= Re, py += Im of (B + i A) (x + i y)^n, to second order, as a matrix element."""
-    from tmlattice.lattice.ocelot import elements as ocelot
-
-    strengths = _strengths(element)
-    if np.any(strengths[3:]):
-        left_out["thin multipoles above the sextupole"] += 1
-    turned = [k * np.exp(-1j * (n + 1) * roll) for n, k in enumerate(strengths[:3])]
-    k0, k1, k2 = (complex(k) for k in (*turned, 0.0, 0.0, 0.0)[:3])
-    source = ocelot.Matrix(l=0.0, eid=family)
-    r, t = np.eye(6), np.zeros((6, 6, 6))
-    r[1, 0], r[1, 2], r[3, 0], r[3, 2] = -k1.real, k1.imag, k1.imag, k1.real
-    t[1, 0, 0], t[1, 2, 2], t[3, 0, 0], t[3, 2, 2] = -k2.real, k2.real, k2.imag, -k2.imag
-    t[1, 0, 2] = t[1, 2, 0] = k2.imag
-    t[3, 0, 2] = t[3, 2, 0] = k2.real
-    source.r, source.t = r, t
-    source.b = np.array([[0.0], [-k0.real], [0.0], [k0.imag], [0.0], [0.0]])
-    return "multipole", source
-
-
-def _bend(
-    element: Any, family: str, length: float, roll: float, left_out: Counter[str]
-) -> tuple[Kind, Any]:
-    from tmlattice.lattice.ocelot import elements as ocelot
-
-    strengths = (*_strengths(element), 0.0, 0.0, 0.0)
-    if strengths[0] != 0 or np.any(np.asarray(getattr(element, "KickAngle", (0.0, 0.0)))):
-        left_out["field errors of bends"] += 1
-    if any(complex(k).imag for k in strengths) or any(strengths[3:]):
-        left_out["skew fields and octupoles of bends"] += 1
-    source = ocelot.SBend(
-        l=length,
-        angle=float(element.BendingAngle),
-        k1=complex(strengths[1]).real,
-        k2=2.0 * complex(strengths[2]).real,
-        e1=float(getattr(element, "EntranceAngle", 0.0)),
-        e2=float(getattr(element, "ExitAngle", 0.0)),
-        tilt=roll,
-        gap=float(getattr(element, "FullGap", 0.0)),
-        fint=float(getattr(element, "FringeInt1", 0.0)),
-        fintx=float(getattr(element, "FringeInt2", 0.0)),
-        h_pole1=float(getattr(element, "H1", 0.0)),
-        h_pole2=float(getattr(element, "H2", 0.0)),
-        eid=family,
-    )
-    return "bend", source
-
-
-def _straight(
-    element: Any, family: str, length: float, mad: str, roll: float, left_out: Counter[str]
-) -> tuple[Kind, Any]:
-    """Quadrupole, sextupole or octupole, by strengths; at zero strength by class or MADType."""
-    import at
-
-    from tmlattice.lattice.ocelot import elements as ocelot
-
-    strengths = _strengths(element)
-    if strengths[0] != 0 or np.any(np.asarray(getattr(element, "KickAngle", (0.0, 0.0)))):
-        left_out["dipole kicks of multipoles"] += 1
-    orders = [n for n in range(1, len(strengths)) if strengths[n] != 0]
-    if orders:
-        order = orders[0]
-    elif isinstance(element, at.Quadrupole) or mad == "QUADRUPOLE":
-        order = 1
-    elif isinstance(element, at.Octupole) or mad == "OCTUPOLE":
-        order = 3
-    elif isinstance(element, at.Sextupole) or mad == "SEXTUPOLE":
-        order = 2
-    else:
-        return "multipole", ocelot.Quadrupole(l=length, k1=0.0, eid=family)
-    k, tilt = (0.0, 0.0) if not orders else _normal(complex(strengths[order]), order)
-    rest = [n for n in orders if n != order]
-    k2 = 0.0
-    if order == 1 and 2 in rest:
-        second = complex(strengths[2]) * np.exp(3j * tilt)  # in the quadrupole's own frame
-        if abs(second.imag) <= 1e-12 * abs(second):
-            k2 = 2.0 * second.real
-            rest.remove(2)
-    if rest:
-        left_out["higher orders of multipoles"] += 1
-    if order == 1:
-        return "quadrupole", ocelot.Quadrupole(l=length, k1=k, k2=k2, tilt=tilt + roll, eid=family)
-    if order == 2:
-        return "sextupole", ocelot.Sextupole(l=length, k2=k, tilt=tilt + roll, eid=family)
-    if order == 3:
-        return "octupole", ocelot.Octupole(l=length, k3=k, tilt=tilt + roll, eid=family)
-    left_out["multipoles above the octupole"] += 1
-    return "multipole", ocelot.Drift(l=length, eid=family)
-
-
-def _merge_wigglers(
-    places: list[tuple[str, Kind, Any]], energy: float
-) -> list[tuple[str, Kind, Any]]:
+def _merge_wigglers(places: list[Place], energy: float) -> list[Place]:
     """Each row of thin bends of alternating sign as one matrix element of the family `wiggler`.
 
     The matrix is the product of the slices' own 6 x 6 matrices, edges included, so tunes and
@@ -328,8 +245,8 @@ def _merge_wigglers(
     from tmlattice.lattice.ocelot import elements as ocelot
 
     matrices: dict[int, Array] = {}
-    merged: list[tuple[str, Kind, Any]] = []
-    row: list[tuple[str, Kind, Any]] = []
+    merged: list[Place] = []
+    row: list[Place] = []
 
     def product(sources: Iterable[Any]) -> Array:
         total = np.eye(6)

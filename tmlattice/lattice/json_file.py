@@ -17,17 +17,17 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice.places import place_elements
-from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring, number_names
+from tmlattice.lattice.ring import ELECTRON_GEV, NO_ERRORS, Element, Errors, Ring, number_names
 from tmlattice.lattice.source import blank, made
 
 FORMAT, VERSION = "tmlattice-lattice", 1
 
 CLASSES = (
-    "Aperture", "Bend", "Cavity", "Drift", "Hcor", "Marker", "Matrix", "Monitor", "Multipole",
-    "Octupole", "Quadrupole", "RBend", "SBend", "Sextupole", "Solenoid", "TDCavity", "TWCavity",
-    "Undulator", "UnknownElement", "Vcor", "XYQuadrupole",
+    "Aperture", "Bend", "Cavity", "CombinedMultipole", "Drift", "Hcor", "Marker", "Matrix",
+    "Monitor", "Multipole", "Octupole", "Quadrupole", "RBend", "SBend", "Sextupole", "Solenoid",
+    "TDCavity", "TWCavity", "Undulator", "UnknownElement", "Vcor", "XYQuadrupole",
 )  # fmt: skip
-"""OCELOT's element classes that a file may name."""
+"""OCELOT's element classes that a file may name, and the package's own of them."""
 
 
 def save_ring(ring: Ring, path: str | Path) -> None:
@@ -75,6 +75,7 @@ def save_ring(ring: Ring, path: str | Path) -> None:
                 "package": __version__,
                 "name": ring.name,
                 "energy_gev": ring.energy,
+                **({} if ring.mass == ELECTRON_GEV else {"mass_gev": ring.mass}),
                 "changes": {name: dict(change) for name, change in ring.changes.items()},
                 "definitions": definitions,
                 "sequence": sequence,
@@ -92,6 +93,16 @@ def is_own(path: Path) -> bool:
     if not isinstance(content, dict):
         raise LatticeError(f"'{path}' holds no lattice; give the package's own JSON or AT's")
     return "format" in content or "atjson" not in content
+
+
+def is_xsuite(path: Path) -> bool:
+    """Whether a JSON file is a line or an environment of Xsuite.
+
+    Raises:
+        LatticeError: it is no JSON.
+    """
+    content = _content(path)
+    return isinstance(content, dict) and "elements" in content and "xtrack_version" in content
 
 
 def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
@@ -135,7 +146,8 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
         for e, key in zip(elements, keys, strict=True)
     )
     energy = float(content["energy_gev"]) if energy is None else energy
-    return Ring(name, elements, energy, content.get("changes", {}))
+    mass = float(content.get("mass_gev", ELECTRON_GEV))
+    return Ring(name, elements, energy, content.get("changes", {}), mass)
 
 
 def _content(path: Path) -> Any:

@@ -1,15 +1,19 @@
 """One door to all lattice files: the suffix says which reader it is."""
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice import stored
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.marked import marked
+from tmlattice.lattice.ring import PARTICLES, Ring
 
 AT_SUFFIXES = (".mat", ".m", ".repr")
-MADX_SUFFIXES = (".seq", ".madx")
+MADX_SUFFIXES = (".seq", ".madx", ".lte")
+TFS_SUFFIXES = (".tfs", ".twiss", ".dat", ".outx")
 
 
 def _builtin_folder() -> Path:
@@ -24,23 +28,41 @@ def builtin_lattices() -> list[str]:
 
 
 def load_ring(
-    name_or_path: str | Path, sequence: str | None = None, energy: float | None = None
+    name_or_path: str | Path,
+    sequence: str | None = None,
+    energy: float | None = None,
+    monitors: str | Sequence[str] | None = None,
+    correctors: str | Sequence[str] | None = None,
+    particle: str | None = None,
 ) -> Ring:
     """The ring of a built-in lattice or of a lattice file.
 
     Names that stand more than once are numbered in beam order. What the maps cannot model is
     warned of (an octupole is a drift at second order). Each reader says what it takes over:
-    `read_ocelot`, `read_at`, `read_madx`, `read_json`.
+    `read_ocelot`, `read_at`, `read_madx`, `read_xsuite`, `read_tfs`, `read_json`.
 
     Args:
         name_or_path: "petra3", or a path: OCELOT (`.py`; it is code, and is run), AT (`.mat`,
-            `.m`, `.repr`, `.json`), MAD-X (`.seq`, `.madx`) or the package's own JSON.
+            `.m`, `.repr`, `.json`), MAD-X (`.seq`, `.madx`, or a TWISS table: `.tfs`, `.twiss`,
+            `.dat`), elegant (`.lte`), Xsuite (`.json`) or the package's own JSON.
         sequence: which one the file's variables, keys or sequences is the ring.
         energy: GeV; else what the file states.
+        monitors, correctors: patterns of names, such as "BPM*", of elements that are monitors or
+            correctors although the file does not say so: see `marked`.
+        particle: "electron" or "proton"; else what the file states, an electron where it is silent.
 
     Raises:
         LatticeError: no such file, it cannot be read, or it holds no ring.
     """
+    ring = marked(_loaded(name_or_path, sequence, energy), monitors, correctors)
+    if particle is None:
+        return ring
+    if particle not in PARTICLES:
+        raise unknown_name("particle", particle, PARTICLES)
+    return replace(ring, mass=PARTICLES[particle])
+
+
+def _loaded(name_or_path: str | Path, sequence: str | None, energy: float | None) -> Ring:
     path = _find(str(name_or_path))
     name = str(name_or_path)
     key = stored.key_of(path, sequence, energy)
@@ -64,14 +86,22 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
 
         return read_ocelot(path, name, sequence, energy)
     if suffix == ".json":
-        from tmlattice.lattice.json_file import is_own, read_json
+        from tmlattice.lattice.json_file import is_own, is_xsuite, read_json
 
+        if is_xsuite(path):
+            from tmlattice.lattice.madx_file import read_xsuite
+
+            return read_xsuite(path, name, sequence, energy)
         if is_own(path):
             return read_json(path, name, energy)
     if suffix in MADX_SUFFIXES:
         from tmlattice.lattice.madx_file import read_madx
 
         return read_madx(path, name, sequence, energy)
+    if suffix in TFS_SUFFIXES:
+        from tmlattice.lattice.tfs_file import read_tfs
+
+        return read_tfs(path, name, energy)
     from tmlattice.lattice.at_file import read_at
 
     return read_at(path, name, sequence, energy)
@@ -82,14 +112,14 @@ def _find(name: str) -> Path:
     if name.casefold() in builtin:
         return _builtin_folder() / f"{name.casefold()}.py"
     path = Path(name)
-    known = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES)
+    known = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES, *TFS_SUFFIXES)
     if path.suffix.lower() in known and path.is_file():
         return path
     if path.is_file():
         raise LatticeError(
             f"'{name}' is no lattice file that can be read; give OCELOT code (.py), AT (.mat, .m, "
-            f".repr, .json), MAD-X (.seq, .madx), the package's own JSON or a built-in name "
-            f"({', '.join(builtin)})"
+            f".repr, .json), MAD-X (.seq, .madx; a TWISS table: .tfs), elegant (.lte), Xsuite "
+            f"(.json), the package's own JSON or a built-in name ({', '.join(builtin)})"
         )
     if path.suffix:
         raise LatticeError(f"no lattice file '{name}'; check the path")

@@ -1,12 +1,15 @@
-"""Reading a MAD-X sequence or line, through AT's own reader of that language."""
+"""Reading a MAD-X sequence or line, a line of elegant, or one of Xsuite, through AT's readers."""
 
+import json
 import re
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 from tmlattice.errors import LatticeError, unknown_name
-from tmlattice.lattice.at_file import ring_from_at
+from tmlattice.lattice.at_file import quiet_at, ring_from_at
+from tmlattice.lattice.madx_matrix import matrix_command
 from tmlattice.lattice.ring import Ring
 
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
@@ -15,47 +18,95 @@ _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I
 def read_madx(
     path: Path, name: str, sequence: str | None = None, energy: float | None = None
 ) -> Ring:
-    """The ring of a MAD-X file.
+    """The ring of a MAD-X or elegant file.
 
     Args:
-        path: `.seq` or `.madx`; files that it calls are read too.
+        path: `.seq`, `.madx` or elegant's `.lte`; files that it calls are read too.
         name: of the ring.
         sequence: of the file's sequences or lines; else `ring`, else the only one.
-        energy: GeV; else the file's BEAM.
+        energy: GeV; else the file's BEAM (elegant's files have none).
 
     Raises:
         LatticeError: no sequence, several without a choice, no energy, or AT cannot read it.
     """
     import at
 
-    parser = at.MadxParser(verbose=False)
+    elegant = path.suffix.lower() == ".lte"
+    parser = (
+        at.ElegantParser(verbose=False)
+        if elegant
+        else at.MadxParser(verbose=False, matrix=matrix_command())
+    )
     try:
-        with redirect_stdout(StringIO()):
+        with redirect_stdout(StringIO()), quiet_at():
             parser.parse_files(str(path))
     except Exception as error:
         raise _unreadable(path, error) from error
-    found = [str(s) for s in parser.sequences]
-    if not found:
-        raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a MAD-X file with one")
-    use = sequence.casefold() if sequence else "ring" if "ring" in found else found[-1]
-    if sequence and use not in found:
-        raise unknown_name(f"sequence in '{path}' named", sequence, found)
-    if not sequence and "ring" not in found and len(found) > 1:
-        raise LatticeError(
-            f"'{path}' has the sequences {', '.join(found)}; name one with sequence="
-        )
-    beams = [dict(v) for k, v in parser.items() if str(k).startswith("beam%")]
-    stated = _BEAM.search(path.read_text(encoding="utf-8", errors="replace"))
-    if energy is None and not stated and beams == [dict(at.MadxParser()["beam%"])]:
-        raise LatticeError(f"'{path}' has no BEAM with an energy; say energy= (GeV)")
+    use = _chosen(path, [str(s) for s in parser.sequences], sequence)
+    if elegant:
+        stated = False
+    else:
+        beams = [dict(v) for k, v in parser.items() if str(k).startswith("beam%")]
+        text = path.read_text(encoding="utf-8", errors="replace")
+        stated = bool(_BEAM.search(text)) or beams != [dict(at.MadxParser()["beam%"])]
+    if energy is None and not stated:
+        lacks = "no beam energy" if elegant else "no BEAM with an energy"
+        raise LatticeError(f"'{path}' has {lacks}; say energy= (GeV)")
     try:
-        with redirect_stdout(StringIO()):
+        with redirect_stdout(StringIO()), quiet_at():
             lattice = parser.lattice(use=use)
     except Exception as error:
         raise _unreadable(path, error) from error
     return ring_from_at(lattice, name, energy)
 
 
-def _unreadable(path: Path, error: Exception) -> LatticeError:
+def _chosen(path: Path, found: list[str], wanted: str | None) -> str:
+    """Of the sequences and lines of a file the one that is the ring."""
+    if not found:
+        raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
+    names = {name.casefold(): name for name in found}
+    use = wanted.casefold() if wanted else "ring" if "ring" in names else found[-1].casefold()
+    if use not in names:
+        raise unknown_name(f"sequence in '{path}' named", wanted or "", found)
+    if not wanted and "ring" not in names and len(found) > 1:
+        raise LatticeError(
+            f"'{path}' has the sequences {', '.join(found)}; name one with sequence="
+        )
+    return names[use]
+
+
+def read_xsuite(
+    path: Path, name: str, sequence: str | None = None, energy: float | None = None
+) -> Ring:
+    """The ring of a JSON file of Xsuite: a line, or an environment with lines.
+
+    Args:
+        path: `.json`.
+        name: of the ring.
+        sequence: of an environment's lines; else `ring`, else the only one.
+        energy: GeV; else that of the line's reference particle.
+
+    Raises:
+        LatticeError: no line, several without a choice, no energy, or AT cannot read it.
+    """
+    import at
+
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    options, line = {}, content
+    if "lines" in content:
+        options["use"] = _chosen(path, list(content["lines"]), sequence)
+        line = content["lines"][options["use"]]
+    if energy is None and not line.get("particle_ref"):
+        raise LatticeError(f"'{path}' has no reference particle; say energy= (GeV)")
+    try:
+        with quiet_at():
+            lattice = at.load_xsuite(str(path), **options)
+    except Exception as error:
+        raise _unreadable(path, error, "Xsuite's JSON") from error
+    return ring_from_at(lattice, name, energy)
+
+
+def _unreadable(path: Path, error: Exception, what: str = "MAD-X") -> LatticeError:
+    what = "elegant's lattice" if path.suffix.lower() == ".lte" else what
     said = "; ".join(" ".join(str(a).split()) for a in error.args) or type(error).__name__
-    return LatticeError(f"'{path}' cannot be read as MAD-X ({said}); mend that statement")
+    return LatticeError(f"'{path}' cannot be read as {what} ({said}); mend that statement")

@@ -1,15 +1,44 @@
 """From OCELOT objects in beam order to named elements: what all lattice readers share."""
 
+import copy
 import logging
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, cast
 
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import Element, Kind, number_names
 
 log = logging.getLogger(__name__)
+
+Place = tuple[str, Kind, Any]
+"""Family, kind and OCELOT element, before its name has a number."""
+
+
+def corrector(family: str, plane: Literal["h", "v"], length: float, kick: float = 0.0) -> Place:
+    """A horizontal ("h") or vertical ("v") corrector; length in m, kick in rad."""
+    from tmlattice.lattice.ocelot import elements
+
+    cls, kind = (elements.Hcor, "hcorrector") if plane == "h" else (elements.Vcor, "vcorrector")
+    return family, cast(Kind, kind), cls(l=length, angle=kick, eid=family)
+
+
+def corrector_pair(family: str, length: float, x: float = 0.0, y: float = 0.0) -> list[Place]:
+    """A corrector of both planes: FAMILY_h and FAMILY_v, thin, in the middle of its length.
+
+    Args:
+        family: its name.
+        length: m; a way of half of it lies before and behind.
+        x, y: kicks, rad.
+    """
+    from tmlattice.lattice.ocelot import elements
+
+    pair = [corrector(f"{family}_h", "h", 0.0, x), corrector(f"{family}_v", "v", 0.0, y)]
+    if length == 0:
+        return pair
+    half: Place = (f"{family}_half", "drift", elements.Drift(l=length / 2, eid=f"{family}_half"))
+    return [half, *pair, half]
 
 
 def source_kind(source: Any) -> Kind:
@@ -34,9 +63,38 @@ def source_kind(source: Any) -> Kind:
     for classes, kind in kinds:
         if isinstance(source, classes):
             return kind
+    if type(source).__name__ == "CombinedMultipole":
+        return _strongest(source)
     if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
         return "wiggler" if "wig" in str(source.id).casefold() else "matrix"
     return "drift" if source.l else "marker"
+
+
+def halves(source: Any) -> tuple[Any, Any]:
+    """The two halves of an OCELOT element; a bend's edges stay at its ends."""
+    first, second = (copy.deepcopy(source) for _ in range(2))
+    first.l = second.l = source.l / 2
+    if hasattr(source, "e1"):
+        first.angle = second.angle = source.angle / 2
+        first.e2 = first.fintx = first.h_pole2 = 0.0
+        second.e1 = second.fint = second.h_pole1 = 0.0
+    return first, second
+
+
+RADIUS = 0.02
+"""m; where fields of several orders are compared."""
+
+
+def _strongest(source: Any) -> Kind:
+    """Of a combined multipole, by its strongest field at `RADIUS`; a thin one has no kind."""
+    fields = (
+        math.hypot(source.k0, source.k0s),
+        math.hypot(source.k1, source.k1s) * RADIUS,
+        math.hypot(source.k2, source.k2s) * RADIUS**2 / 2,
+    )
+    order = fields.index(max(fields)) if source.l and any(fields) else 0
+    kinds: tuple[Kind, ...] = ("multipole", "quadrupole", "sextupole")
+    return kinds[order]
 
 
 def place_elements(

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -182,21 +183,57 @@ class _Made:
 Element.source = _Made()
 
 
+ELECTRON_GEV = 0.51099895069e-3
+PROTON_GEV = 0.93827208943
+"""Rest energies, GeV. Source: CODATA 2022."""
+PARTICLES = {"electron": ELECTRON_GEV, "proton": PROTON_GEV}
+
+
 @dataclass(frozen=True)
 class Ring:
-    """Elements in beam order, and the beam energy.
+    """Elements in beam order, and the beam: its energy and its particle's mass.
 
     Attributes:
         name: the name or the path that it was loaded by.
         elements: in beam order from the start of the sequence.
-        energy: GeV.
+        energy: of a particle, rest energy included, GeV.
         changes: what was changed since it was loaded, by element name.
+        mass: rest energy of a particle, GeV; an electron's unless the lattice says otherwise.
     """
 
     name: str
     elements: tuple[Element, ...]
     energy: float
     changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    mass: float = ELECTRON_GEV
+
+    def __post_init__(self) -> None:
+        if not self.energy > self.mass > 0:
+            raise LatticeError(
+                f"'{self.name}' has the energy {self.energy:g} GeV, which is not above its "
+                f"particle's rest energy of {self.mass:g} GeV; give energy= (GeV)"
+            )
+
+    @property
+    def gamma(self) -> float:
+        """Energy over rest energy."""
+        return self.energy / self.mass
+
+    @property
+    def beta(self) -> float:
+        """Velocity over that of light."""
+        return math.sqrt(1 - 1 / self.gamma**2)
+
+    @property
+    def radiates(self) -> bool:
+        """Whether its particles are light enough to lose energy in bends."""
+        return self.mass < 2 * ELECTRON_GEV
+
+    @property
+    def map_energy(self) -> float:
+        """GeV; what OCELOT is told: the energy of an electron that is as fast. Maps of given
+        normalised strengths depend on the velocity alone."""
+        return self.energy * (ELECTRON_GEV / self.mass)
 
     @cached_property
     def memory(self) -> dict[Any, Any]:
@@ -205,7 +242,7 @@ class Ring:
 
     def __getstate__(self) -> dict[str, Any]:
         """Only the fields travel: what is worked out from them can be worked out again."""
-        return {name: self.__dict__[name] for name in ("name", "elements", "energy", "changes")}
+        return {name: self.__dict__[name] for name in FIELDS}
 
     @cached_property
     def length(self) -> float:
@@ -242,6 +279,27 @@ class Ring:
 
     def __getitem__(self, name: str) -> Element:
         return self.elements[self.index(name)]
+
+    @cached_property
+    def slices(self) -> dict[int, tuple[int, ...]]:
+        """Magnets that stand in pieces: the place of the longest, and those of all; see
+        `lattice.slices`."""
+        from tmlattice.lattice.slices import slices_of
+
+        return slices_of(self.elements)
+
+    @cached_property
+    def _whole(self) -> dict[int, tuple[int, ...]]:
+        return {i: pieces for pieces in self.slices.values() for i in pieces}
+
+    def pieces(self, name: str) -> tuple[str, ...]:
+        """Names of all pieces of the magnet that an element is a piece of; else its own.
+
+        Raises:
+            UnknownNameError: no such element.
+        """
+        place = self.index(name)
+        return tuple(self.elements[i].name for i in self._whole.get(place, (place,)))
 
     def counts(self) -> dict[str, int]:
         """Number of elements by kind."""
@@ -286,6 +344,8 @@ def number_names(names: Iterable[str]) -> list[str]:
         seen[key] += 1
     return numbered
 
+
+FIELDS = ("name", "elements", "energy", "changes", "mass")
 
 KEPT = ("kept",)
 """Where a ring's `memory` has the key under which it is kept in the cache, if it is."""

@@ -15,12 +15,21 @@ NOT_PHYSICS = ("id", "has_edge", "color", "width", "height", "params", "n")
 """Of what OCELOT keeps of an element."""
 
 
+def element_class(cls: str) -> Any:
+    """OCELOT's class of this name, or the package's own `CombinedMultipole`."""
+    if cls == "CombinedMultipole":
+        from tmlattice.lattice.combined import CombinedMultipole
+
+        return CombinedMultipole
+    from tmlattice.lattice.ocelot import elements
+
+    return getattr(elements, cls)
+
+
 @cache
 def blank(cls: str) -> dict[str, Any]:
     """The numbers of a fresh element of an OCELOT class: what may be stored, and its defaults."""
-    from tmlattice.lattice.ocelot import elements
-
-    values = vars(getattr(elements, cls)(eid="blank").element)
+    values = vars(element_class(cls)(eid="blank").element)
     return {k: v for k, v in values.items() if k not in NOT_PHYSICS}
 
 
@@ -39,10 +48,8 @@ def made(path: Path, key: str, definition: dict[str, Any]) -> Any:
     Raises:
         LatticeError: a parameter that the class does not have, or of another shape.
     """
-    from tmlattice.lattice.ocelot import elements
-
     known = blank(definition["class"])
-    source = getattr(elements, definition["class"])(eid=definition.get("family", key))
+    source = element_class(definition["class"])(eid=definition.get("family", key))
     for name, value in definition["parameters"].items():
         if name not in known:
             raise LatticeError(

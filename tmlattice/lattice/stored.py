@@ -59,7 +59,7 @@ def key_of(path: Path, sequence: str | None, energy: float | None) -> str | None
         neighbours = {neighbour.stem for neighbour in path.absolute().parent.iterdir()}
         if neighbours & _MODULES or not depends_on_nothing(content):
             return None
-    return cache.key("ring", path.suffix.lower(), content, sequence, energy)
+    return cache.key("ring with mass", path.suffix.lower(), content, sequence, energy)
 
 
 def load(key: str, name: str) -> Ring | None:
@@ -77,7 +77,7 @@ def load(key: str, name: str) -> Ring | None:
         s = start + length / 2
         elements.append(Element(own, family, kind, s, length, k1, k2, angle, tilt, source))
         start += length
-    ring = Ring(name, tuple(elements), kept["energy"], kept["changes"])
+    ring = Ring(name, tuple(elements), kept["energy"], kept["changes"], kept["mass"])
     ring.memory[KEPT] = key
     return ring
 
@@ -102,6 +102,7 @@ def save(key: str, ring: Ring) -> None:
         return
     kept = {
         "energy": ring.energy,
+        "mass": ring.mass,
         "changes": {name: dict(change) for name, change in ring.changes.items()},
         "definitions": list(index),
         "families": families,

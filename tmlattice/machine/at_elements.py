@@ -11,6 +11,7 @@ from scipy.constants import physical_constants
 from scipy.linalg import sqrtm
 
 from tmlattice.effects.build import Build, Where
+from tmlattice.effects.radiation import expected_loss as loss_of
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import Element, Ring
 
@@ -26,13 +27,15 @@ SWAPPED = [0, 1, 2, 3, 5, 4]
 
 NOTHING = Build()
 
-_STRAIGHT = frozenset({"scale", "dx", "dy", "roll", "entrance", "middle"})
+_STRAIGHT = frozenset({"scale", "dx", "dy", "roll", "kick_x", "kick_y", "entrance", "middle"})
 _CORRECTOR = frozenset({"scale", "roll", "kick_x", "kick_y", "entrance"})
 _EMPTY = frozenset({"entrance", "middle"})
 _TAKES: Mapping[str, frozenset[str]] = {
     "quadrupole": _STRAIGHT,
     "sextupole": _STRAIGHT,
-    "bend": frozenset({"scale", "roll", "loss", "entrance"}),
+    "octupole": _STRAIGHT,
+    "multipole": _STRAIGHT,
+    "bend": frozenset({"scale", "dx", "dy", "roll", "kick_x", "kick_y", "loss", "entrance"}),
     "hcorrector": _CORRECTOR,
     "vcorrector": _CORRECTOR,
     "wiggler": frozenset({"loss", "entrance", "middle"}),
@@ -54,6 +57,10 @@ def wiggler_curvature(element: Element, energy: float) -> float:
 
 def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
     """Energy loss of the design orbit in a turn, eV: C_gamma E^4 / 2 pi, integral of 1/rho^2."""
+    if not ring.radiates:
+        if bends or wigglers:
+            raise LatticeError(f"the particles of '{ring.name}' are too heavy to radiate")
+        return 0.0
     energy = ring.energy * 1e9
     bent = sum(e.angle**2 / e.length for e in ring.elements if e.kind == "bend")
     wiggled = sum(wiggler_curvature(e, energy) for e in ring.elements if e.kind == "wiggler")
@@ -87,6 +94,15 @@ def _matrix(element: Element, energy: float) -> Array:
     return matrix
 
 
+def _turned(wrong: Build, angle: float) -> list[float]:
+    """The kick (x, y) turned from x towards y."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return [
+        float(cosine * wrong.kick_x - sine * wrong.kick_y),
+        float(sine * wrong.kick_x + cosine * wrong.kick_y),
+    ]
+
+
 def _rotation(angle: float) -> Array:
     """Coordinates seen by a magnet turned by `angle` from x towards y, [6, 6]."""
     matrix = np.eye(6)
@@ -94,6 +110,31 @@ def _rotation(angle: float) -> Array:
         [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], np.eye(2)
     )
     return matrix
+
+
+def errors_of(element: Element, energy: float) -> Build:
+    """What is wrong with an element in the ring itself; energy in GeV.
+
+    Raises:
+        LatticeError: a rolled bend: the maps turn its design plane, and no catalogue has it.
+    """
+    errors = element.errors
+    if element.kind == "bend" and errors.roll:
+        raise LatticeError(f"AT cannot build the bend '{element.name}' with a roll of its own")
+    own = Build(
+        dx=errors.dx, dy=errors.dy, roll=errors.roll, kick_x=errors.kick_x, kick_y=errors.kick_y
+    )
+    if errors.loss:
+        own.loss = errors.loss / loss_of(element, energy)
+    if errors.k1l or errors.k1sl:
+        own.add_gradient("middle", normal=errors.k1l, skew=errors.k1sl)
+    if errors.entrance_k1l:
+        own.add_gradient("entrance", normal=errors.entrance_k1l)
+    if any(errors.entrance):
+        own.add_slopes("entrance", *errors.entrance)
+    if any(errors.middle):
+        own.add_slopes("middle", *errors.middle)
+    return own
 
 
 def _check(element: Element, wrong: Build) -> None:
@@ -153,6 +194,8 @@ class Builder:
     ) -> list[Any]:
         """The body, or its two halves (`body` of a share of the length) and the thin kicks."""
         thin = self._thin(element, wrong, "middle")
+        if wrong.kick_x or wrong.kick_y:
+            thin.append(at.Corrector(element.name, 0.0, _turned(wrong, wrong.roll)))
         return [*body(0.5), *thin, *body(0.5)] if thin else body(1.0)
 
     def _marker(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
@@ -189,20 +232,22 @@ class Builder:
             more |= {"T1": -shift, "T2": shift}
         if angle:
             more |= {"R1": _rotation(angle), "R2": _rotation(-angle)}
+        source = element.source
+        skew = [0.0] * len(normal)
+        combined = type(source).__name__ == "CombinedMultipole"
+        if combined:
+            normal = [float(source.k0), *normal[1:]]
+            skew = [float(source.k0s), float(source.k1s), float(source.k2s)]
         factorial = [1.0, 1.0, 2.0, 6.0]
-        strengths = [k / n for k, n in zip(normal, factorial, strict=False)]
+        B, A = ([k / n for k, n in zip(f, factorial, strict=False)] for f in (normal, skew))
 
         def body(share: float) -> list[Any]:
-            return [
-                at.Multipole(
-                    element.name,
-                    share * element.length,
-                    [0.0] * len(strengths),
-                    strengths,
-                    NumIntSteps=self.steps,
-                    **more,
-                )
-            ]
+            if element.length == 0:  # a combined multipole's fields are integrated then
+                thin = share if combined else 0.0
+                parts = [[thin * k for k in field] for field in (A, B)]
+                return [at.ThinMultipole(element.name, *parts, **more)]
+            length = share * element.length
+            return [at.Multipole(element.name, length, A, B, NumIntSteps=self.steps, **more)]
 
         return body
 
@@ -223,11 +268,13 @@ class Builder:
 
     def _octupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         k3 = float(element.source.k3)
-        return self._straight(element, [0.0, 0.0, 0.0, k3], wrong, False)(1.0)
+        body = self._straight(element, [0.0, 0.0, 0.0, k3], wrong, False)
+        return self._with_middle(element, wrong, body)
 
     def _multipole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
-        if element.length > 0:  # a thick one, as AT's files have them
-            return self._straight(element, [0.0, element.k1, element.k2], wrong, False)(1.0)
+        if not hasattr(element.source, "kn"):
+            body = self._straight(element, [0.0, element.k1, element.k2], wrong, False)
+            return self._with_middle(element, wrong, body)
         strengths = np.asarray(element.source.kn, dtype=float)
         if strengths[0]:
             raise LatticeError(f"AT cannot build '{element.name}', a thin multipole that bends")
@@ -253,7 +300,9 @@ class Builder:
         if length <= 0 or source.h_pole1 or source.h_pole2:
             raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
         roll = wrong.roll
-        horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2  # what px loses
+        kick_x, kick_y = _turned(wrong, -element.tilt)
+        horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2 - kick_x  # what px loses
+        vertical = kick_y - roll * angle
         # The body is exact in a step; only its errors, losses and gradients are spread.
         k1 = element.k1 * (1 + setting["k1_relative"])
         steps = self.steps if element.k1 or element.k2 else 4
@@ -267,7 +316,7 @@ class Builder:
                 share * length,
                 share * angle,
                 PolynomB=[horizontal / length, k1, element.k2 / 2, 0.0],
-                PolynomA=[-roll * angle / length, 0.0, 0.0, 0.0],
+                PolynomA=[vertical / length, 0.0, 0.0, 0.0],
                 NumIntSteps=steps,
                 PassMethod=self.bend_pass,
                 **edges,
@@ -276,11 +325,16 @@ class Builder:
 
         entrance, exit_ = source.fint * source.gap, source.fintx * source.gap
         if entrance == exit_:
-            return [body(1.0, EntranceAngle=source.e1, ExitAngle=source.e2, gK=entrance)]
-        return [  # AT's exact bend has one fringe integral for both edges
-            body(0.5, EntranceAngle=source.e1, gK=entrance, FringeBendExit=0),
-            body(0.5, ExitAngle=source.e2, gK=exit_, FringeBendEntrance=0),
-        ]
+            made = [body(1.0, EntranceAngle=source.e1, ExitAngle=source.e2, gK=entrance)]
+        else:  # AT's exact bend has one fringe integral for both edges
+            made = [
+                body(0.5, EntranceAngle=source.e1, gK=entrance, FringeBendExit=0),
+                body(0.5, ExitAngle=source.e2, gK=exit_, FringeBendEntrance=0),
+            ]
+        if wrong.dx or wrong.dy:
+            shift = np.array([wrong.dx, 0, wrong.dy, 0, 0, 0])
+            made[0].T1, made[-1].T2 = -shift, shift
+        return made
 
     def _hcorrector(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         kick = setting.get("kick", element.angle) * wrong.scale

@@ -10,7 +10,8 @@ owe it to its own model.
 Launches are OCELOT's (x, px, y, py, tau, p); AT tracks (x, px, y, py, delta, ct). The first four
 are the same: px = Px / p0, no angle. From p = dE / (p0 c) follows delta = P / p0 - 1 through
 E^2 = (P c)^2 + (m c^2)^2. tau = c t - s / beta0 and ct have the same sign, positive for a late
-particle; AT takes the speed of light for all particles, an error of 1 / gamma^2 in ct alone.
+particle; AT takes the speed of light for all particles: its ct is the way, beta0 c t, and what the
+velocity adds stands before the cavities and at the end, where it counts (protons).
 """
 
 import copy
@@ -24,13 +25,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import c as SPEED_OF_LIGHT
 
-from tmlattice.beam.rf import rf_of
+from tmlattice.beam.rf import RELATIVISTIC, Rf, rf_of, stable_phase
 from tmlattice.effects import Cause, RingEffect, check, find
 from tmlattice.effects.build import Build
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.ring import NO_ERRORS, Ring
 from tmlattice.machine import at_orbit
-from tmlattice.machine.at_elements import ELECTRON, NOTHING, SWAPPED, Builder, expected_loss
+from tmlattice.machine.at_elements import (
+    ELECTRON,
+    NOTHING,
+    SWAPPED,
+    Builder,
+    errors_of,
+    expected_loss,
+)
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
@@ -51,7 +59,8 @@ SET_ON: Mapping[str, frozenset[str]] = {
 class AtEngine:
     """A ring with its causes as a line of AT elements.
 
-    Causes of the same effect on the same element add up. A thin kick sits on the design axis,
+    Causes of the same effect on the same element add up, and to what the ring's own elements have
+    wrong (`Element.errors`). A thin kick sits on the design axis,
     whatever the offset and roll of its magnet.
 
     Args:
@@ -103,17 +112,36 @@ class AtEngine:
         self._builder = Builder(ring.energy * 1e9, steps, aperture, self._bends > 0, self._wigglers)
         self._line: list[Any] = []
         self._places: list[slice] = []  # of each element of the ring, in the line
-        nothing: Mapping[str, float] = {}
-        for i, element in enumerate(ring.elements):
-            pieces = self._builder.pieces(element, self._wrong.get(i, NOTHING), nothing)
-            self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
-            self._line += pieces
-        self._line.append(at.Marker("rf_at_the_end"))
+        rf = rf_of(ring, harmonic, voltage)
+        self._build(rf.places)
         self._monitors = np.array(
             [i for i, e in enumerate(self._line) if isinstance(e, at.Monitor)], dtype=np.uint32
         )
         self.expected_loss = expected_loss(ring, self._bends, self._wigglers)
-        self._set_rf(harmonic, voltage)
+        self._set_rf(rf)
+
+    def _build(self, cavities: Sequence[int]) -> None:
+        """The line. AT's ct is the way: what the velocity of slower particles adds stands before
+        the cavities, which feel it."""
+        nothing: Mapping[str, float] = {}
+        way = 0.0
+
+        def velocity() -> list[Any]:
+            if self.ring.gamma > RELATIVISTIC:
+                return []
+            matrix = np.eye(6, order="F")
+            matrix[5, 4] = -way / self.ring.gamma**2
+            return [at.M66("velocity", matrix)]
+
+        for i, element in enumerate(self.ring.elements):
+            if i in cavities:
+                self._line += velocity()
+                way = 0.0
+            pieces = self._builder.pieces(element, self._wrong.get(i, NOTHING), nothing)
+            self._places.append(slice(len(self._line), len(self._line) + len(pieces)))
+            self._line += pieces
+            way += element.length
+        self._line += [*velocity(), at.Marker("rf_at_the_end")]
 
     def _loss(self, kind: str) -> float:
         """The scale of the loss in all elements of a kind."""
@@ -123,8 +151,7 @@ class AtEngine:
             raise LatticeError(f"AT gives every {kind} the same share of its expected loss")
         return scales.pop() if scales else 0.0
 
-    def _set_rf(self, harmonic: int | None, voltage: float | None) -> None:
-        rf = rf_of(self.ring, harmonic, voltage)
+    def _set_rf(self, rf: Rf) -> None:
         behind = len(self._line) - 1  # the marker at the end
         self._cavities = [
             self._places[i].start if i < len(self._places) else behind for i in rf.places
@@ -168,7 +195,7 @@ class AtEngine:
             raise ValueError(f"{turns} turns cannot be tracked; one at least can")
         if settings is not None and len(settings) != len(start):
             raise ValueError(f"{len(settings)} settings for {len(start)} shots; give one a shot")
-        state = to_at(start, self.ring.energy)
+        state = to_at(start, self.ring.energy, self.ring.mass)
         readings = np.empty((len(start), turns, len(self._monitors), 2))
         for shots, changed, frequency in self._groups(settings or [{}] * len(start)):
             line = self._line.copy()
@@ -250,12 +277,13 @@ class AtEngine:
     def _cavity(self, there: Any, frequency_relative: float) -> Any:
         length = getattr(there, "Length", 0.0)
         frequency = self._harmonic * SPEED_OF_LIGHT / self.ring.length * (1 + frequency_relative)
-        # Above transition a late particle has too much energy: the field falls with ct.
-        phase = np.arcsin(self.expected_loss / self._voltage)
+        # Above transition a late particle has too much energy: the field falls with ct there.
+        phase = stable_phase(self.ring, float(np.arcsin(self.expected_loss / self._voltage)))
+        energy = self.ring.energy * 1e9 * self.ring.beta**2  # dP / P = dE / (beta^2 E)
         return at.RFCavity(
             "rf",
             length,
-            self._voltage / len(self._cavities) * self._energy / (self.ring.energy * 1e9),
+            self._voltage / len(self._cavities) * self._energy / energy,
             frequency,
             self._harmonic,
             self._energy,
@@ -297,18 +325,21 @@ class AtEngine:
         return readings
 
 
-def to_at(launches: ArrayLike, energy: float) -> Array:
+def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> Array:
     """AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6].
 
     Args:
         launches: [..., 6].
         energy: of the reference particle, GeV.
+        mass: its rest energy, GeV.
     """
     launches = np.asarray(launches, dtype=float)
-    reference = np.sqrt((energy * 1e9) ** 2 - ELECTRON**2)
+    rest = 1e9 * mass
+    reference = np.sqrt((energy * 1e9) ** 2 - rest**2)
     total = energy * 1e9 + launches[..., 5] * reference
     converted = launches[..., SWAPPED].copy()
-    converted[..., 4] = np.sqrt(total**2 - ELECTRON**2) / reference - 1
+    converted[..., 4] = np.sqrt(total**2 - rest**2) / reference - 1
+    converted[..., 5] *= reference / (energy * 1e9)
     return converted
 
 
@@ -320,7 +351,7 @@ def _check_setting(name: str, what: Iterable[str], known: Iterable[str]) -> None
 
 
 def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
-    """What is wrong with the elements, by place in the ring."""
+    """What is wrong with the elements, in the ring itself and by causes, by place in the ring."""
     causes = list(causes)
     check(ring, causes)
     amounts: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
@@ -329,10 +360,12 @@ def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
         if isinstance(effect, RingEffect):
             for i in effect.members(ring, cause.element):
                 amounts[i][effect.name] += cause.amount
-    wrong = {i: Build() for i in amounts}
+    wrong = {
+        i: errors_of(e, ring.energy) for i, e in enumerate(ring.elements) if e.errors != NO_ERRORS
+    }
     for i, own in amounts.items():
         for name, amount in own.items():
             effect = find(name)
             assert isinstance(effect, RingEffect)
-            effect.build(wrong[i], amount)
+            effect.build(wrong.setdefault(i, Build()), amount)
     return wrong

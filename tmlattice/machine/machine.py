@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause, Settings, beams, check, monitors_with
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
+from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.shots import Shots, stream
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ class Machine:
 
     Raises:
         EffectError, UnknownNameError: a cause that the ring cannot have.
+        LatticeError: a ring without monitors.
         TmlatticeError: another engine, or negative noise.
     """
 
@@ -87,6 +89,7 @@ class Machine:
         noise: float | Sequence[float] = 2e-5,
     ) -> None:
         causes = list(causes)
+        need_monitors(ring)
         check(ring, causes)
         self.ring = ring
         self.causes = tuple(causes)

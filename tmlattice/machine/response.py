@@ -11,8 +11,9 @@ from tqdm.auto import tqdm
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, Settings, apply, background_rms, check, monitors_with
-from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
+from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.machine import ENGINES, true_causes
 from tmlattice.machine.shots import draw_background, stream
@@ -95,7 +96,8 @@ def simulate_response(
 
     Raises:
         EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
-        MeasurementError: a corrector that is none, or a ring without monitors.
+        MeasurementError: a corrector that is none.
+        LatticeError: a ring without monitors.
         TmlatticeError: another engine.
         UnstableRingError: no closed orbit.
     """
@@ -105,9 +107,8 @@ def simulate_response(
     machine_seed = seed if machine_seed is None else machine_seed
     every = [*draw_background(ring, rms, machine_seed), *causes]
     check(ring, every)
+    need_monitors(ring)
     names = tuple(monitor.name for monitor in ring.monitors)
-    if not names:
-        raise MeasurementError(f"'{ring.name}' has no monitor; nothing reads its orbit")
     design = ResponseModel(ring)
     columns = design.columns(correctors)
     rf = rf_of(ring)

@@ -16,6 +16,7 @@ from tmlattice.beam.chain import Chain
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.lattice import Ring
+from tmlattice.lattice.checks import need_monitors
 from tmlattice.optics import one_turn_optics
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ def draw_shots(
 
     Raises:
         TmlatticeError: no shot, an amplitude that is not positive, or a sigma that is no rms.
+        LatticeError: a ring without monitors.
         BeamLostError: an amplitude that the design does not carry.
         UnstableRingError: a design without betatron phases.
     """
@@ -86,6 +88,7 @@ def draw_shots(
         raise TmlatticeError(
             f"the launches' rms {sigma} should be five numbers (x, px, y, py, delta), none negative"
         )
+    need_monitors(ring)
     chain = Chain.from_ring(ring)
     modes = one_turn_optics(chain).modes
     phases = stream(seed, "launches").uniform(0, 2 * np.pi, (shots, 2))

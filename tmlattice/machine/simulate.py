@@ -61,22 +61,26 @@ class Simulation:
             energy=self.machine.ring.energy,
         )
 
-    def write(self, folder: Path, jobs: int = 1, progress: bool = True) -> None:
+    def write(
+        self, folder: Path, jobs: int = 1, progress: bool = True, force: bool = False
+    ) -> None:
         """Shot by shot into a measurement folder; it appears when all went well.
 
         Args:
             folder: see the measurement format.
             jobs: processes.
             progress: show a bar where there is a terminal.
+            force: a measurement that is there already is replaced.
 
         Raises:
             OutputError: it cannot be written.
+            MeasurementError: the folder holds a measurement.
         """
         ring, noise = self.machine.ring, self.machine.noise
         names = [monitor.name for monitor in ring.monitors]
         known = (float(noise[0]), float(noise[1])) if (noise > 0).all() else None
         shots = self.shots
-        with measurement_writer(folder, names, known, ring.name, ring.energy) as writer:
+        with measurement_writer(folder, names, known, ring.name, ring.energy, force) as writer:
             measured = self.machine.measure(shots, self.turns, self.seed, jobs)
             for shot, readings in tqdm(
                 measured, total=len(shots), unit="shot", disable=None if progress else True

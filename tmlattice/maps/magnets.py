@@ -186,7 +186,7 @@ class LayerMaps:
             if len(self._known) > KNOWN:  # a fit asks for ever new amounts
                 self._known.clear()
                 self._kept.clear()
-            known = self._known[key] = quadratic_map(element, self.ring.energy, self.dimension)
+            known = self._known[key] = quadratic_map(element, self.ring.map_energy, self.dimension)
             if isinstance(key[0], int):  # an id: its source must not be freed
                 self._kept.append(element.source)
         return known
@@ -331,11 +331,11 @@ def ring_matrix(ring: Ring) -> Array:
     known: dict[Hashable, list[Array]] = {}
     for element in ring.elements:
         if element.errors != NO_ERRORS or element.kind == "cavity":
-            total = quadratic_map(element, ring.energy, 6).R[:4, :4] @ total
+            total = quadratic_map(element, ring.map_energy, 6).R[:4, :4] @ total
             continue
         physics = physics_of(element)
         if physics not in known:
-            known[physics] = [matrix[:4, :4] for matrix in element.source.R(ring.energy)]
+            known[physics] = [matrix[:4, :4] for matrix in element.source.R(ring.map_energy)]
         for matrix in known[physics]:
             total = matrix @ total
     return total

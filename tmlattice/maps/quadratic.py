@@ -4,6 +4,7 @@ OCELOT gives an element as a sequence of parts (three for a bend: entrance edge,
 each x -> B + R x + x^T T x. The parts are composed to second order.
 """
 
+import copy
 import functools
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, replace
@@ -56,7 +57,8 @@ class Quadratic:
 
 FAINT = 3e-4
 """rad; below, OCELOT's map of a bend with k2 has lost a hundredth of its second order to rounding
-(k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large)."""
+(k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large).
+There the sextupole's part is that of a straight magnet, wrong by the bend's angle at most."""
 
 
 def _on_rows(matrix: Array, T: Array) -> Array:
@@ -104,15 +106,38 @@ def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
     body = [(TMTypes.MAIN, atom.l / 2)] * 2 if split and not bare else [(TMTypes.MAIN, None)]
     edges = [(TMTypes.ENTRANCE, None)], [(TMTypes.EXIT, None)]
     parts = [*edges[0], *body, *edges[1]] if atom.has_edge else body
+    bends = (elements.Bend, elements.SBend, elements.RBend)
+    faint = isinstance(source, bends) and atom.k2 and abs(atom.angle) < FAINT
+    if faint:
+        atom = copy.copy(atom)
+        atom.k2 = 0.0
     if supported is None or SecondTM in supported:
         try:
             second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
+            if faint:
+                for params, (where, length) in zip(second, parts, strict=True):
+                    if where is TMTypes.MAIN:
+                        params.T = params.T + _sextupole(source, length, energy)
             return [(p.B.ravel(), *_tilted(p.R, p.T, p.tilt)) for p in second]
         except (AttributeError, NotImplementedError):
             pass  # it has no second order: a linear element
     zero = np.zeros((6, 6, 6))
     linear = zip(source.B(energy), source.R(energy), strict=True)
     return [(B.ravel(), R, zero) for B, R in linear]
+
+
+def _sextupole(bend: Any, length: float | None, energy: float) -> Array:
+    """What k2 adds to T of a bend's body if it were straight, [6, 6, 6]."""
+    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
+
+    with_k2, without = (
+        elements.Quadrupole(l=bend.l, k1=bend.k1, k2=k2).element for k2 in (bend.k2, 0.0)
+    )
+    first, second = (
+        SecondTM.from_element(atom, TMTypes.MAIN, length).get_params(energy).T
+        for atom in (with_k2, without)
+    )
+    return np.asarray(first - second)
 
 
 def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
@@ -156,15 +181,9 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
     """The map of one element, its errors included.
 
     Raises:
-        LatticeError: it is not finite, it loses energy, which four coordinates cannot hold, or
-            OCELOT's map of such a bend is wrong.
+        LatticeError: it is not finite, or it loses energy, which four coordinates cannot hold.
     """
     errors = element.errors
-    if element.kind == "bend" and element.k2 and abs(element.angle) < FAINT:
-        raise LatticeError(
-            f"bend '{element.name}' bends by {element.angle:g} rad and has k2: OCELOT's map of it "
-            f"is wrong below {FAINT:g} rad; make it a sextupole and a corrector"
-        )
     if element.kind == "cavity":  # what it gives depends on the turn: that is the beam's
         element = _empty(element)
     if errors == NO_ERRORS:

@@ -16,7 +16,7 @@ from tmlattice.measurement.documents import located, read_document
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.rows import dense, match_names, read_rows
-from tmlattice.measurement.tables import read_table, read_turn_by_turn
+from tmlattice.measurement.tables import Unit, read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import (
     COORDINATES,
     UNKNOWN_LAUNCH,
@@ -34,7 +34,10 @@ RF = "rf"
 
 
 def read_measurement(
-    path: str | Path, monitors: Sequence[str] | None = None, turn_by_turn: str | None = None
+    path: str | Path,
+    monitors: Sequence[str] | None = None,
+    turn_by_turn: str | None = None,
+    unit: Unit = "m",
 ) -> Measurement | OrbitResponse:
     """Read a measurement folder, or a plain table of readings (`.csv`, see `read_table`).
 
@@ -44,6 +47,7 @@ def read_measurement(
             and the names and their order are the ring's; a monitor with no rows is left out
             (`in_order_of` puts it back as missing).
         turn_by_turn: the path is a turn-by-turn file of this kind, see `read_turn_by_turn`.
+        unit: of the readings of a table or a turn-by-turn file; a folder's are in m.
 
     Returns:
         A Measurement, or an OrbitResponse, by the folder's kind.
@@ -53,9 +57,9 @@ def read_measurement(
     """
     path = Path(path)
     if turn_by_turn is not None:
-        return read_turn_by_turn(path, turn_by_turn, monitors=monitors)
+        return read_turn_by_turn(path, turn_by_turn, monitors=monitors, unit=unit)
     if path.suffix.casefold() == ".csv":
-        return read_table(path, monitors=monitors)
+        return read_table(path, monitors=monitors, unit=unit)
     folder = path.parent if path.name == "measurement.json" else path
     if not folder.is_dir():
         raise MeasurementError(

@@ -109,7 +109,9 @@ def read_turn_by_turn(
     spellings = list(dict.fromkeys(str(n) for x, y in tables for n in (*x.index, *y.index)))
     found, places = merge_spellings(spellings)
     place = dict(zip(spellings, places.tolist(), strict=True))
-    readings = np.full((len(tables), int(data.nturns), len(found), 2), np.nan)
+    # a file may state fewer turns than it has: the tables count
+    turns = max((frame.shape[1] for planes in tables for frame in planes), default=0)
+    readings = np.full((len(tables), turns, len(found), 2), np.nan)
     for shot, planes in enumerate(tables):
         for plane, frame in enumerate(planes):
             values = frame.to_numpy(dtype=float)

@@ -26,22 +26,27 @@ from tmlattice.measurement.trajectory import (
 Array = NDArray[np.float64]
 
 
-def write_measurement(folder: str | Path, measurement: Measurement | OrbitResponse) -> None:
+def write_measurement(
+    folder: str | Path, measurement: Measurement | OrbitResponse, force: bool = False
+) -> None:
     """Write a measurement folder: whole, or not at all. What it reads back is bit-identical.
 
     Args:
-        folder: made where it is not there; files of the same names are replaced.
+        folder: made where it is not there.
         measurement: of either kind.
+        force: a measurement that is there already is replaced.
 
     Raises:
         OutputError: it cannot be written.
-        MeasurementError: a reading that no reader would take (above 0.2 m).
+        MeasurementError: a reading that no reader would take (above 0.2 m), or a folder that
+            holds a measurement.
     """
     if isinstance(measurement, OrbitResponse):
+        check_free(folder, force)
         _write_response(Path(folder), measurement)
         return
     m = measurement
-    with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy) as writer:
+    with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy, force) as writer:
         for i, shot in enumerate(m.shots):
             writer.add(
                 shot,
@@ -49,6 +54,22 @@ def write_measurement(folder: str | Path, measurement: Measurement | OrbitRespon
                 None if m.launch_sigma is None else m.launch_sigma[i],
                 m.settings[i] if m.settings else {},
                 m.readings[i],
+            )
+
+
+def check_free(folder: str | Path, force: bool = False) -> None:
+    """Old data are kept: a folder is written to when it holds no measurement, or by force.
+
+    Raises:
+        MeasurementError: it holds one.
+    """
+    if force:
+        return
+    for name in ("measurement.json", "readings.csv", "response.csv"):
+        if (Path(folder) / name).exists():
+            raise MeasurementError(
+                f"'{folder}' holds a measurement already ({name}); name another folder, or replace "
+                "it with --force (in Python: force=True)"
             )
 
 
@@ -259,22 +280,26 @@ def measurement_writer(
     noise: Any = None,
     lattice: str | None = None,
     energy: float | None = None,
+    force: bool = False,
 ) -> Iterator[MeasurementWriter]:
     """A writer of a trajectory's folder, shot by shot, with memory flat in their number.
 
     The folder appears, whole, when the block ends; after an exception or Ctrl-C nothing is left.
 
     Args:
-        folder: made where it is not there; files of the same names are replaced.
+        folder: made where it is not there.
         monitors: names, in the order of the readings.
         noise: rms of a reading, m: a pair (x, y), [monitor, 2], a mapping by monitor, or None.
         lattice: name or path, a hint for the reader.
         energy: GeV.
+        force: a measurement that is there already is replaced.
 
     Raises:
         OutputError: it cannot be written.
-        MeasurementError: names or noise that cannot be; no reading written.
+        MeasurementError: names or noise that cannot be; no reading written; a folder that holds
+            a measurement.
     """
+    check_free(folder, force)
     with ExitStack() as stack:
         temporary = stack.enter_context(output_folder(Path(folder)))
         with (

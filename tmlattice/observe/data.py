@@ -50,6 +50,12 @@ class Data:
         filled = np.where(np.isfinite(self.sigma), self.sigma, planes)
         return replace(self, sigma=filled)
 
+    def of_shots(self, shots: NDArray[np.intp]) -> "Data":
+        """Some of the shots."""
+        names = ("readings", "valid", "sigma", "launches", "launch_sigma", "active")
+        arrays = {name: getattr(self, name)[shots] for name in names}
+        return replace(self, settings=tuple(self.settings[i] for i in shots), **arrays)
+
     def without(self, dropped: Flags) -> "Data":
         """The same with these readings missing."""
         return replace(self, valid=self.valid & ~dropped)

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, find
+from tmlattice.inference.judge import Half, Judged, other_half
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.search import State
-from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.inference.whitening import EXACT, Projection, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import TurnMetric, metric
 
@@ -36,12 +37,15 @@ class FirstTurns(Problem):
         data: readings.
         spread: rms times signature of small errors everywhere, [error, shot, reading, 2], m, or
             None.
+        open: of which family each small error is, [error], and the covariance of the logarithms of
+            their sizes, [family, family], where those were learnt from these data; or None.
         white: the whitening where it is known already: a dense one costs a factorisation.
     """
 
     model: Model = field(repr=False)
     data: Data = field(repr=False)
     spread: Array | None = field(default=None, repr=False)
+    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
     white: Whitening | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -81,6 +85,12 @@ class FirstTurns(Problem):
             ends.append(self.model.readings(point.nuisances, there, kicks))
         return self.whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
 
+    def metres(self, row: Array) -> Array:
+        """A slope as readings move, where they are not correlated: [shot * reading * 2], m."""
+        rows = row.reshape(self.data.shots, -1)[:, :-5].reshape(self.valid.shape)
+        weight = self.whitening.weight
+        return np.where(weight > 0, rows / np.where(weight > 0, weight, 1.0), 0.0).ravel()
+
     def moved(self, nuisances: Array, change: Array) -> Array:
         """Launches with their free coordinates changed."""
         launches = nuisances.copy()
@@ -94,6 +104,19 @@ class FirstTurns(Problem):
             self.model, point.view, point.nuisances, self.whitening, point.projection,
             self.data.active,
         )  # fmt: skip
+
+    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
+        """By how the variance along it changes with the sizes of small errors."""
+        if self.open is None or self.spread is None or point.projection is None:
+            return np.inf
+        family, covariance = self.open
+        active = self.data.active[:, None, None]
+        seen = self.model.signatures(point.view, [hypothesis], point.nuisances)[0]
+        row = point.projection.out(self.whitening.signature(np.nan_to_num(seen) * active))
+        back = self.whitening.back(row.reshape(self.data.shots, -1)[None, :, :-5])[0]
+        squares = np.einsum("esrp,srp->e", self.spread, back, optimize=True) ** 2
+        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
+        return 2 / max(float(slope @ covariance @ slope), 1e-9)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those that sit between the same monitors as a magnet."""
@@ -177,7 +200,7 @@ def turns_of(found: State) -> FirstTurns:
     return found.problem
 
 
-def judged(problem: FirstTurns, launches: Array) -> tuple[Array, Array]:
+def judged(problem: FirstTurns, launches: Array, unknown: Array | None = None) -> Judged:
     """What a model leaves of shots that no fit saw.
 
     In each shot only the launch is fitted, to one half of the monitors; the readings of the other
@@ -186,20 +209,43 @@ def judged(problem: FirstTurns, launches: Array) -> tuple[Array, Array]:
     Args:
         problem: of these shots; its `fixed` causes are the model's.
         launches: first guess.
-
-    Returns:
-        Readings less model, NaN where they gave the launch; and the rms to expect, of the noise
-        and of what the launch predicts, both [shot, reading, 2], m. NaN everywhere where the beam
-        is lost in the model.
+        unknown: covariance that what is not known of the model makes of all readings,
+            [shot * reading * 2] twice, m^2; None: nothing.
     """
     data = problem.data
     odd = problem.owner() % 2 == 1
     fitted = problem.without(odd)
     point = fit(fitted, (), launches).point
+    residuals = np.full(data.valid.shape, np.nan)
     if point.projection is None:
-        return np.full(data.valid.shape, np.nan), data.sigma
-    slopes = point.view.launch[..., fitted.whitening.columns]
-    covariance = point.projection.covariance()  # [shot, column, column]
-    predicted = np.einsum("srpi,sij,srpj->srp", slopes, covariance, slopes, optimize=True)
-    left = np.where(data.valid & odd, data.readings - point.view.readings, np.nan)
-    return left, np.sqrt(data.sigma**2 + predicted)
+        return Judged(residuals, ())
+    left = np.where(data.valid, data.readings - point.view.readings, 0.0)
+    columns = fitted.whitening.columns
+    off = (data.launches - point.nuisances)[:, columns]
+    sigma = np.maximum(data.launch_sigma[:, columns], EXACT)
+    index = np.arange(data.valid.size).reshape(data.valid.shape)
+    parts = []
+    for shots in np.array_split(np.arange(data.shots), data.shots if unknown is None else 1):
+        slopes = np.zeros((*data.valid[shots].shape, len(shots), len(columns)))
+        for i, shot in enumerate(shots):
+            slopes[i, ..., i, :] = point.view.launch[shot][..., columns]
+        gives, scored = data.valid[shots] & ~odd[shots], data.valid[shots] & odd[shots]
+        if not scored.any():
+            continue
+        known = np.where(np.isfinite(sigma[shots]), sigma[shots] ** -2.0, 0.0)
+        first, second = (
+            Half(left[shots][half], slopes[half].reshape(half.sum(), -1), data.sigma[shots][half])
+            for half in (gives, scored)
+        )
+        order = np.concatenate([index[shots][gives], index[shots][scored]])
+        among = None if unknown is None else unknown[np.ix_(order, order)]
+        found = other_half(first, second, off[shots].ravel(), known.ravel(), among)
+        parts.append(found)
+        residuals[shots] = _scattered(found.residual, scored)
+    return Judged(residuals, tuple(parts))
+
+
+def _scattered(values: Array, where: Flags) -> Array:
+    whole = np.full(where.shape, np.nan)
+    whole[where] = values
+    return whole

@@ -254,7 +254,7 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
     ]
     placed = [(s, finding) for s, finding in placed if low <= s <= high]
     for k, (s, finding) in enumerate(placed):
-        name = finding.effect or "unnamed"
+        name = finding.remedy.effect if finding.remedy is not None else "unnamed"
         text = f"{name.replace('_', ' ')} {finding.element or ''}".strip()
         left = s > low + 0.6 * (high - low)
         ax.annotate(
@@ -290,8 +290,10 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     ax.axhline(noise, color="k", linestyle="--", linewidth=1, label=f"noise {noise:.1f} µm")
     labels = ["design"] + [
         f"+ {find(cause.effect).words}\n{cause.element or ''}".rstrip()
-        for cause in diagnosis.causes
+        for cause in diagnosis.faults
     ]
+    if diagnosis.priors:
+        labels = ["design", "+ small errors\neverywhere", "+ what was\nfound"][: len(rms)]
     crowded = len(labels) > 4
     ax.set_xticks(
         steps,

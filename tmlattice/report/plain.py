@@ -16,6 +16,7 @@ from tmlattice.report.text import (
     next_text,
     noise_text,
     sensitivity_rows,
+    small_rows,
     suspect_rows,
     title,
     tune_texts,
@@ -25,7 +26,7 @@ from tmlattice.report.text import (
 
 WIDTH = 100
 
-SUSPECTS = "Suspects, not findings; each explains much of it, and is where to look first:"
+SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 
 
 def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
@@ -52,6 +53,12 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
     lines += ["", *_gap_table(diagnosis)]
     lines += wrapped(closed_text(diagnosis) + ".", "", width)
     lines += wrapped(left_text(diagnosis), "", width)
+    small = small_rows(diagnosis)
+    if small:
+        lines += ["", "Small errors everywhere:"]
+        size = max(len(name) for name, _ in small)
+        for name, text in small:
+            lines += wrapped(text, f"   {name:<{size}}   ", width)
     if diagnosis.steps:
         lines += ["", *steps_text(diagnosis, width)]
     if diagnosis.verdict == "nothing":

@@ -1,9 +1,12 @@
 """What is to be done about a finding, in the words of a control room."""
 
+from collections.abc import Sequence
+
 from tmlattice.diagnosis.consequences import Beam, Consequences
-from tmlattice.diagnosis.remedies import Remedy
+from tmlattice.diagnosis.remedies import Remedy, leading, pieces_of
 from tmlattice.diagnosis.result import Finding
-from tmlattice.effects import ReadingEffect, RingEffect, find
+from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
+from tmlattice.lattice import Ring
 from tmlattice.report.amounts import amount_text, probability_text, words
 
 _KINDS = {
@@ -23,7 +26,9 @@ def subject(remedy: Remedy) -> str:
         return "the beam"
     kind = _KINDS.get(remedy.kind, remedy.kind)
     family = " family" if remedy.effect.startswith("family") else ""
-    return f"{kind}{family} {remedy.element}"
+    others = [name for name in remedy.pieces if name != remedy.element]
+    magnet = f" (one magnet with {', '.join(others)})" if others else ""
+    return f"{kind}{family} {remedy.element}{magnet}"
 
 
 def remedy_text(remedy: Remedy) -> str:
@@ -48,12 +53,17 @@ def title(finding: Finding) -> str:
     return remedy_text(finding.remedy)
 
 
+LIKELY = 0.01
+"""Share of a remedy's probability from which on a mechanism is told."""
+
+
 def mechanism_text(remedy: Remedy) -> str:
     """Which explanations share a remedy, and how likely each is."""
-    if len(remedy.mechanisms) == 1:
-        effect = remedy.mechanisms[0][0]
+    likely = [m for m in remedy.mechanisms if m[1] >= LIKELY * remedy.probability]
+    if len(likely) == 1:
+        effect = likely[0][0]
         return f"{words(effect)} ({effect}: {find(effect).sign})"
-    told = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in remedy.mechanisms)
+    told = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in likely)
     return "; or ".join(told) + ": the remedy is the same"
 
 
@@ -65,6 +75,27 @@ def or_text(finding: Finding, most: int) -> str:
         rest = sum(r.probability for r in others[most:])
         shown.append(f"{len(others) - most} more ({probability_text(rest)} together)")
     return "\n".join(shown)
+
+
+SAID = 4
+"""Places that a sentence names."""
+
+
+def by_hand_text(ring: Ring, causes: Sequence[Cause]) -> str:
+    """What no setting mends, in a sentence; empty where nothing is left."""
+    todo: dict[str, list[str]] = {}  # what to do -> where
+    for cause in causes:
+        lead = leading(ring, cause)
+        place = " + ".join(pieces_of(ring, lead.element)) or "the ring"
+        places = todo.setdefault(find(lead.effect).remedy, [])
+        places += [place] * (place not in places)
+    if not todo:
+        return ""
+    said = []
+    for remedy, places in todo.items():
+        more = f" and {len(places) - SAID} more" if len(places) > SAID else ""
+        said.append(remedy.replace("{}", ", ".join(places[:SAID]) + more))
+    return f"no setting in it mends what is left to do: {'; '.join(said)}"
 
 
 # --- what it does to the stored beam --------------------------------------------------------------
@@ -100,14 +131,15 @@ def _beam_text(beam: Beam | None, told: Consequences) -> str:
     if beam is None:
         return "unstable: no beam can be stored"
     x, y = beam.tunes
-    design = f"{told.design[0]:.4f}, {told.design[1]:.4f}"
-    return (
-        f"tunes {x:.4f}, {y:.4f} (design {design}); "
-        f"beta beat {_pair(beam.beta_beat_rms, 100, 1)} % rms, "
-        f"{_pair(beam.beta_beat_max, 100, 1)} % at most; "
-        f"dispersion off by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms; "
-        f"closed orbit {_pair(beam.orbit_rms, 1e6, 1)} µm rms"
-    )
+    said = [f"tunes {x:.4f}, {y:.4f} (design {told.design[0]:.4f}, {told.design[1]:.4f})"]
+    if max(beam.beta_beat_max) > SETTLED.beta_beat_max[0]:
+        rms, most = _pair(beam.beta_beat_rms, 100, 2), _pair(beam.beta_beat_max, 100, 2)
+        said.append(f"beta beat {rms} % rms, {most} % at most")
+    if max(beam.dispersion_rms) > SETTLED.dispersion_rms[0]:
+        said.append(f"dispersion off by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms")
+    if max(beam.orbit_rms) > SETTLED.orbit_rms[0]:
+        said.append(f"closed orbit {_pair(beam.orbit_rms, 1e6, 1)} µm rms")
+    return "; ".join(said)
 
 
 def _pair(values: tuple[float, float], factor: float, digits: int) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.effects import find
+from tmlattice.effects import CATALOGUE, find
 from tmlattice.report.amounts import amount_text, least_text, probability_text, words
 from tmlattice.report.remedies import (
     consequence_text,
@@ -57,7 +57,30 @@ def closed_text(diagnosis: Diagnosis) -> str:
     if gap.interval is not None:
         low, high = gap.interval
         text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
+    after = gap.misfits[-1]
+    if diagnosis.priors and after.expected is not None:
+        rms = [f"{1e6 * step.rms:.3g}" for step in gap.misfits]
+        added = ["the design", "with small errors", "with what was found"][: len(rms)]
+        text += ": " + ", ".join(f"{a} {b} µm" for a, b in zip(added, rms, strict=False))
+        text += f"; {1e6 * after.expected:.3g} µm are to be expected of it"
     return text
+
+
+HARDLY = 0.5
+"""Relative error of a size of small errors from which on it is more a guess."""
+
+
+def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Small errors everywhere: (effect, rms and how many times the usual one)."""
+    rows = []
+    for name, rms in diagnosis.priors.items():
+        if name in CATALOGUE and diagnosis.kind == "trajectory":
+            usual = CATALOGUE[name].background
+            times = f", {rms / usual:.2g} times the usual one" if usual else ""
+            error = diagnosis.prior_errors.get(name, 0.0)
+            hardly = "; these readings hardly see it" if error > HARDLY else ""
+            rows.append((words(name), f"{amount_text(name, rms)} rms{times}{hardly}"))
+    return rows
 
 
 # --- the sentences --------------------------------------------------------------------------------
@@ -77,6 +100,11 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         return f"Something acts at s = {where}, and no effect of the catalogue explains it.{also}"
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return steps_sentence(diagnosis)
+    if diagnosis.verdict == "distributed" and diagnosis.priors:
+        return (
+            "Small errors all along the ring explain the readings; no single fault stands out "
+            "among them."
+        )
     if diagnosis.verdict == "distributed":
         return (
             "The data differ from the model all along the ring; no single place, and no few "
@@ -124,6 +152,11 @@ def _open(finding: Finding) -> str:
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
+    if diagnosis.verdict == "distributed" and diagnosis.priors and not diagnosis.steps:
+        return (
+            "A measurement of this machine from before the fault (--reference) shows a fault that "
+            "small errors hide."
+        )
     if diagnosis.verdict == "distributed" and not diagnosis.steps:
         return (
             "Small errors everywhere look like this: state them (--background all), or give a "
@@ -238,7 +271,9 @@ def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
     gap = diagnosis.heldout
     if gap is not None:
-        rows.append((f"held out ({heldout_text(diagnosis)})", gap.misfits[0], gap.misfits[-1]))
+        rows.append(
+            (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.since], gap.misfits[-1])
+        )
     return [
         (name, *(f"{1e6 * m.rms:.1f} µm, chi² {_chi2(m.chi2_per_dof)}" for m in (before, after)))  # type: ignore[misc]
         for name, before, after in rows
@@ -296,7 +331,13 @@ def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         what = "something without a name" if one.effect is None else words(one.effect)
         if one.kind == "section" and one.effect is not None:
             what += f", {one.element}"
-        rows.append((one.kind, place, f"{what} (statistic {one.statistic:.4g})"))
+        rows.append(
+            (
+                one.kind,
+                place,
+                f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})",
+            )
+        )
     return rows
 
 

@@ -137,7 +137,7 @@ def agreements(ring: "Ring") -> list[Agreement]:
                 continue
             seen.add(key)
             ours = magnet_map(element, 3).coefficients
-            parts = part_maps(element, ring.energy)
+            parts = part_maps(element, ring.map_energy)
             theirs = parts[len(parts) // 2].coefficients
             differences.append([
                 np.abs(ours[1] - theirs[1]).max(), np.abs(ours[2] - theirs[2]).max(),
@@ -181,7 +181,7 @@ def turn_maps(ring: "Ring", order: int) -> Iterator[tuple["Element", list[Taylor
                getattr(element.source, "e1", 0), getattr(element.source, "e2", 0))  # fmt: skip
         maps = known.get(key) if element.kind != "wiggler" else None
         if maps is None:
-            maps = known[key] = _maps_of(element, ring.energy, order)
+            maps = known[key] = _maps_of(element, ring.map_energy, order)
         yield element, maps
 
 

@@ -1,0 +1,202 @@
+"""Rings as other codes keep them: MAD-X's tables, Xsuite's JSON, elegant's lines."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tmlattice import load_ring
+from tmlattice.beam.chain import Chain
+from tmlattice.errors import LatticeError
+from tmlattice.maps import ring_matrix
+from tmlattice.optics import off_momentum, twiss
+
+MADX = """
+beam, particle=proton, energy=26;
+qf: quadrupole, l=0.4, k1=0.9;  qd: quadrupole, l=0.4, k1=-0.95;  qs: quadrupole, l=0.2, k1s=0.1;
+b:  sbend, l=1.2, angle=2*pi/16, e1=pi/16, e2=pi/16, k1=0.01, hgap=0.02, fint=0.5;
+sf: sextupole, l=0.2, k2=6.0;   sd: sextupole, l=0.2, k2=-9.0;
+ch: hkicker, l=0.1, kick=1e-5;  cv: vkicker, l=0.1;  ck: kicker, l=0.2;  m1: monitor;
+rf: rfcavity, volt=0.1, harmon=8;
+ring: sequence, l=64, refer=centre;
+%s
+endsequence;
+"""
+CELL = {"m1": 0.1, "qf": 0.5, "sf": 1.0, "ch": 1.3, "b_1": 2.2, "cv": 3.2, "qd": 4.5, "sd": 5.0,
+        "b_2": 6.2, "qs": 7.0, "ck": 7.3, "rf": 7.9}  # fmt: skip
+COLUMNS = ["NAME", "KEYWORD", "S", "L", "ANGLE", "K0L", "K0SL", "K1L", "K1SL", "K2L", "TILT",
+           "E1", "E2", "HGAP", "FINT", "HKICK", "VKICK", "VOLT", "FREQ"]  # fmt: skip
+KEYWORDS = {"bend": "SBEND", "hcorrector": "HKICKER", "vcorrector": "VKICKER",
+            "cavity": "RFCAVITY"}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def madx(tmp_path_factory):
+    path = tmp_path_factory.mktemp("madx") / "ring.seq"
+    places = (f"  {k.split('_')[0]}, at={8 * i + at};" for i in range(8) for k, at in CELL.items())
+    path.write_text(MADX % "\n".join(places))
+    return load_ring(path)
+
+
+def table(ring, folder, centre=0.0, drop=(), **header):
+    """The table that MAD-X's TWISS writes of a ring: no drifts, integrated strengths."""
+    header = {"ENERGY": ring.energy, "MASS": ring.mass, "LENGTH": ring.length, **header}
+    kept = [c for c in COLUMNS if c not in drop]
+    lines = [f"@ {k} %le {v!r}" for k, v in header.items() if v is not None]
+    types = ("%s" if c in kept[:2] else "%le" for c in kept)
+    lines += ["* " + " ".join(kept), "$ " + " ".join(types)]
+    for e in ring.elements:
+        if e.kind == "drift":
+            continue
+        source = e.source
+        row = {
+            "NAME": f'"{e.family.upper()}"',
+            "KEYWORD": f'"{KEYWORDS.get(e.kind, e.kind.upper())}"',
+            "S": e.s + (0.5 - centre) * e.length,
+            "L": e.length,
+            "ANGLE": e.angle if e.kind == "bend" else 0.0,
+            "K1L": e.k1 * e.length,
+            "K2L": e.k2 * e.length,
+            "TILT": e.tilt,
+            "E1": getattr(source, "e1", 0.0),
+            "E2": getattr(source, "e2", 0.0),
+            "HGAP": getattr(source, "gap", 0.0) / 2,
+            "FINT": getattr(source, "fint", 0.0),
+            "HKICK": e.angle if e.kind == "hcorrector" else 0.0,
+            "VOLT": 1e3 * getattr(source, "v", 0.0),
+            "FREQ": 1e-6 * getattr(source, "freq", 0.0),
+        }
+        lines.append(" ".join(str(row.get(c, 0.0)) for c in kept))
+    path = folder / "twiss.tfs"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("centre", [0.0, 0.5])
+def test_twiss_table_is_the_ring_that_it_is_of(madx, tmp_path, centre):
+    ring = load_ring(table(madx, tmp_path, centre))
+    assert (ring.energy, ring.mass) == (madx.energy, pytest.approx(madx.mass))
+    np.testing.assert_allclose(ring_matrix(ring), ring_matrix(madx), rtol=0, atol=1e-9)
+    rings = (ring, madx)
+    ours, theirs = (off_momentum(Chain.from_ring(r, 6), r.length).chromaticity for r in rings)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-6)
+    for kind in ("quadrupole", "bend", "sextupole", "monitor", "hcorrector", "vcorrector"):
+        assert ring.counts()[kind] == madx.counts()[kind], kind
+    places = {e.name: e.s for e in ring.elements}
+    for e in madx.elements:
+        if e.kind not in ("drift", "marker"):
+            assert places[e.name] == pytest.approx(e.s, abs=1e-9)
+    assert ring["ch::3"].angle == 1e-5
+    assert ring["rf::0"].source.v == pytest.approx(1e-4)
+
+
+def test_rectangular_bends_have_their_edges(madx, tmp_path):
+    path = table(madx, tmp_path, drop=("E1", "E2"))
+    path.write_text(path.read_text().replace('"SBEND"', '"RBEND"'))
+    np.testing.assert_allclose(
+        ring_matrix(load_ring(path)), ring_matrix(madx), rtol=0, atol=1e-9
+    )  # pi / 16 is half the angle
+
+
+def test_tables_that_say_too_little(madx, tmp_path):
+    with pytest.raises(LatticeError, match=r"no column L; write the table with .*k1l"):
+        load_ring(table(madx, tmp_path, drop=("L",)))
+    with pytest.raises(LatticeError, match="states no ENERGY; say energy="):
+        load_ring(table(madx, tmp_path, ENERGY=None))
+    path = table(madx, tmp_path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:8] + lines[20:22] + lines[8:20]) + "\n")
+    with pytest.raises(LatticeError, match="elements that overlap"):
+        load_ring(path)
+    path.write_text("@ nothing\n")
+    with pytest.raises(LatticeError, match="cannot be read as a table of MAD-X"):
+        load_ring(path)
+
+
+def test_sps_has_the_optics_that_its_header_states():
+    folder = os.environ.get("TMLATTICE_DATA")
+    path = Path(folder or "nowhere") / "real_rings" / "sps" / "twiss_elements.dat"
+    if not path.is_file():
+        pytest.skip("TMLATTICE_DATA has no real_rings/sps/twiss_elements.dat")
+    ring = load_ring(path)
+    header = dict(line.split()[1::2] for line in path.read_text().splitlines() if line[0] == "@"
+                  and line.split()[2] == "%le")  # fmt: skip
+    stated = {key: float(value) for key, value in header.items()}
+    functions = twiss(Chain.from_ring(ring))
+    tunes = [stated["Q1"], stated["Q2"]]
+    np.testing.assert_allclose(functions.total_tunes, tunes, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(functions.beta.max(0)[0], stated["BETXMAX"], rtol=1e-3)
+    effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
+    # MAD-X's own chromaticity is of the same second-order maps
+    chromaticity = [stated["DQ1"], stated["DQ2"]]
+    np.testing.assert_allclose(effects.chromaticity, chromaticity, rtol=0, atol=2e-3)
+    assert effects.momentum_compaction == pytest.approx(stated["ALFA"], rel=2e-4)
+    assert ring.length == pytest.approx(stated["LENGTH"], abs=1e-6)
+
+
+XSUITE = Path(__file__).parent / "lattices" / "xtrack_line.json"
+TUNES = [2.9958360, 3.8039423]
+CHROMATICITY = [12.244, 13.850]
+
+
+def test_line_of_xsuite_has_xsuites_tunes():
+    """Referee: the 4d twiss of xtrack 0.118.4, which wrote the file."""
+    ring = load_ring(XSUITE)
+    assert ring.energy == pytest.approx(3.0, rel=1e-6)
+    counts = ring.counts()
+    assert (counts["quadrupole"], counts["bend"], counts["sextupole"]) == (32, 32, 32)
+    found = twiss(Chain.from_ring(ring)).total_tunes
+    np.testing.assert_allclose(found, TUNES, rtol=0, atol=2e-5)  # xtrack cuts magnets into kicks
+    slopes = off_momentum(Chain.from_ring(ring, 6), ring.length).chromaticity
+    np.testing.assert_allclose(slopes, CHROMATICITY, rtol=5e-3)  # a slope over a finite step
+    marked = load_ring(XSUITE, monitors="bpm")
+    assert len(marked.monitors) == 32
+
+
+def test_environment_of_xsuite_wants_its_line_named(tmp_path):
+    line = json.loads(XSUITE.read_text())
+    elements = line.pop("elements")
+    content = {"xtrack_version": line["xtrack_version"], "elements": elements,
+               "lines": {"one": line, "two": line}}  # fmt: skip
+    path = tmp_path / "environment.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(LatticeError, match="has the sequences one, two; name one"):
+        load_ring(path)
+    assert load_ring(path, sequence="two").length == load_ring(XSUITE).length
+    line.pop("particle_ref")
+    path.write_text(json.dumps({**line, "elements": elements}))
+    with pytest.raises(LatticeError, match="no reference particle; say energy="):
+        load_ring(path)
+
+
+ELEGANT = """
+QF: KQUAD, L=0.4, K1=0.9
+QD: KQUAD, L=0.4, K1=-0.95
+B: CSBEND, L=1.2, ANGLE=0.39269908169872414, E1=0.19634954084936207, E2=0.19634954084936207
+SF: KSEXT, L=0.2, K2=6.0
+BPM: MONI
+C: KICKER
+D: DRIF, L=0.5
+CELL: LINE=(BPM, QF, D, SF, C, D, B, D, QD, D, B, D)
+RING: LINE=(CELL, CELL, CELL, CELL, CELL, CELL, CELL, CELL)
+"""
+
+
+def test_line_of_elegant(tmp_path):
+    path = tmp_path / "ring.lte"
+    path.write_text(ELEGANT)
+    with pytest.raises(LatticeError, match="no beam energy; say energy="):
+        load_ring(path)
+    ring = load_ring(path, energy=3.0)
+    assert len(ring.monitors) == 8
+    assert ring["sf::2"].k2 == pytest.approx(6.0)
+    assert ring["b::0"].angle == pytest.approx(np.pi / 8)
+    assert {e.kind for e in ring.elements if e.family.startswith("c_")} == {
+        "hcorrector", "vcorrector"
+    }  # fmt: skip
+    assert ring.length == pytest.approx(8 * (0.8 + 2.4 + 0.2 + 5 * 0.5))
+    path.write_text("Q: KQUAD, L=0.4\n")
+    with pytest.raises(LatticeError, match="no SEQUENCE and no LINE"):
+        load_ring(path, energy=3.0)

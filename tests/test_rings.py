@@ -1,0 +1,70 @@
+"""Rings that accelerator-toolbox ships: the questions of `benchmarks/rings.py`, of their files."""
+
+import sys
+from pathlib import Path
+
+import at
+import machine_data
+import numpy as np
+import pytest
+from command import tmlattice
+
+from tmlattice import load_ring
+from tmlattice.errors import LatticeError
+from tmlattice.machine.at_engine import AtEngine
+from tmlattice.machine.ocelot_engine import OcelotEngine
+
+FOLDER = Path(machine_data.__file__).parent
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import rings  # noqa: E402
+
+SMALL = {case.name: case for case in rings.cases() if case.name in ("dba", "thomx")}
+
+
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.filterwarnings("ignore::at.AtWarning")
+def test_small_ring_agrees_with_at_and_its_fault_is_found(name):
+    row = rings.study(SMALL[name])
+    for key, limit in rings.LIMITS.items():
+        assert row[key] < limit, (key, row)
+    assert row["place"], row
+    assert row["verdict"] in ("named", "equivalent"), row
+    assert row["tune_fit"] < 0.01, row  # the change is 0.02 to 0.05
+    assert row["green"]
+
+
+def test_a_case_that_is_wrong_is_not_green():
+    row = {"tunes_at": 1e-5, "turn_file": 1e-3, "place": False, "tune_fit": 1e-3}
+    assert not rings.green(row)
+    assert rings.green({**row, "place": True})
+    assert not rings.green({**row, "place": True, "turn_file": 0.1})
+
+
+def test_every_ring_with_a_cavity_is_built_by_both_engines(tmp_path):
+    """The default engine once refused six of six."""
+    for name in ("esrf.m", "soleil.m", "australian_synchrotron.m"):
+        ring = load_ring(FOLDER / name)
+        assert ring.counts()["cavity"] >= 1, name
+        launch = np.zeros((1, 6))
+        launch[0, :4] = [1e-5, 0, 1e-5, 0]
+        a, b = (engine(ring).track(launch, 2) for engine in (AtEngine, OcelotEngine))
+        # of orbits of 10 to 50 micrometres
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-8, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("name", "correctors"), [("soleil.m", 191), ("australian_synchrotron.m", 32), ("thomx.m", 12)]
+)
+def test_correctors_of_both_planes_are_there(name, correctors):
+    counts = load_ring(FOLDER / name).counts()
+    assert counts["hcorrector"] == counts["vcorrector"] == correctors
+
+
+def test_a_file_that_at_refuses_ends_in_one_sentence(tmp_path):
+    with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
+        load_ring(FOLDER / "errnoclass.mat")
+    done = tmlattice("info", FOLDER / "errnoclass.mat", cwd=tmp_path, check=2)
+    assert "Traceback" not in done.stderr
+    quiet = tmlattice("info", FOLDER / "noenergy.mat", cwd=tmp_path, check=0)
+    assert "AT " not in quiet.stderr  # AT's own words stay in the log
+    assert at.load_lattice(FOLDER / "hmba.mat").energy == 6e9

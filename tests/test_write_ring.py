@@ -1,0 +1,153 @@
+"""Rings in the formats of other codes: what is read back is the ring that was written."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command import tmlattice
+from conftest import SMALL
+
+from tmlattice import Cause, load_ring, simulate
+from tmlattice.beam.chain import Chain
+from tmlattice.diagnosis.result import ring_tunes
+from tmlattice.effects import apply
+from tmlattice.errors import LatticeError
+from tmlattice.lattice import write_ring
+from tmlattice.lattice.ring import PROTON_GEV
+from tmlattice.measurement import write_measurement
+
+FORMATS = ("ring.json", "ring.at.json", "ring.madx", "ring.seq", "ring.py")
+FOREIGN = FORMATS[1:]
+
+
+def names(ring):
+    return [element.name.casefold().replace("..", "::") for element in ring.elements]
+
+
+@pytest.fixture(scope="module")
+def uneven(small_ring):
+    """With a magnet of its own strength, a tilt, a cavity's worth of everything that is written."""
+    ring = small_ring.with_changed("QD::5", k1=-0.85).with_changed("sd::3", tilt=0.2)
+    return ring.with_changed("v3", angle=1e-4)
+
+
+@pytest.mark.parametrize("file", FORMATS)
+def test_ring_that_is_read_back_has_the_same_maps(uneven, file, tmp_path):
+    assert write_ring(uneven, tmp_path / file) == () or file.endswith((".madx", ".seq"))
+    back = load_ring(tmp_path / file)
+    assert back.energy == uneven.energy
+    assert [e.kind for e in back.elements] == [e.kind for e in uneven.elements]
+    drifts = np.array([e.kind == "drift" for e in uneven.elements])  # MAD-X numbers definitions
+    assert (np.array(names(back)) == np.array(names(uneven)))[~drifts].all()
+    # numbers are written to their last digit; tilts and matrices are turned there and back
+    assert ring_tunes(back) == pytest.approx(ring_tunes(uneven), abs=1e-12)
+    launch = [[1e-3, 1e-4, -5e-4, 2e-4, 0.0, 1e-3]]
+    turns = [Chain.from_ring(ring, 6).track(launch, 1)[0, 1] for ring in (uneven, back)]
+    assert turns[1][:4] == pytest.approx(turns[0][:4], abs=1e-13)
+
+
+@pytest.mark.parametrize("file", FORMATS)
+def test_protons_are_as_fast_in_the_file(small_ring, file, tmp_path):
+    ring = replace(small_ring, mass=PROTON_GEV)
+    write_ring(ring, tmp_path / file)
+    back = load_ring(tmp_path / file)
+    # OCELOT's maps are told the energy of an electron that is as fast
+    assert back.map_energy == pytest.approx(ring.map_energy, rel=1e-12)
+    assert file.endswith(".py") or back.mass == pytest.approx(PROTON_GEV, rel=1e-9)
+
+
+def test_at_itself_finds_the_tunes_in_the_file(uneven, tmp_path):
+    """AT tracks the file with its own elements: ten steps a magnet leave 2e-5."""
+    import at
+
+    write_ring(uneven, tmp_path / "ring.at.json")
+    lattice = at.load_lattice(str(tmp_path / "ring.at.json"))
+    assert at.get_tune(lattice) == pytest.approx(ring_tunes(uneven), abs=5e-5)
+
+
+@pytest.mark.parametrize("file", FOREIGN)
+def test_errors_that_a_format_can_say_are_written(small_ring, file, tmp_path):
+    """A roll, kicks of a corrector in both planes, a wiggler's focusing and a skew field in it."""
+    causes = [
+        Cause("quadrupole_roll", "QF::3", 0.01),
+        Cause("corrector_kick_x", "v3", 2e-5),
+        Cause("corrector_kick_y", "v7", -3e-5),
+        Cause("insertion_device_focusing", "wig_1", 3e-3),
+        Cause("skew_gradient", "wig_1", 2e-3),
+    ]
+    ring = apply(small_ring, causes)
+    write_ring(ring, tmp_path / file)
+    back = load_ring(tmp_path / file)
+    assert ring_tunes(back) == pytest.approx(ring_tunes(ring), abs=1e-9)
+    orbits = [Chain.from_ring(r).closed_orbit()[0][-1] for r in (ring, back)]
+    assert np.abs(orbits[0][[0, 2]]).min() > 1e-6
+    assert orbits[1] == pytest.approx(orbits[0], abs=1e-12)
+
+
+@pytest.mark.parametrize("file", FOREIGN)
+def test_errors_that_a_format_has_no_place_for_are_told(small_ring, file, tmp_path):
+    causes = [
+        Cause("quadrupole_offset_x", "QF::3", 1e-4),
+        Cause("gradient_absolute", "QD::5", 4e-3),
+    ]
+    told = write_ring(apply(small_ring, causes), tmp_path / file)
+    assert any("dx of QF::3" in sentence for sentence in told)
+    assert any("thin gradients in the middle of QD::5" in sentence for sentence in told)
+    back = load_ring(tmp_path / file)
+    magnet = small_ring["QD::5"]
+    name = "qd..5" if file.endswith((".madx", ".seq")) else "QD::5"
+    assert back[name].k1 == pytest.approx(magnet.k1 + 4e-3 / magnet.length)
+    assert write_ring(apply(small_ring, causes), tmp_path / "own.json") == ()
+    assert load_ring(tmp_path / "own.json")["QF::3"].errors.dx == 1e-4
+
+
+def test_skew_gradient_of_a_quadrupole_is_written_as_its_tilt(small_ring, tmp_path):
+    """In magnets that stand upright, in one that is tilted, and in one that has no field."""
+    ring = small_ring.with_changed("QF::7", tilt=0.3).with_changed("QD::9", k1=0.0)
+    causes = [Cause("skew_gradient", name, 1e-4) for name in ("QF::3", "QD::5", "QF::7", "QD::9")]
+    causes.append(Cause("gradient_absolute", "QF::7", 2e-4))
+    faulty = apply(ring, causes)
+    (told,) = write_ring(faulty, tmp_path / "ring.at.json")
+    assert "QF::3, QD::5, QF::7, QD::9 are written as fields of their bodies" in told
+    back = load_ring(tmp_path / "ring.at.json")
+    turns = [Chain.from_ring(r).one_turn_map()[1] for r in (ring, faulty, back)]
+    # thin and thick differ to second order in the length of a magnet
+    assert np.abs(turns[2] - turns[1]).max() < 0.1 * np.abs(turns[1] - turns[0]).max()
+
+
+def test_name_of_no_format_is_refused_before_anything_is_written(small_ring, tmp_path):
+    with pytest.raises(LatticeError, match=r"\.at\.json"):
+        write_ring(small_ring, tmp_path / "ring.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_diagnose_writes_the_ring_as_found_and_repaired(small_ring, tmp_path):
+    """The repaired ring's settings on the machine as found give the design's tunes."""
+    fault = Cause("quadrupole_gradient", "QD::5", -0.05)
+    roll = Cause("quadrupole_roll", "QF::11", 0.02)
+    data = simulate(
+        small_ring, [fault, roll], shots=4, seed=1, amplitude=3e-4, noise=2e-6
+    ).measurement()
+    write_measurement(tmp_path / "m", data)
+    done = tmlattice(
+        "diagnose", SMALL, tmp_path / "m", "--lattice-out", "found.at.json", "--repaired-out",
+        "set.py", "--json", "a.json", cwd=tmp_path, check=0,
+    )  # fmt: skip
+    assert "turn QF::11 upright" in done.stdout.split("written:")[1]
+    design = small_ring["QD::5"].k1
+    found, settings = load_ring(tmp_path / "found.at.json"), load_ring(tmp_path / "set.py")
+    told = {f["element"]: f for f in json.loads((tmp_path / "a.json").read_text())["findings"]}
+    a = told["QD::5"]["amount"]
+    assert found["QD::5"].k1 == pytest.approx((1 + a) * design)
+    assert settings["QD::5"].k1 == pytest.approx(design / (1 + a))
+    assert settings["QF::11"].tilt == 0.0
+    there = apply(settings, [Cause("quadrupole_gradient", "QD::5", a)])
+    assert ring_tunes(there) == pytest.approx(ring_tunes(small_ring), abs=1e-9)
+
+
+def test_suffix_without_a_format_is_refused_before_the_work(tmp_path):
+    done = tmlattice(
+        "diagnose", SMALL, tmp_path, "--repaired-out", "ring.lte", cwd=tmp_path, check=2
+    )
+    assert done.stderr

@@ -1,0 +1,195 @@
+"""Few causes alone, or a few among small errors everywhere: what the data speak for.
+
+A machine has small errors everywhere, which is what nobody has to say. Where they are so small that
+the noise hides them, few causes explain the readings alone; that is tried first, unless already
+neighbouring monitors disagree all along the ring. Where it leaves more than noise, the sizes of the
+small errors are learnt from what is left, and their evidence says whether they are there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.background import SmallErrors, small_errors
+from tmlattice.diagnosis.prepare import Prepared
+from tmlattice.effects import Cause, background_rms, find
+from tmlattice.inference import chi2
+from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.lattice import Ring
+from tmlattice.observe.data import Data
+from tmlattice.observe.first_turns import turns_of
+from tmlattice.observe.noise import local_misfit
+
+Array = NDArray[np.float64]
+
+FEW = 3
+"""Causes that are sought alone before anybody asks for small errors."""
+
+CROWDED = 1.5
+"""Median of what neighbouring monitors leave of one another, in noise (0.67 for noise alone), above
+which few causes are not tried: a few leave most gaps between monitors as the design has them."""
+
+DOUBT = 8.0
+"""Statistic of the likeliest fault from which on it is weighed with sizes learnt without it."""
+
+CLEAR = 10.0
+"""Log evidence above which small errors are there."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """An explanation, and the small errors beside it.
+
+    Attributes:
+        explanation: of the search.
+        small: None: there are none.
+    """
+
+    explanation: Explanation
+    small: SmallErrors | None = None
+
+
+def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float] | None) -> Found:
+    """What explains the data.
+
+    Args:
+        ring: the design.
+        ready: the data.
+        search: what is searched.
+        told: rms of small errors by effect; empty: there are none; None: the data say.
+    """
+    if told is not None and not told:
+        search.progress("scan")
+        return Found(explain(search, ready.before))
+    if told is not None:
+        search.progress("background")
+        small = small_errors(ring, ready.problem, ready.known, told, ready.before.nuisances)
+        return Found(*_among(ring, ready, search, small))
+    few = None
+    if not _crowded(ready):
+        search.progress("scan")
+        few = explain(replace(search, most=min(FEW, search.most)), ready.before)
+        if _explained(few, ready):
+            return Found(few)
+    search.progress("small errors")
+    start = ready.before if few is None else few.fit
+    about = [] if few is None or not few.named else [_strongest(few)]
+    usual = background_rms({"all": None})
+    small = small_errors(
+        ring, ready.problem, ready.known, usual, start.nuisances, about,
+        learn=True, noisy=ready.estimated,
+    )  # fmt: skip
+    if small.evidence is not None and small.evidence < CLEAR:
+        if few is None or (few.full and search.most > FEW):
+            few = explain(search, ready.before)
+        return Found(few)
+    return Found(*_among(ring, ready, search, small))
+
+
+def _crowded(ready: Prepared) -> bool:
+    """Whether neighbouring monitors disagree all along the ring; nobody knows without a noise."""
+    data = ready.problem.data
+    if ready.estimated:
+        return False
+    left = local_misfit(data, ready.before.point.view) / data.sigma
+    left = np.abs(left[np.isfinite(left)])
+    return len(left) > 20 and float(np.median(left)) > CROWDED
+
+
+def _explained(found: Explanation, ready: Prepared) -> bool:
+    """Whether few causes leave nothing but noise, and did not need all that they may be."""
+    more, _ = ready.problem.judgement.noise
+    p_value = chi2.sf(found.fit.chi2, freedom(turns_of(found).data, found.fit))
+    return bool(p_value >= more)
+
+
+def _among(
+    ring: Ring, ready: Prepared, search: Search, small: SmallErrors
+) -> tuple[Explanation, SmallErrors]:
+    """The background, taken again along the orbit of what is found where that misleads."""
+    few = min(2, search.most)  # two findings say already whether it has to be taken again
+    learn = small.evidence is not None
+    search.progress("scan")
+    narrow = replace(search, most=few, names_first=True)
+    explanation = explain(replace(narrow, problem=small.problem), small.before)
+    for _ in range(ready.problem.judgement.retaken):
+        tried = _beside(explanation, doubted=learn)
+        if tried is None:
+            break
+        search.progress("background with what was found")
+        beside, causes = tried
+        errors = small.estimate(beside, turns_of(explanation).whitening)
+        again = small_errors(
+            ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
+            learn=learn, noisy=learn and ready.estimated,
+        )  # fmt: skip
+        other = explain(replace(narrow, problem=again.problem), again.before)
+        if not explanation.count and not other.count:
+            break  # it was a small error after all
+        small, explanation = again, other
+    if explanation.full and search.most > few:
+        explanation = explain(replace(search, problem=small.problem), small.before)
+    if explanation.fit.causes and not explanation.fit.kicks:
+        return _settled(ring, ready, explanation, small)
+    return explanation, small
+
+
+def _settled(
+    ring: Ring, ready: Prepared, explanation: Explanation, small: SmallErrors
+) -> tuple[Explanation, SmallErrors]:
+    """Small errors linear about all that was found, and its amounts among them."""
+    found = explanation.fit
+    errors = small.estimate(found, turns_of(explanation).whitening)
+    about = small_errors(
+        ring, small.plain, ready.known, small.sizes, found.nuisances, found.causes, errors
+    )
+    problem = about.problem.without(explanation.dropped)
+    again = fit(problem, found.causes, found.nuisances)
+    if not again.good:
+        return explanation, small
+    settled = replace(explanation, problem=problem, fit=again, before=about.before)
+    return settled, replace(about, open=small.open, evidence=small.evidence)
+
+
+def _strongest(explanation: Explanation) -> Cause:
+    clear = [named.detection.statistic for named in explanation.named]
+    return explanation.fit.causes[int(np.argmax(clear))]
+
+
+def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Cause, ...]] | None:
+    """Beside which fit, and with which causes, small errors have to be taken again; None: they
+    stand.
+
+    A strong fault's orbit makes small errors look like further faults, so the strongest finding is
+    taken along. A monitor that was set aside has errors of its own that took up what they could: it
+    starts anew. And sizes that were learnt with a fault among them are too large, so that it passes
+    for a small error: where nothing was found the likeliest fault has to be weighed without it.
+    """
+    if not explanation.count:
+        scan = explanation.first
+        top = int(np.argmax(scan.statistic)) if doubted and len(scan.statistic) else -1
+        if top < 0 or scan.statistic[top] < DOUBT:
+            return None
+        name, place = scan.hypotheses[top]
+        amount = np.copysign(abs(scan.amount[top]) ** (1 / find(name).power), scan.amount[top])
+        cause = Cause(name, place, float(amount))
+        tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
+        return (tried, tried.causes) if tried.good else None
+    found = explanation.fit
+    left = chi2.sf(found.chi2, freedom(turns_of(explanation).data, found))
+    if not (explanation.monitors or (found.causes and (explanation.count > 1 or left < 0.01))):
+        return None
+    # the others may be the background's
+    return found, (_strongest(explanation),) if explanation.named else ()
+
+
+def freedom(data: Data, result: Fit) -> int:
+    """Degrees of freedom: readings and priors, less what was fitted."""
+    free = data.launch_sigma > 0
+    priors = int((free & np.isfinite(data.launch_sigma)).sum())
+    amounts = sum(not find(cause.effect).discrete for cause in result.causes)
+    kicks = sum(len(values) for values in result.kicks.values())
+    return max(int(data.valid.sum()) + priors - int(free.sum()) - amounts - kicks, 1)

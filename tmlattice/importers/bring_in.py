@@ -1,0 +1,162 @@
+"""Which importer files are for: by what they hold, not by their names."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.errors import MeasurementError
+from tmlattice.importers.conventions import compared
+from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
+from tmlattice.importers.imported import Imported, counted
+from tmlattice.importers.lattices import Elements, elements_of
+from tmlattice.importers.loco import Iteration, bring_loco, is_loco
+from tmlattice.importers.middle_layer import bring_middle_layer, is_beside, is_response
+from tmlattice.importers.tables import bring_table, bring_turns
+from tmlattice.lattice import Ring, load_ring
+from tmlattice.lattice.mat_file import read_mat
+from tmlattice.measurement import OrbitResponse
+from tmlattice.measurement.tables import Unit
+
+MATLAB, HDF5, TABLE, NAMES = (".mat",), (".h5", ".hdf5", ".hdf"), (".csv",), (".json",)
+Content = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How files are read.
+
+    Attributes:
+        iteration: of a LOCO fit, see `bring_loco`.
+        keep_bad: take what the files call bad, see `bring_loco`.
+        sequence: the variable of a MATLAB file that is the lattice.
+        lattice: name or path of the lattice of a table or of turns, see `load_ring`.
+        energy: GeV; else what the lattice states.
+        turns: the kind of a turn-by-turn file, see `bring_turns`.
+        unit: of the readings of first turns or turns.
+        noise: rms of a reading, or of an orbit change, m, where the files give none.
+    """
+
+    iteration: Iteration = "last"
+    keep_bad: bool = False
+    sequence: str | None = None
+    lattice: str | None = None
+    energy: float | None = None
+    turns: str | None = None
+    unit: Unit | None = None
+    noise: float | None = None
+
+
+def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imported:
+    """The measurement of one file or of several that belong together.
+
+    Args:
+        paths: MATLAB LOCO (`.mat`); or the HDF5 files of a response, its dispersion and noise,
+            with the table of names (`.json`) and the lattice (`.mat`); or the Middle Layer's
+            response, dispersion and noise (`.mat`) with the machine's LOCO file; or a table
+            (`.csv`); or any other file, which the package `turn_by_turn` is asked to read.
+        options: how they are read.
+
+    Raises:
+        MeasurementError: files that are not known, or do not fit together.
+        LatticeError: a lattice that cannot be made.
+    """
+    options = options or Options()
+    files = [Path(path) for path in paths]
+    for path in files:
+        if not path.is_file():
+            raise MeasurementError(f"no file '{path}'; check the path")
+    if options.turns and len(files) != 1:
+        raise MeasurementError("turns are in one file; name one")
+    known = [] if options.turns else files
+    matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
+    hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
+    brought = _bring(files, matlab, hdf5, options)
+    if options.noise is not None and brought.measurement.noise is None:
+        noise = np.full((len(brought.measurement.monitors), 2), options.noise)
+        brought = replace(brought, measurement=replace(brought.measurement, noise=noise))
+        brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
+    if isinstance(brought.measurement, OrbitResponse):
+        brought = _with_all_noise(brought, brought.measurement)
+    if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
+        return brought
+    confirmed, contradicted = compared(brought.ring, brought.measurement)
+    return replace(
+        brought,
+        assumed=(*brought.assumed, *confirmed),
+        doubts=(*brought.doubts, *contradicted),
+    )
+
+
+def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
+    """The typical noise of a plane where the files have none for a monitor."""
+    if data.noise is None or not np.isfinite(data.noise).any(axis=0).all():
+        return brought
+    unknown = np.isnan(data.noise)
+    read = np.isfinite(data.response).any(axis=0)
+    noise = np.where(unknown, np.nanmedian(data.noise, axis=0), data.noise)
+    brought = replace(brought, measurement=replace(data, noise=noise))
+    names = [data.monitors[i] for i in np.unique(np.nonzero(unknown & read)[0])]
+    if not names:
+        return brought
+    return brought.saying(f"no noise is given for {counted(names)}: that of the typical monitor")
+
+
+def _bring(
+    files: Sequence[Path],
+    matlab: Sequence[tuple[Path, Content]],
+    hdf5: Sequence[tuple[Path, Content]],
+    options: Options,
+) -> Imported:
+    if options.turns or (len(files) == 1 and not matlab and not hdf5):
+        (path,) = files[:1]
+        if not options.turns and path.suffix.lower() in TABLE:
+            return bring_table(path, _ring(options), options.unit)
+        if options.turns or path.suffix.lower() not in NAMES:
+            return bring_turns(path, _ring(options), options.turns, options.unit)
+    loco = [(path, content) for path, content in matlab if is_loco(content)]
+    rest = [(path, content) for path, content in matlab if not is_loco(content)]
+    if hdf5:
+        names = [path for path in files if path.suffix.lower() in NAMES]
+        if not rest or not names:
+            raise MeasurementError(
+                f"'{hdf5[0][0]}' names inputs, not places: give the lattice (.mat) and the table "
+                "of names (name_mapping.json) with it"
+            )
+        mapping = {key: place for path in names for key, place in read_mapping(path).items()}
+        return bring_hdf5(hdf5, mapping, _lattice(rest, options))
+    responses = [content for _, content in rest if is_response(content)]
+    if responses and not loco:
+        raise MeasurementError(
+            "a response of the Middle Layer names devices, not elements: give the machine's LOCO "
+            "file with it"
+        )
+    if len(loco) == 1 and len(loco) + len(rest) == len(files):
+        ((path, content),) = loco
+        if not rest:
+            return bring_loco(content, path, options.iteration, options.keep_bad)
+        if len(responses) == 1:
+            beside = [content for _, content in rest if is_beside(content)]
+            return bring_middle_layer(
+                responses[0], beside, content, path, options.iteration, options.keep_bad
+            )
+    shown = ", ".join(f"'{path}'" for path in files)
+    raise MeasurementError(
+        f"{shown}: no measurement that is known; give a MATLAB LOCO file (with LocoMeasData), or "
+        "the HDF5 files of a response with lattice and names"
+    )
+
+
+def _ring(options: Options) -> Ring | None:
+    if options.lattice is None:
+        return None
+    return load_ring(options.lattice, options.sequence, options.energy)
+
+
+def _lattice(matlab: Sequence[tuple[Path, Content]], options: Options) -> Elements:
+    if len(matlab) > 1:
+        raise MeasurementError(f"two lattices, '{matlab[0][0]}' and '{matlab[1][0]}'; give one")
+    ((path, content),) = matlab
+    return elements_of(content, path, options.sequence)

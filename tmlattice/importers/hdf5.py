@@ -1,0 +1,202 @@
+"""Orbit responses of the ESRF and of pyLOCO: HDF5 files, and a table of names.
+
+- The response: `matrix` [monitors x then y, inputs], m/rad, `inputs_delta`, rad, from one side to
+  the other, `input_names`; `raw_up` and `raw_down`, m, where the orbits themselves were kept.
+- The dispersion: `measured_eta_x`, `measured_eta_y`, m, for `rf_full_step`, Hz.
+- The noise: `Noise_BPMx`, `Noise_BPMy`, m, of one orbit.
+- `name_mapping.json`: `"39/B1L": "srmag/hst-sf2/c04-a"`, an element's place in the lattice, from 0,
+  the component of its field and the name of what drives it: B1L kicks in x, A1L in y.
+
+Monitors stand in the order of the lattice.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.importers.imported import Imported, numbers
+from tmlattice.importers.lattices import Elements
+from tmlattice.importers.matlab_ring import Roles, ring_of_elements
+from tmlattice.measurement import OrbitResponse
+from tmlattice.measurement.orbit_response import RfStep
+
+Array = NDArray[np.float64]
+Plane = {"B1L": "x", "A1L": "y"}
+
+
+def read_hdf5(path: Path) -> dict[str, Any]:
+    """Arrays, texts and attributes of an HDF5 file, all groups in one table.
+
+    Raises:
+        MeasurementError: no HDF5 file.
+    """
+    import h5py
+
+    content: dict[str, Any] = {}
+
+    def take(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            content[name.rsplit("/", 1)[-1]] = item[()]
+
+    try:
+        with h5py.File(path) as file:
+            content.update(dict(file.attrs))
+            file.visititems(take)
+    except (OSError, RuntimeError, TypeError, ValueError, KeyError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise MeasurementError(
+            f"'{path}' cannot be read as HDF5 ({said}); save it again"
+        ) from error
+    return content
+
+
+def read_mapping(path: Path) -> dict[str, tuple[int, str]]:
+    """Name of what drives a kick -> place in the lattice and plane.
+
+    Raises:
+        MeasurementError: no JSON table of names.
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        found = {}
+        for key, name in table.items():
+            place, _, component = key.partition("/")
+            if component in Plane:
+                found[str(name)] = int(place), Plane[component]
+    except (OSError, ValueError, AttributeError) as error:
+        raise MeasurementError(
+            f'\'{path}\' is no table of names such as "39/B1L": "srmag/hst-sf2/c04-a" ({error})'
+        ) from error
+    return found
+
+
+def bring_hdf5(
+    parts: Sequence[tuple[Path, Mapping[str, Any]]],
+    mapping: Mapping[str, tuple[int, str]],
+    lattice: Elements,
+) -> Imported:
+    """The measurement of HDF5 files that belong together.
+
+    Args:
+        parts: paths and contents, of `read_hdf5`: the response, and where there are the dispersion
+            and the noise.
+        mapping: of `read_mapping`.
+        lattice: the model.
+
+    Raises:
+        MeasurementError: no response, a name that the mapping lacks, or shapes that do not fit.
+        LatticeError: the lattice cannot be made.
+    """
+    data = _with(parts, "matrix")
+    if data is None:
+        raise MeasurementError(
+            f"'{parts[0][0]}' holds no 'matrix'; give the file of the orbit response"
+        )
+    names = _texts(data.get("input_names"))
+    unknown = [name for name in names if name not in mapping]
+    if unknown:
+        raise MeasurementError(
+            f"'{unknown[0]}' stands in no table of names; give its name_mapping.json too"
+        )
+    monitors = tuple(i for i, fields in enumerate(lattice.fields) if _is_monitor(fields))
+    rows = 2 * len(monitors)
+    kicks: dict[int, frozenset[str]] = {}
+    for name in names:
+        place, plane = mapping[name]
+        kicks[place] = kicks.get(place, frozenset()) | {plane}
+    own = {mapping[name]: name.lower() for name in names}
+    placed = ring_of_elements(
+        lattice.fields, lattice.name, lattice.energy, Roles(monitors, kicks, own)
+    )
+    steps = numbers(data.get("inputs_delta"), "inputs_delta", (len(names),))
+    change, of_orbits = _orbits(data, steps, rows)
+    noise, of_noise = _noise(parts, data, len(monitors))
+    rf, of_rf = _rf(parts, lattice, len(monitors))
+    measured = OrbitResponse(
+        correctors=tuple(placed.correctors[mapping[name]] for name in names),
+        planes=tuple(mapping[name][1] for name in names),
+        kicks=steps,
+        monitors=placed.monitors,
+        response=np.stack([change[: rows // 2].T, change[rows // 2 :].T], axis=2),
+        noise=noise,
+        rf=rf,
+        lattice="lattice.json",
+        energy=placed.ring.energy,
+    )
+    said = (
+        "monitors stand in the order of the lattice, x then y; inputs are found by the table of "
+        "names",
+        of_orbits,
+        "the RF frequency stood still while correctors were stepped",
+        of_noise,
+        of_rf,
+        *placed.said,
+    )
+    return Imported(measured, placed.ring, said)
+
+
+def _with(parts: Sequence[tuple[Path, Mapping[str, Any]]], name: str) -> Mapping[str, Any] | None:
+    return next((content for _, content in parts if name in content), None)
+
+
+def _is_monitor(fields: Mapping[str, Any]) -> bool:
+    return str(fields.get("Class", "")).lower() == "monitor" or "GCR" in fields
+
+
+def _texts(value: Any) -> list[str]:
+    if value is None:
+        raise MeasurementError("no 'input_names'; the columns cannot be told")
+    items = np.atleast_1d(np.asarray(value, dtype=object)).tolist()
+    return [item.decode() if isinstance(item, bytes) else str(item) for item in items]
+
+
+def _orbits(data: Mapping[str, Any], steps: Array, rows: int) -> tuple[Array, str]:
+    """Orbit changes, m, [row, column]."""
+    shape = rows, len(steps)
+    sizes = [np.size(data.get(name, ())) for name in ("raw_up", "raw_down")]
+    if sizes == [rows * len(steps)] * 2:
+        up, down = (numbers(data[name], name, shape) for name in ("raw_up", "raw_down"))
+        two = bool(data.get("bipolar", True))
+        sides = "two-sided" if two else "one-sided; the diagnosis takes them as two-sided"
+        return up - down, (
+            f"orbit changes are raw_up - raw_down, m, for inputs_delta, rad; steps are {sides}"
+        )
+    matrix = numbers(data["matrix"], "matrix", shape)
+    return matrix * steps, "matrix is in m/rad, inputs_delta in rad from one side to the other"
+
+
+def _noise(
+    parts: Sequence[tuple[Path, Mapping[str, Any]]], data: Mapping[str, Any], monitors: int
+) -> tuple[Array | None, str]:
+    found = _with(parts, "Noise_BPMx")
+    if found is None:
+        return None, "no noise is given (Noise_BPMx)"
+    orbit = np.stack(
+        [numbers(found.get(f"Noise_BPM{p}"), f"Noise_BPM{p}", (monitors,)) for p in "xy"], axis=1
+    )
+    shots = max(1, int(data.get("shots_per_orbit", 1)))
+    return np.where(orbit > 0, orbit, np.nan) * np.sqrt(2 / shots), (
+        "Noise_BPMx is the rms of one orbit; an orbit change is the difference of two"
+        + (f", each the mean of {shots}" if shots > 1 else "")
+    )
+
+
+def _rf(
+    parts: Sequence[tuple[Path, Mapping[str, Any]]], lattice: Elements, monitors: int
+) -> tuple[RfStep | None, str]:
+    found = _with(parts, "measured_eta_x")
+    step = None if found is None else found.get("rf_full_step")
+    if found is None or step is None or lattice.harmonic is None or lattice.frequency is None:
+        return None, "no response to the RF's step is given (measured_eta_x with rf_full_step)"
+    orbit = np.stack(
+        [numbers(found.get(f"measured_eta_{p}"), f"measured_eta_{p}", (monitors,)) for p in "xy"],
+        axis=1,
+    )
+    return RfStep(lattice.frequency, lattice.harmonic, float(step), orbit), (
+        "measured_eta is the orbit change, m, for rf_full_step, Hz, from one side to the other"
+    )

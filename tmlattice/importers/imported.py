@@ -1,0 +1,119 @@
+"""What an importer makes of files: a measurement, the lattice where they hold one, and words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.files import output_folder
+from tmlattice.lattice import Ring, save_ring
+from tmlattice.measurement import Measurement, OrbitResponse, write_measurement
+from tmlattice.measurement.write import check_free
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A measurement as the package has it.
+
+    Attributes:
+        measurement: an orbit response, or first turns.
+        ring: the model that the files hold or that the caller named; None: neither.
+        assumed: what the files do not prove: units, signs, steps; a sentence each.
+        doubts: what the data contradict; a sentence each.
+    """
+
+    measurement: OrbitResponse | Measurement
+    ring: Ring | None = None
+    assumed: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+    def saying(self, *sentences: str) -> "Imported":
+        """The same with more that was assumed."""
+        return replace(self, assumed=(*self.assumed, *sentences))
+
+
+def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
+    """Something of a file as an array of numbers.
+
+    Args:
+        value: of the file.
+        what: its name, for the error.
+        shape: that it must have; None: any.
+
+    Raises:
+        MeasurementError: it holds no numbers, or has another shape.
+    """
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise MeasurementError(f"{what} holds no numbers; mend it in the file") from None
+    if shape is not None:
+        if array.size != int(np.prod(shape)):
+            raise MeasurementError(
+                f"{what} has the shape {list(array.shape)}; it should be {list(shape)}"
+            )
+        array = array.reshape(tuple(shape))
+    return array
+
+
+def is_number(value: Any) -> TypeGuard[int | float]:
+    """Whether something of a file is one finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300
+
+
+def counted(names: Sequence[str], most: int = 8) -> str:
+    """Names in a sentence, the first few of many."""
+    shown = ", ".join(f"'{name}'" for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def described(brought: Imported) -> str:
+    """What was brought in, in a line."""
+    data = brought.measurement
+    if isinstance(data, OrbitResponse):
+        planes = [data.planes.count(plane) for plane in "xy"]
+        read = np.isfinite(data.response).any(axis=0).sum(axis=0)
+        noise = "" if data.noise is None or not np.isfinite(data.noise).any() else (
+            f", noise {1e6 * np.nanmedian(data.noise):.3g} µm"
+        )  # fmt: skip
+        step = "no RF step" if data.rf is None or data.rf.orbit is None else (
+            f"an RF step of {data.rf.step:+g} Hz"
+        )  # fmt: skip
+        return (
+            f"orbit response: monitors {read[0]} x, {read[1]} y; correctors {planes[0]} x, "
+            f"{planes[1]} y; {step}{noise}"
+        )
+    shots, turns, monitors, _ = data.readings.shape
+    return f"first turns: {shots} shots, {turns} turns, {monitors} monitors"
+
+
+def write_imported(brought: Imported, folder: Path, force: bool = False) -> None:
+    """Write the measurement folder, with `lattice.json` where there is a ring, as a whole.
+
+    Args:
+        brought: what to write.
+        folder: made where it is not there.
+        force: a measurement or lattice that is there already is replaced.
+
+    Raises:
+        OutputError: it cannot be written.
+        MeasurementError: readings that no reader would take, or old data without force.
+    """
+    check_free(folder, force)
+    if brought.ring is not None and not force and (folder / "lattice.json").exists():
+        raise MeasurementError(
+            f"'{folder}' holds a lattice.json already; name another folder, or replace it with "
+            "--force (in Python: force=True)"
+        )
+    with output_folder(folder) as temporary:
+        write_measurement(temporary, brought.measurement)
+        if brought.ring is not None:
+            save_ring(brought.ring, temporary / "lattice.json")

@@ -1,0 +1,376 @@
+"""MATLAB LOCO files: `LocoMeasData`, `BPMData`, `CMData`, `RINGData`, `FitParameters`.
+
+The response `M` is [monitors x then y, correctors H then V], mm, for the steps `HCMKicks`,
+`VCMKicks`, mrad, from one side to the other; `Eta`, mm, for a step `DeltaRF`, Hz; `BPMSTD`, mm,
+is the rms with which LOCO weighs an entry of `M`, the difference of two orbits. Indices count
+from 1. Of the lists by iteration the first says what was measured; gains, kicks and couplings of
+later ones are the fit's answer and are not taken.
+
+`RINGData` is the lattice with the parameters of the fit's last iteration, and `FitParameters`
+has those of every iteration: `iteration` says which are put in.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.importers.imported import Imported, counted, is_number, numbers
+from tmlattice.importers.matlab_ring import Placed, Roles, ring_of_elements
+from tmlattice.measurement import OrbitResponse
+from tmlattice.measurement.orbit_response import RfStep
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Fields = Mapping[str, Any]
+Iteration = Literal["first", "last"]
+
+VARIABLES = (
+    "LocoMeasData", "BPMData", "CMData", "RINGData", "FitParameters", "LocoFlags", "LocoModel",
+)  # fmt: skip
+SAME = 1e-6
+"""Relative difference of the lattice's numbers and the last iteration's: they are the same."""
+COMPUTED = 1e-4
+"""Relative difference of a dispersion and LOCO's first model's: it was computed, not measured. The
+measured ones of ten rings differ by 0.04 to 1."""
+
+
+def is_loco(content: Fields) -> bool:
+    """Whether the variables of a MATLAB file are LOCO's."""
+    return "LocoMeasData" in content
+
+
+def bring_loco(
+    content: Fields, path: Path, iteration: Iteration = "last", keep_bad: bool = False
+) -> Imported:
+    """The measurement and the model of a LOCO file.
+
+    Args:
+        content: its variables, of `read_mat`.
+        path: of the file, for names and errors.
+        iteration: "last": the lattice as the file has it, which is as the fit left it; "first":
+            with the parameters with which the fit began, the model as it was before.
+        keep_bad: take monitors and correctors too that the good lists leave out.
+
+    Raises:
+        MeasurementError: a variable or field is missing, or shapes do not fit.
+        LatticeError: the lattice cannot be made.
+    """
+    data, monitors, correctors = (
+        _first(content.get(name), f"{name} of '{path}'")
+        for name in ("LocoMeasData", "BPMData", "CMData")
+    )
+    lattice = content.get("RINGData")
+    if isinstance(lattice, list):  # the ring itself
+        lattice = {"Lattice": lattice}
+    lattice = _first(lattice, f"RINGData of '{path}'")
+    stated = isinstance(content.get("LocoFlags"), Mapping | list)
+    flags = _first(content["LocoFlags"], "LocoFlags") if stated else {}
+    at_monitor = _index(monitors, "BPMIndex")
+    every = {
+        "HBPMIndex": np.arange(len(at_monitor)) + 1,
+        "VBPMIndex": np.arange(len(at_monitor)) + 1,
+    }
+    reads = {p: _index({**every, **monitors}, f"{k}BPMIndex") for p, k in (("x", "H"), ("y", "V"))}
+    kickers = {plane: _index(correctors, f"{k}CMIndex") for plane, k in (("x", "H"), ("y", "V"))}
+    for plane, index in reads.items():
+        if len(index) and not 0 <= index.min() <= index.max() < len(at_monitor):
+            raise MeasurementError(
+                f"'{path}': a monitor of plane {plane} is not among the {len(at_monitor)} of "
+                "BPMIndex; mend BPMData"
+            )
+    elements, of_lattice = _elements(lattice, content.get("FitParameters"), iteration)
+    kicks: dict[int, frozenset[str]] = {}
+    for plane, index in kickers.items():
+        for place in index.tolist():
+            kicks[place] = kicks.get(place, frozenset()) | {plane}
+    placed = ring_of_elements(
+        elements,
+        path.name.split(".")[0],
+        _energy(lattice, elements),
+        Roles(tuple(at_monitor.tolist()), kicks),
+    )
+    good, of_lists = _good(monitors, correctors, reads, kickers, placed, keep_bad)
+    measured = OrbitResponse(
+        **_columns(data, correctors, reads, kickers, placed, good),
+        rf=_rf(data, lattice, reads, good, placed),
+        lattice="lattice.json",
+        energy=placed.ring.energy,
+    )
+    return Imported(
+        measured,
+        placed.ring,
+        assumed=(*conventions(flags, measured), *of_lists, of_lattice, *placed.said),
+        doubts=(*_computed(data, content.get("LocoModel"), good), *_unkicked(correctors, kickers)),
+    )
+
+
+def _first(value: Any, what: str) -> Fields:
+    """A structure, or the first of a list by iteration."""
+    if isinstance(value, list) and value:
+        value = value[0]
+    if not isinstance(value, Mapping):
+        raise MeasurementError(f"no structure {what}; give the whole LOCO file")
+    return value
+
+
+def _field(structure: Fields, name: str) -> Any:
+    if name not in structure:
+        raise MeasurementError(f"no field {name}; give the whole LOCO file")
+    return structure[name]
+
+
+def _index(structure: Fields, name: str) -> Indices:
+    """A list of places from 1, counted from 0."""
+    index = np.atleast_1d(numbers(_field(structure, name), name))
+    if index.ndim > 1:
+        raise MeasurementError(
+            f"{name} has the shape {list(index.shape)}; a magnet of several elements a row is not "
+            "taken: name one element of each"
+        )
+    if np.any(index != np.round(index)) or len(set(index.tolist())) < len(index):
+        raise MeasurementError(f"{name} is no list of different places; mend it in the file")
+    return index.astype(np.int64) - 1
+
+
+def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
+    """GeV; LOCO has it in GeV, AT's elements in eV."""
+    stated = [s["Energy"] for s in (lattice, *elements) if is_number(s.get("Energy"))]
+    if not stated or not stated[0] > 0:
+        raise MeasurementError("neither RINGData nor its elements state an energy; add Energy")
+    return float(stated[0]) * (1e-9 if stated[0] > 1e5 else 1.0)
+
+
+# --- the lattice ----------------------------------------------------------------------------------
+def _elements(
+    lattice: Fields, parameters: Any, iteration: Iteration
+) -> tuple[list[dict[str, Any]], str]:
+    """The elements with an iteration's parameters, and a sentence that says so."""
+    given = _field(lattice, "Lattice")
+    if not isinstance(given, list) or not all(isinstance(e, Mapping) for e in given):
+        raise MeasurementError("RINGData.Lattice is no list of elements; save the ring in it")
+    elements = [dict(fields) for fields in given]
+    steps = parameters if isinstance(parameters, list) else [parameters]
+    steps = [step for step in steps if isinstance(step, Mapping)]
+    as_it_is = "the model is RINGData as it stands"
+    if not steps:
+        return elements, as_it_is
+    try:
+        last, first = (_settings(step) for step in (steps[-1], steps[0]))
+        there = [_number_of(elements, setting) for setting in last]
+        same = all(
+            abs(a - b) <= SAME * max(abs(a), abs(b)) for a, (*_, b) in zip(there, last, strict=True)
+        )
+        if not same:
+            return elements, f"{as_it_is}: its numbers are not those of the fit's last iteration"
+        if iteration == "last":
+            return elements, (
+                f"{as_it_is}, with the {len(last)} parameters that LOCO fitted to these data in "
+                f"{len(steps) - 1} iterations (--iteration first: the model before the fit)"
+            )
+        for setting in first:
+            _put(elements, setting)
+    except (ArithmeticError, KeyError, IndexError, TypeError, ValueError):
+        return elements, f"{as_it_is}: the fit's parameters cannot be followed"
+    return elements, (
+        f"the model is RINGData with the {len(first)} parameters of FitParameters(1), with which "
+        f"the fit began: RINGData itself has those of its last iteration (--iteration last)"
+    )
+
+
+Setting = tuple[int, str, int, float]
+"""Place, field, number within it, value."""
+
+
+def _settings(step: Fields) -> list[Setting]:
+    values = np.atleast_1d(np.asarray(step["Values"], dtype=float))
+    groups = step["Params"]
+    groups = groups if isinstance(groups, list) else [groups]
+    settings: list[Setting] = []
+    for group, value in zip(groups, values.tolist(), strict=True):
+        for one in group if isinstance(group, list) else [group]:
+            number = np.ravel(np.asarray(one["FieldIndex"], dtype=float))
+            at = int(number[-1]) - 1 if len(number) else 0
+            places = np.ravel(np.asarray(one["ElemIndex"], dtype=float)).astype(np.int64) - 1
+            settings += [(place, str(one["FieldName"]), at, value) for place in places.tolist()]
+    return settings
+
+
+def _number_of(elements: Sequence[Fields], setting: Setting) -> float:
+    place, field, at, _ = setting
+    return float(np.ravel(elements[place][field])[at])
+
+
+def _put(elements: list[dict[str, Any]], setting: Setting) -> None:
+    place, field, at, value = setting
+    old = elements[place][field]
+    if isinstance(old, np.ndarray):
+        new = old.astype(float)
+        new.ravel()[at] = value
+        elements[place][field] = new
+    else:
+        elements[place][field] = value
+
+
+# --- the measurement ------------------------------------------------------------------------------
+def _good(
+    monitors: Fields,
+    correctors: Fields,
+    reads: Mapping[str, Indices],
+    kickers: Mapping[str, Indices],
+    placed: Placed,
+    keep_bad: bool,
+) -> tuple[dict[str, NDArray[np.bool_]], list[str]]:
+    """Flags of the good lists by list ("x" and "y" of monitors, "H" and "V" of correctors)."""
+    good, said = {}, []
+    for plane, letter in (("x", "H"), ("y", "V")):
+        for key, structure, index, kind in (
+            (plane, monitors, reads[plane], "BPM"), (letter, correctors, kickers[plane], "CM")
+        ):  # fmt: skip
+            name = f"{letter}{kind}GoodDataIndex"
+            flags = np.ones(len(index), dtype=bool)
+            if name in structure:
+                there = np.atleast_1d(numbers(structure[name], name)).astype(np.int64) - 1
+                flags[:] = np.isin(np.arange(len(index)), there)
+            if not flags.all():
+                bad = np.flatnonzero(~flags)
+                names = (
+                    [placed.monitors[index[k]] for k in bad] if kind == "BPM"
+                    else [placed.correctors[int(index[k]), plane] for k in bad]
+                )  # fmt: skip
+                what = "monitors in" if kind == "BPM" else "correctors of"
+                done = "kept" if keep_bad else "left out"
+                said.append(f"{what} {plane} that {name} calls bad, {done}: {counted(names)}")
+            good[key] = np.ones_like(flags) if keep_bad else flags
+    return good, said
+
+
+def _columns(
+    data: Fields,
+    correctors: Fields,
+    reads: Mapping[str, Indices],
+    kickers: Mapping[str, Indices],
+    placed: Placed,
+    good: Mapping[str, NDArray[np.bool_]],
+) -> dict[str, Any]:
+    """Correctors, planes, kicks, monitors, response and noise of the measurement."""
+    horizontal, vertical = len(kickers["x"]), len(kickers["y"])
+    rows = len(reads["x"]) + len(reads["y"])
+    M = 1e-3 * numbers(_field(data, "M"), "LocoMeasData.M", (rows, horizontal + vertical))
+    names, planes, kicks, kept = [], [], [], []
+    for plane, letter in (("x", "H"), ("y", "V")):
+        index = kickers[plane]
+        names += [placed.correctors[place, plane] for place in index.tolist()]
+        planes += [plane] * len(index)
+        kicks += (1e-3 * _steps(correctors, letter, len(index))).tolist()
+        kept += good[letter].tolist()
+    response = np.stack([_spread(column, reads, good, placed) for column in M.T])
+    noise = None
+    if np.size(data.get("BPMSTD", ())):
+        given = 1e-3 * numbers(data["BPMSTD"], "LocoMeasData.BPMSTD")
+        given = numbers(np.repeat(given, rows if given.size == 1 else 1), "BPMSTD", (rows,))
+        every = {plane: np.ones_like(flags) for plane, flags in good.items()}
+        noise = _spread(np.where(given > 0, given, np.nan), reads, every, placed)
+    take = np.array(kept, dtype=bool) & (np.array(kicks) != 0)
+    return {
+        "correctors": [n for n, t in zip(names, take, strict=True) if t],
+        "planes": [p for p, t in zip(planes, take, strict=True) if t],
+        "kicks": np.array(kicks)[take],
+        "monitors": placed.monitors,
+        "response": response[take],
+        "noise": noise,
+    }
+
+
+def _steps(correctors: Fields, letter: str, count: int) -> Array:
+    steps = np.ravel(numbers(_field(correctors, f"{letter}CMKicks"), f"{letter}CMKicks"))
+    steps = np.repeat(steps, count) if steps.size == 1 else steps
+    if len(steps) != count:
+        raise MeasurementError(f"{letter}CMKicks has {len(steps)} steps, not {count}")
+    return steps
+
+
+def _unkicked(correctors: Fields, kickers: Mapping[str, Indices]) -> list[str]:
+    """Correctors without a step, which no response can be of."""
+    counts = [
+        int(np.count_nonzero(_steps(correctors, letter, len(kickers[plane])) == 0))
+        for plane, letter in (("x", "H"), ("y", "V"))
+    ]
+    return [f"{sum(counts)} correctors have a step of 0 and are left out"] if sum(counts) else []
+
+
+def _spread(
+    column: Array,
+    reads: Mapping[str, Indices],
+    good: Mapping[str, NDArray[np.bool_]],
+    placed: Placed,
+) -> Array:
+    """Readings x then y as [monitor, 2], NaN where there is none or it is bad."""
+    spread = np.full((len(placed.monitors), 2), np.nan)
+    first = len(reads["x"])
+    for plane, part in ((0, column[:first]), (1, column[first:])):
+        key = "xy"[plane]
+        spread[reads[key], plane] = np.where(good[key], part, np.nan)
+    return spread
+
+
+def _rf(
+    data: Fields,
+    lattice: Fields,
+    reads: Mapping[str, Indices],
+    good: Mapping[str, NDArray[np.bool_]],
+    placed: Placed,
+) -> RfStep | None:
+    step, eta = data.get("DeltaRF"), np.asarray(data.get("Eta", ()))
+    cavity: Fields = next((e for e in lattice["Lattice"] if is_number(e.get("HarmNumber"))), {})
+    frequency = lattice.get("CavityFrequency", cavity.get("Frequency"))
+    frequency = data.get("RF", frequency)
+    harmonic = lattice.get("CavityHarmNumber", cavity.get("HarmNumber"))
+    if not (is_number(step) and is_number(frequency) and is_number(harmonic) and eta.size):
+        return None
+    rows = len(reads["x"]) + len(reads["y"])
+    orbit = _spread(1e-3 * numbers(eta, "LocoMeasData.Eta", (rows,)), reads, good, placed)
+    return RfStep(float(frequency), round(harmonic), float(step), orbit)
+
+
+def _computed(data: Fields, models: Any, good: Mapping[str, NDArray[np.bool_]]) -> list[str]:
+    """A dispersion that is LOCO's own model's."""
+    first = models[0] if isinstance(models, list) and models else models
+    if not isinstance(first, Mapping) or not np.size(data.get("Eta", ())):
+        return []
+    eta = numbers(data["Eta"], "LocoMeasData.Eta").ravel()
+    model = numbers(first.get("Eta", ()), "LocoModel.Eta").ravel()
+    if model.size < eta.size:  # of the monitors of the good lists
+        eta = eta[np.concatenate([good["x"], good["y"]])]
+    if model.size != eta.size or not eta.any():
+        return []
+    apart = np.abs(eta - model).max() / np.abs(eta).max()
+    if apart > COMPUTED:
+        return []
+    return [
+        f"LocoMeasData.Eta is the dispersion of LOCO's own first model to {apart:.0e}: it was "
+        "computed, not measured"
+    ]
+
+
+def conventions(flags: Fields, measured: OrbitResponse) -> list[str]:
+    """How the numbers of a LOCO file are taken; a sentence each."""
+    two = str(flags.get("ResponseMatrixMeasurement", "BiDirectional")).lower() == "bidirectional"
+    said = [
+        "M and Eta are in mm, HCMKicks and VCMKicks in mrad from one side of the step to the other",
+        "steps are two-sided" + ("" if flags else " (no LocoFlags say so)") if two
+        else "steps are one-sided, as LocoFlags says; the diagnosis takes them as two-sided",
+        "the RF frequency stood still while correctors were stepped",
+    ]  # fmt: skip
+    if str(flags.get("ClosedOrbitType", "")).lower() == "fixedmomentum":
+        said[-1] += ": LOCO's own model kept the momentum (ClosedOrbitType)"
+    if measured.noise is None:
+        said.append("no noise is given (BPMSTD)")
+    else:
+        said.append("BPMSTD is the rms of an orbit change, as LOCO weighs it")
+    if measured.rf is None:
+        said.append("no response to the RF's step is given (Eta, DeltaRF)")
+    return said

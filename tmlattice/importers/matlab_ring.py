@@ -1,0 +1,272 @@
+"""A ring out of the MATLAB structures of AT's elements, with monitors and correctors as a
+measurement has them.
+
+A measurement names elements by their place in the lattice. What stands there becomes a monitor or a
+corrector whatever its class says, and keeps its name:
+
+- a corrector of one plane stays one element;
+- where one place kicks in both planes, all of its family become two thin correctors in the middle
+  of it, `name_h` and `name_v`: to first order a thick corrector is no other;
+- a magnet that kicks (a corrector inside a sextupole) becomes two halves, `name` and `name_2`, with
+  the thin correctors in its middle.
+
+A pass method of the file chooses nothing that is loaded: one that AT does not ship is a drift.
+"""
+
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from tmlattice.errors import LatticeError
+from tmlattice.importers.imported import is_number
+from tmlattice.lattice import Ring
+from tmlattice.lattice.at_file import ring_from_at
+
+PLANES = "xy"
+LONGEST = 1e5
+"""m; no element of a ring is longer."""
+_LETTER = {"x": "h", "y": "v"}
+_APERTURES = ("AperturePass", "EAperturePass", "LongtAperturePass")
+_MAD = {"x": "HKICKER", "y": "VKICKER"}
+
+
+@dataclass(frozen=True)
+class Roles:
+    """What a measurement takes places of the lattice for.
+
+    Attributes:
+        monitors: places, from 0.
+        kicks: planes in which a place kicks, by place.
+        names: of thin correctors, by place and plane, where they have names of their own.
+    """
+
+    monitors: tuple[int, ...]
+    kicks: Mapping[int, frozenset[str]]
+    names: Mapping[tuple[int, str], str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A ring and the names of the places that a measurement knows.
+
+    Attributes:
+        ring: the model.
+        monitors: names of the monitors, in the order of `Roles.monitors`.
+        correctors: names by place and plane.
+        said: what was done to the lattice; sentences.
+    """
+
+    ring: Ring
+    monitors: tuple[str, ...]
+    correctors: Mapping[tuple[int, str], str]
+    said: tuple[str, ...]
+
+
+def ring_of_elements(
+    elements: Sequence[Mapping[str, Any]], name: str, energy: float, roles: Roles
+) -> Placed:
+    """The ring of AT's elements as structures.
+
+    Args:
+        elements: the fields of each, in beam order.
+        name: of the ring.
+        energy: GeV.
+        roles: what stands where; a place beyond the lattice is an error.
+
+    Raises:
+        LatticeError: an element that AT cannot make, or a place that is not there.
+    """
+    import at
+
+    places = [*roles.monitors, *roles.kicks]
+    if not elements:
+        raise LatticeError("the lattice has no elements; nothing can be compared with it")
+    if places and not (min(places) >= 0 and max(places) < len(elements)):
+        wrong = max(places) if max(places) >= len(elements) else min(places)
+        raise LatticeError(
+            f"place {wrong + 1} is beyond the lattice's {len(elements)} elements; the file's "
+            "lattice is not that of its measurement"
+        )
+    said: Counter[str] = Counter()
+    with warnings.catch_warnings():  # AT's own, of what it finds in old files
+        warnings.simplefilter("ignore")
+        made = [_element(fields, i, energy, said) for i, fields in enumerate(elements)]
+    both = {
+        _family(made[i])
+        for i, planes in roles.kicks.items()
+        if len(planes) > 1 and isinstance(made[i], at.Corrector)
+    }
+    sequence: list[Any] = []
+    where: dict[tuple[int, str], int] = {}  # (place, "" or plane) -> in the sequence
+    for i, element in enumerate(made):
+        planes = roles.kicks.get(i, frozenset())
+        if i in roles.monitors:
+            parts = _monitor(element, planes)
+            where[i, ""] = len(sequence)
+        elif isinstance(element, at.Corrector):
+            if np.any(np.asarray(element.KickAngle, dtype=float)):
+                said["kicks of correctors in the lattice are taken as 0"] += 1
+            parts = _corrector(element, frozenset(PLANES) if _family(element) in both else planes)
+        elif planes:
+            parts = _magnet(element, planes)
+            said["magnets that kick stand as two halves with thin correctors between"] += 1
+        else:
+            parts = [element]
+        for k, part in enumerate(parts):
+            if plane := getattr(part, "Plane", ""):
+                where[i, plane] = len(sequence) + k
+                part.FamName = roles.names.get((i, plane), part.FamName)
+        sequence += parts
+    lattice = at.Lattice(sequence, name=name, energy=energy * 1e9, periodicity=1)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            ring = ring_from_at(lattice, name, energy)
+        except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
+            raise LatticeError(f"the lattice cannot be taken over ({error}); mend it") from error
+    names = _names(ring, [_family(element) for element in sequence], where.values())
+    return Placed(
+        ring=ring,
+        monitors=tuple(names[where[i, ""]] for i in roles.monitors),
+        correctors={
+            (i, plane): names[where[i, plane]]
+            for i, planes in roles.kicks.items()
+            for plane in planes
+        },
+        said=(
+            *(f"{what} ({count})" for what, count in said.items()),
+            *(str(warning.message) for warning in told),
+        ),
+    )
+
+
+def _names(ring: Ring, families: Sequence[str], places: Iterable[int]) -> dict[int, str]:
+    """Names in the ring of places in the sequence that it was made of: of each family the first is
+    the first, whatever became of other families (slices of a wiggler are merged)."""
+    there = defaultdict(list)
+    for element in ring.elements:
+        there[element.family].append(element.name)
+    seen: Counter[str] = Counter()
+    number = []
+    for family in families:
+        number.append(seen[family])
+        seen[family] += 1
+    names = {}
+    for place in places:
+        family = families[place]
+        if len(there[family]) != seen[family]:
+            raise LatticeError(
+                f"'{family}' of the lattice is a monitor or corrector here and a wiggler's slice "
+                "there; give them names of their own"
+            )
+        names[place] = there[family][number[place]]
+    return names
+
+
+def _family(element: Any) -> str:
+    return str(element.FamName).strip().lower()
+
+
+@cache
+def _shipped() -> frozenset[str]:
+    """AT's own pass methods."""
+    from pathlib import Path
+
+    import at
+
+    folder = Path(at.__file__).parent / "integrators"
+    names = {path.name.split(".")[0] for path in folder.iterdir()}
+    return frozenset(name for name in names if name.endswith("Pass"))
+
+
+def _element(fields: Mapping[str, Any], place: int, energy: float, said: Counter[str]) -> Any:
+    from at.load.utils import element_from_dict
+
+    if not isinstance(fields, Mapping):
+        raise LatticeError(f"element {place + 1} of the lattice is no structure; save it again")
+    kept = {key: value for key, value in fields.items() if _is_data(value)}
+    length = kept.get("Length", 0.0)
+    if not is_number(length) or abs(length) > LONGEST:
+        raise LatticeError(f"element {place + 1} of the lattice has the length {length!r:.40}")
+    name, method = kept.get("FamName"), kept.get("PassMethod")
+    kept["FamName"] = name if isinstance(name, str) and name else f"element_{place + 1}"
+    if not isinstance(method, str) or method not in _shipped():
+        said[f"'{str(method)[:40]}' is no pass method of AT: a drift"] += 1
+        kept = {"FamName": kept["FamName"], "Length": length}
+        kept["PassMethod"] = "DriftPass" if length else "IdentityPass"
+    if str(kept["PassMethod"]) in _APERTURES:
+        kept = {"FamName": kept["FamName"], "Class": "Marker", "PassMethod": "IdentityPass"}
+    _one_gradient(kept)
+    if "Frequency" in kept:  # a cavity cannot be made without
+        kept.setdefault("Energy", energy * 1e9)
+    try:
+        return element_from_dict(kept, index=place, check=False, quiet=True)
+    except Exception as error:  # AT's constructors fail in their own ways
+        said_so = " ".join(str(error).split()) or type(error).__name__
+        raise LatticeError(
+            f"element {place + 1} of the lattice, '{kept['FamName']}', cannot be made ({said_so})"
+        ) from error
+
+
+def _one_gradient(fields: dict[str, Any]) -> None:
+    """`K` and `PolynomB` both say the gradient; a linear pass method follows `K`."""
+    if "PolynomB" in fields and "K" in fields:
+        gradient = fields.pop("K")
+        if "Linear" in str(fields.get("PassMethod")):
+            orders = np.zeros(max(2, np.size(fields["PolynomB"])))
+            orders[: np.size(fields["PolynomB"])] = fields["PolynomB"]
+            orders[1] = float(np.ravel(gradient)[0])
+            fields["PolynomB"] = orders
+            fields["MaxOrder"] = max(1, int(fields.get("MaxOrder", 1)))
+
+
+def _is_data(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "fiub" and value.size > 0
+    return isinstance(value, int | float | str)
+
+
+def _kicker(family: str, length: float, plane: str) -> Any:
+    import at
+
+    return at.Corrector(family, length, [0.0, 0.0], MADType=_MAD[plane], Plane=plane)
+
+
+def _thin(element: Any, planes: Iterable[str]) -> list[Any]:
+    return [_kicker(f"{_family(element)}_{_LETTER[plane]}", 0.0, plane) for plane in sorted(planes)]
+
+
+def _monitor(element: Any, planes: frozenset[str]) -> list[Any]:
+    import at
+
+    if planes:
+        raise LatticeError(f"'{element.FamName}' is a monitor and a corrector; name one of them")
+    return [at.Monitor(_family(element), Length=float(getattr(element, "Length", 0.0)))]
+
+
+def _corrector(element: Any, planes: frozenset[str]) -> list[Any]:
+    import at
+
+    length = float(element.Length)
+    if not planes:
+        return [at.Corrector(_family(element), length, [0.0, 0.0])]
+    if len(planes) == 1:
+        (plane,) = planes
+        return [_kicker(_family(element), length, plane)]
+    way = [at.Drift("drift", length / 2)] if length else []
+    return [*way, *_thin(element, planes), *way]
+
+
+def _magnet(element: Any, planes: frozenset[str]) -> list[Any]:
+    """A magnet with thin correctors in its middle."""
+    thin = _thin(element, planes)
+    if not float(getattr(element, "Length", 0.0)):
+        return [element, *thin]
+    first, second = element.divide([0.5, 0.5])
+    second.FamName = f"{_family(element)}_2"
+    return [first, *thin, second]

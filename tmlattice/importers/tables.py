@@ -1,0 +1,290 @@
+"""CSV tables of an orbit response, and turn-by-turn files.
+
+Long: `corrector,monitor,x [mm],y [mm],kick [mrad]`, a row for each corrector and monitor; rows of
+the corrector `rf` hold the orbit change for a step of `kick`, Hz. Wide: `monitor,plane` and a
+column `name [mm/mrad]` for each corrector, whose steps are not known then. Units stand in the
+header, in brackets; without one they are m, rad and m/rad. Names are the lattice's.
+"""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.importers.imported import Imported, counted
+from tmlattice.importers.middle_layer import METRES, RADIANS
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement, OrbitResponse, read_table, read_turn_by_turn
+from tmlattice.measurement.monitors import Names
+from tmlattice.measurement.orbit_response import RfStep
+from tmlattice.measurement.tables import Unit
+from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
+
+Array = NDArray[np.float64]
+
+LIGHT = 299792458.0
+KICK = 1e-4
+"""rad; the step that a wide table is taken to have been made with."""
+_HEADER = re.compile(r"^\s*(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*$")
+_PLANES = {"hcorrector": "x", "vcorrector": "y"}
+
+
+def bring_table(path: Path, ring: Ring | None, unit: Unit | None = None) -> Imported:
+    """An orbit response, or first turns, of a CSV table.
+
+    Args:
+        path: the file.
+        ring: the lattice; an orbit response needs it, for the correctors' planes.
+        unit: of the readings of first turns; None: m.
+
+    Raises:
+        MeasurementError: a header that is not known, or a field that is no number: with its line.
+        UnknownNameError: a name that the lattice does not have.
+    """
+    header, rows = _read(path)
+    names = [name.lower() for name, _ in header]
+    if "corrector" not in names and "plane" not in names:
+        return _first_turns(path, ring, unit)
+    if ring is None:
+        raise MeasurementError(
+            f"'{path}' is an orbit response: name its lattice with --lattice, which knows the "
+            "planes of its correctors"
+        )
+    if "corrector" in names:
+        return _long(path, header, rows, ring)
+    return _wide(path, header, rows, ring)
+
+
+def bring_turns(
+    path: Path, ring: Ring | None, kind: str | None = None, unit: Unit | None = None
+) -> Imported:
+    """Turns of the beam, of a file that the package `turn_by_turn` reads.
+
+    Args:
+        path: the file.
+        ring: the lattice, whose names the monitors then have; None: names as they are.
+        kind: see `read_turn_by_turn`; None: lhc, then sps.
+        unit: of the file; None: mm.
+
+    Raises:
+        MeasurementError: it cannot be read, or its readings cannot be of that unit.
+    """
+    failed: MeasurementError | None = None
+    for one in [kind] if kind else ["lhc", "sps"]:
+        try:
+            data = read_turn_by_turn(path, one, unit=unit or "mm")
+        except MeasurementError as error:
+            failed = failed or error
+            continue
+        doubts: tuple[str, ...] = ()
+        if ring is not None:
+            data, doubts = _of_ring(data, ring)
+        read = np.atleast_2d(np.isfinite(data.readings).any(axis=(0, 1)))
+        single = int((read.sum(axis=1) == 1).sum())
+        said = [
+            f"read as '{one}' of turn_by_turn; readings are in {unit or 'mm'}",
+            "turn 0 is the first in the file; where the beam was launched is not known",
+            f"monitors: {int(read[:, 0].sum())} in x, {int(read[:, 1].sum())} in y"
+            + (f", {single} of one plane" if single else ""),
+        ]
+        return Imported(_unlaunched(data, ring), ring, tuple(said), doubts)
+    assert failed is not None
+    raise failed
+
+
+def _of_ring(data: Measurement, ring: Ring) -> tuple[Measurement, tuple[str, ...]]:
+    """The monitors that the ring has, under its names and in its order, and what it has not."""
+    ours = Names("monitor", [element.name for element in ring.monitors])
+    place = {name: ours.find(name) for name in data.monitors}
+    there = sorted((at, name) for name, at in place.items() if at is not None)
+    missing = [name for name, at in place.items() if at is None]
+    if not there:
+        ours[missing[0]]  # an UnknownNameError with the nearest names
+    data = replace(
+        data.select(monitors=[name for _, name in there]),
+        monitors=tuple(ours.names[at] for at, _ in there),
+    )
+    what = f"monitors that the lattice does not have, left out: {counted(missing)}"
+    return data, (what,) if missing else ()
+
+
+def _unlaunched(data: Measurement, ring: Ring | None) -> Measurement:
+    return Measurement(
+        launches=np.zeros((len(data.shots), 5)),
+        readings=data.readings,
+        monitors=data.monitors,
+        noise=None,
+        launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(data.shots), 1)),
+        shots=data.shots,
+        lattice=None if ring is None else "lattice.json",
+        energy=None if ring is None else ring.energy,
+    )
+
+
+def _first_turns(path: Path, ring: Ring | None, unit: Unit | None) -> Imported:
+    known = None if ring is None else [element.name for element in ring.monitors]
+    data = read_table(path, monitors=known, unit=unit or "m")
+    return Imported(
+        _unlaunched(data, ring), ring,
+        (f"readings are in {unit or 'm'}", "where the beam was launched is not known"),
+    )  # fmt: skip
+
+
+# --- an orbit response ----------------------------------------------------------------------------
+Header = list[tuple[str, str]]
+"""Name and unit of each column."""
+
+
+def _read(path: Path) -> tuple[Header, list[list[str]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [row for row in csv.reader(file, skipinitialspace=True) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MeasurementError(f"'{path}' cannot be read as CSV ({error}); save it as UTF-8") from (
+            error
+        )
+    if len(rows) < 2:
+        raise MeasurementError(f"{path}: no rows below the header; nothing was read")
+    matched = [_HEADER.match(name) for name in rows[0]]
+    header = [(m["name"], m["unit"] or "") for m in matched if m]
+    for line, row in enumerate(rows[1:], 2):
+        if len(row) != len(header):
+            raise MeasurementError(
+                f"{path}, row {line}: {len(row)} fields where the header has {len(header)}"
+            )
+    return header, rows[1:]
+
+
+def _number(path: Path, line: int, text: str) -> float:
+    try:
+        value = float(text) if text.strip() else np.nan
+    except ValueError:
+        raise MeasurementError(f"{path}, row {line}: '{text}' is no number") from None
+    return value
+
+
+def _factor(path: Path, name: str, unit: str, of: dict[str, float]) -> float:
+    if not unit:
+        return 1.0
+    if unit.strip().lower() not in of:
+        raise MeasurementError(f"{path}: '{name}' is in [{unit}]; known are {', '.join(of)}")
+    return of[unit.strip().lower()]
+
+
+def _long(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
+    place = {name.lower(): i for i, (name, _) in enumerate(header)}
+    for name in ("corrector", "monitor", "x", "y", "kick"):
+        if name not in place:
+            raise MeasurementError(
+                f"{path}: no column '{name}'; an orbit response has corrector, monitor, x, y, kick"
+            )
+    scale = {n: _factor(path, n, header[place[n]][1], METRES) for n in "xy"}
+    angle = _factor(path, "kick", header[place["kick"]][1], RADIANS)
+    columns: dict[str, dict[str, tuple[float, float]]] = {}
+    kicks: dict[str, float] = {}
+    for line, row in enumerate(rows, 2):
+        corrector, monitor = (row[place[n]].strip() for n in ("corrector", "monitor"))
+        x, y = (scale[n] * _number(path, line, row[place[n]]) for n in "xy")
+        kick = _number(path, line, row[place["kick"]])
+        if kicks.setdefault(corrector, kick) != kick:
+            raise MeasurementError(
+                f"{path}, row {line}: '{corrector}' has the steps {kicks[corrector]:g} and "
+                f"{kick:g}; it has one"
+            )
+        own = columns.setdefault(corrector, {})
+        if monitor in own:
+            raise MeasurementError(f"{path}, row {line}: '{corrector}', '{monitor}' stand twice")
+        own[monitor] = x, y
+    rf = next((name for name in columns if name.lower() == "rf"), None)
+    rf_orbit = columns.pop(rf) if rf else None
+    said = [f"x in {header[place['x']][1] or 'm'}, kicks in {header[place['kick']][1] or 'rad'}"]
+    return _response(
+        ring, {n: (angle * kicks[n], own) for n, own in columns.items()},
+        None if rf is None or rf_orbit is None else (kicks[rf], rf_orbit), said,
+    )  # fmt: skip
+
+
+def _wide(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
+    place = {name.lower(): i for i, (name, _) in enumerate(header)}
+    for name in ("monitor", "plane"):
+        if name not in place:
+            raise MeasurementError(f"{path}: no column '{name}'; a wide table has monitor, plane")
+    per = {f"{m}/{r}": METRES[m] / RADIANS[r] for m in METRES for r in RADIANS}
+    columns: dict[str, tuple[float, dict[str, tuple[float, float]]]] = {}
+    for i, (name, unit) in enumerate(header):
+        if i in (place["monitor"], place["plane"]):
+            continue
+        factor = KICK * _factor(path, name, unit, per)
+        own: dict[str, tuple[float, float]] = {}
+        for line, row in enumerate(rows, 2):
+            monitor, plane = row[place["monitor"]].strip(), row[place["plane"]].strip().lower()
+            if plane not in ("x", "y"):
+                raise MeasurementError(f"{path}, row {line}: plane '{plane}'; it is x or y")
+            x, y = own.get(monitor, (np.nan, np.nan))
+            value = factor * _number(path, line, row[i])
+            own[monitor] = (value, y) if plane == "x" else (x, value)
+        columns[name] = KICK, own
+    said = [
+        f"the table is orbit per kick, in {header[-1][1] or 'm/rad'}: what the steps were is not "
+        f"known, and {KICK:g} rad is taken"
+    ]
+    return _response(ring, columns, None, said)
+
+
+def _response(
+    ring: Ring,
+    columns: dict[str, tuple[float, dict[str, tuple[float, float]]]],
+    rf: tuple[float, dict[str, tuple[float, float]]] | None,
+    said: Sequence[str],
+) -> Imported:
+    monitors = list(dict.fromkeys(ring[m].name for _, own in columns.values() for m in own))
+    index = {name: i for i, name in enumerate(monitors)}
+
+    def orbit(own: dict[str, tuple[float, float]]) -> Array:
+        spread = np.full((len(monitors), 2), np.nan)
+        for name, xy in own.items():
+            spread[index[ring[name].name]] = xy
+        return spread
+
+    planes = []
+    for name in columns:
+        if ring[name].kind not in _PLANES:
+            raise MeasurementError(f"'{name}' is a {ring[name].kind} of the lattice, no corrector")
+        planes.append(_PLANES[ring[name].kind])
+    more = [
+        "each step is from one side to the other",
+        "the RF frequency stood still while correctors were stepped",
+        "no noise is given",
+    ]
+    return Imported(
+        OrbitResponse(
+            correctors=tuple(ring[name].name for name in columns),
+            planes=tuple(planes),
+            kicks=np.array([kick for kick, _ in columns.values()]),
+            monitors=tuple(monitors),
+            response=np.stack([orbit(own) for _, own in columns.values()]),
+            rf=None if rf is None else _step(ring, rf[0], orbit(rf[1])),
+            lattice="lattice.json",
+            energy=ring.energy,
+        ),
+        ring,
+        (*said, *more, *(["no response to the RF's step is given"] if rf is None else [])),
+    )
+
+
+def _step(ring: Ring, step: float, orbit: Array) -> RfStep:
+    """The RF's step; frequency and harmonic are a cavity's, of the ring's own turn."""
+    cavities = [e for e in ring.elements if e.kind == "cavity" and e.source.freq > 0]
+    if not cavities:
+        raise MeasurementError(
+            f"an RF step, and '{ring.name}' has no cavity with a frequency; leave the rows of 'rf' "
+            "out, or name a lattice with its cavity"
+        )
+    turn = LIGHT / ring.length
+    harmonic = round(min(e.source.freq for e in cavities) / turn)
+    return RfStep(harmonic * turn, harmonic, step, orbit)

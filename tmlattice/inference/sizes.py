@@ -1,0 +1,153 @@
+"""How large the small errors of a machine are: what its own readings say of it.
+
+Small errors are Gaussian, one rms for each family (an effect, say): C = C0 + sum_h t_h^2 K_h with
+K_h = S_h^T S_h of the family's signatures at their usual rms. The sizes t_h are those that make the
+readings likeliest, launches projected out (restricted maximum likelihood, by the average
+information of Gilmour, Thompson and Cullis 1995); families that the readings do not see stay near
+the others by their prior. The evidence says whether small errors are there at all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
+
+Array = NDArray[np.float64]
+
+COMMON = 1.5
+"""rms of the logarithm of all sizes together: machines differ by factors of five."""
+
+OWN = 0.7
+"""rms of the logarithm of one family's size beside the others: by factors of two."""
+
+NOISE = 2.0
+"""rms of the logarithm of a noise that is a first guess only."""
+
+STEPS = 20
+LARGEST = 1.5  # of a step, in the logarithm
+SETTLED = 0.5
+"""Log likelihood gained by a step after which none is made: steps converge quadratically."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What the readings say of the sizes of small errors.
+
+    Attributes:
+        scale: of each family, over its usual size, [family].
+        covariance: of their logarithms, [family, family].
+        noise: scale of each part of the noise, over its first guess, [part].
+        log_evidence: over that of no small errors and the noise as guessed.
+    """
+
+    scale: Array
+    covariance: Array
+    noise: Array
+    log_evidence: float
+
+    @property
+    def error(self) -> Array:
+        """Of the logarithm of each, [family]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def learn_sizes(
+    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[NDArray[np.bool_]] = ()
+) -> Sizes:
+    """The likeliest sizes of families of small errors.
+
+    Args:
+        rows: readings less model in units of their noise, [row].
+        launches: orthonormal directions of the launches among them, [row, direction].
+        families: usual rms times signature of each error of a family, [error, row].
+        noise: parts of the rows whose noise is to be learnt too, [row] each; none: it is known.
+
+    Returns:
+        Sizes; all of it NaN where the readings cannot be brought to a likelihood.
+    """
+
+    def out(x: Array) -> Array:
+        return np.asarray(x - (x @ launches) @ launches.T)
+
+    clean = out(rows)
+    inside = launches @ launches.T
+    parts = [np.empty((0, 0))] * 0
+    for family in families:
+        own = out(family)
+        parts.append(own.T @ own)
+    for mask in noise:
+        own = out(np.diag(mask.astype(float)))
+        parts.append(own.T @ own)
+    # what has no size of its own: the noise where it is known, and the launches' directions
+    base = inside if noise else np.eye(len(rows))
+    precision = _prior(len(families), len(noise))
+    size = np.zeros(len(parts))
+    now = _state(clean, base, parts, size, precision)
+    damping = 1e-3
+    for _ in range(STEPS):
+        step = np.linalg.solve(now.information + damping * np.eye(len(size)), now.slope)
+        step *= min(1.0, LARGEST / np.abs(step).max(initial=1e-300))
+        trial = _state(clean, base, parts, size + step, precision)
+        if trial.value <= now.value + 1e-9:
+            if damping > 1e3 or np.abs(step).max(initial=0.0) < 0.02:
+                break
+            damping = max(10 * damping, 0.1)
+            continue
+        gained, size, now, damping = trial.value - now.value, size + step, trial, damping / 5
+        if gained < SETTLED:
+            break
+    covariance = np.linalg.inv(now.information)
+    none = -0.5 * float(clean @ clean)
+    occam = 0.5 * (np.linalg.slogdet(precision)[1] + np.linalg.slogdet(covariance)[1])
+    count = len(families)
+    return Sizes(
+        np.exp(size[:count]),
+        np.asarray(covariance[:count, :count], dtype=float),
+        np.exp(size[count:]),
+        float(now.value + occam - none),
+    )
+
+
+@dataclass(frozen=True)
+class _State:
+    value: float
+    slope: Array
+    information: Array
+
+
+def _prior(families: int, noise: int) -> Array:
+    """Precision of the logarithms."""
+    covariance = np.full((families, families), COMMON**2) + OWN**2 * np.eye(families)
+    precision = np.zeros((families + noise,) * 2)
+    precision[:families, :families] = np.linalg.inv(covariance)
+    precision[families:, families:] = np.eye(noise) / NOISE**2
+    return precision
+
+
+def _state(
+    rows: Array, base: Array, parts: Sequence[Array], size: Array, precision: Array
+) -> _State:
+    """Log posterior of the sizes, its slope, and the average information."""
+    weights = np.exp(2 * size)
+    covariance = base.copy()
+    for weight, part in zip(weights, parts, strict=True):
+        covariance += weight * part
+    factor, failed = dpotrf(covariance, lower=1, overwrite_a=1)
+    if failed:
+        return _State(-np.inf, np.zeros(len(size)), np.eye(len(size)))
+    solved = cho_solve((factor, True), rows, check_finite=False)
+    value = -np.log(np.diag(factor)).sum() - 0.5 * rows @ solved - 0.5 * size @ precision @ size
+    moved = np.array([w * (part @ solved) for w, part in zip(weights, parts, strict=True)])
+    back = cho_solve((factor, True), moved.T, check_finite=False)
+    inverse, _ = dpotri(factor, lower=1, overwrite_c=1)
+    inverse[np.triu_indices(len(inverse), 1)] = 0.0  # dpotri fills one half
+    inverse[np.diag_indices(len(inverse))] *= 0.5
+    traces = np.array(
+        [2 * w * np.vdot(inverse, part) for w, part in zip(weights, parts, strict=True)]
+    )
+    slope = moved @ solved - traces - precision @ size
+    information = 2 * moved @ back + precision
+    return _State(float(value), slope, information)

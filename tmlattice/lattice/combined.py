@@ -1,0 +1,153 @@
+"""A straight magnet with dipole, quadrupole and sextupole fields, normal and skew, as one element.
+
+OCELOT has none: its quadrupole may carry a sextupole, and no other pair goes together. Here is an
+OCELOT element like its own, with the fields as everybody writes them (MAD-X, AT):
+
+    B_y + i B_x = sum over n of (k_n + i k_ns) (x + i y)^n / n!,    px' = -B_y,  py' = +B_x
+
+so that AT's PolynomB[n] is k_n / n! and PolynomA[n] is k_ns / n!. A sextupole with a skew coil and
+a quadrupole with a corrector's coil on its poles are such magnets. A thin one (l = 0) holds the
+integrated fields, k_n L.
+
+Its map is that of the constant Hamiltonian of its body, to second order: the equations of motion of
+all products of two coordinates are linear up to products of three: an exponential solves them.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.lattice.ocelot import OpticElement, SecondTM, elements, rot_mtx
+
+Array = NDArray[np.float64]
+
+ELECTRON_GEV = 0.51099895e-3
+
+FIELDS = ("k0", "k0s", "k1", "k1s", "k2", "k2s")
+"""Dipole (1/m), quadrupole (1/m2), sextupole (1/m3); normal and skew."""
+
+_quadrupole = elements.Quadrupole().element
+_Magnet: Any = next(c for c in type(_quadrupole).__mro__ if c.__name__ == "Magnet")
+_First = type(_quadrupole.create_first_order_main_params(1.0))
+_Second = type(_quadrupole.create_second_order_main_params(1.0))
+
+
+@cache
+def _products() -> dict[tuple[int, ...], int]:
+    """The index of 1, of each coordinate, and of each product of two."""
+    pairs = [(i, j) for i in range(6) for j in range(i, 6)]
+    return {m: k for k, m in enumerate([(), *((i,) for i in range(6)), *pairs])}
+
+
+def _motion(k: dict[str, float], energy: float) -> list[dict[tuple[int, ...], float]]:
+    """d/ds of OCELOT's (x, px, y, py, tau, p), each as a sum over products of coordinates."""
+    gamma = energy / ELECTRON_GEV
+    beta = np.sqrt(1 - 1 / gamma**2) if gamma else 1.0
+    slip = 1 / (beta * gamma) ** 2 if gamma else 0.0
+    return [
+        {(1,): 1.0, (1, 5): -1 / beta},
+        {(): -k["k0"], (0,): -k["k1"], (2,): k["k1s"],
+         (0, 0): -k["k2"] / 2, (2, 2): k["k2"] / 2, (0, 2): k["k2s"]},
+        {(3,): 1.0, (3, 5): -1 / beta},
+        {(): k["k0s"], (2,): k["k1"], (0,): k["k1s"],
+         (0, 2): k["k2"], (0, 0): k["k2s"] / 2, (2, 2): -k["k2s"] / 2},
+        {(5,): -slip, (1, 1): 0.5 / beta, (3, 3): 0.5 / beta, (5, 5): 1.5 * slip / beta},
+        {},
+    ]  # fmt: skip
+
+
+def body_map(
+    fields: dict[str, float], length: float | None, energy: float
+) -> tuple[Array, Array, Array]:
+    """B [6], R [6, 6], T [6, 6, 6] (symmetric) of a straight body.
+
+    Args:
+        fields: `FIELDS`; integrated where there is no length.
+        length: m; None: a thin one.
+        energy: GeV.
+    """
+    from scipy.linalg import expm
+
+    index, motion = _products(), _motion(fields, energy)
+    if length is None:  # kicks alone, no way
+        motion = [row if i in (1, 3) else {} for i, row in enumerate(motion)]
+        length = 1.0
+    slope = np.zeros((len(index), len(index)))
+    for product, row in index.items():
+        for place, factor in enumerate(product):
+            rest = product[:place] + product[place + 1 :]
+            for term, amount in motion[factor].items():
+                made = tuple(sorted((*rest, *term)))
+                if made in index:  # products of three are of third order
+                    slope[row, index[made]] += amount
+    rows = expm(slope * length)[1:7]
+    T = np.zeros((6, 6, 6))
+    for product, column in index.items():
+        if len(product) == 2:
+            i, j = product
+            T[:, i, j] += rows[:, column] / 2
+            T[:, j, i] += rows[:, column] / 2
+    return rows[:, 0], rows[:, 1:7], T
+
+
+class CombinedAtom(_Magnet):  # type: ignore[misc]
+    """What OCELOT asks of an element's physics."""
+
+    def __init__(self, l: float = 0.0, tilt: float = 0.0, eid: Any = None, **fields: float) -> None:  # noqa: E741
+        super().__init__(eid=eid)
+        self.l = l
+        self.tilt = tilt
+        for name in FIELDS:
+            setattr(self, name, fields.get(name, 0.0))
+
+    def _map(self, energy: float, delta_length: float | None) -> tuple[Array, Array, Array]:
+        length = None if self.l == 0 else self.l if delta_length is None else delta_length
+        fields = {name: float(getattr(self, name)) for name in FIELDS}
+        B, R, T = body_map(fields, length, energy)
+        return (rot_mtx(-self.tilt) @ B).reshape(6, 1), R, T  # OCELOT turns R and T, not B
+
+    def create_first_order_main_params(
+        self, energy: float, delta_length: float | None = None
+    ) -> Any:
+        """R and B, before the tilt."""
+        B, R, _ = self._map(energy, delta_length)
+        return _First(R, B, self.tilt)
+
+    def create_second_order_main_params(
+        self, energy: float, delta_length: float | None = None
+    ) -> Any:
+        """R, B and T, before the tilt."""
+        B, R, T = self._map(energy, delta_length)
+        return _Second(R, B, T, self.tilt, 0.0, 0.0)
+
+
+class CombinedMultipole(OpticElement):  # type: ignore[misc]
+    """The element.
+
+    Args:
+        l: length, m; 0: the fields are integrated.
+        k0, k0s, k1, k1s, k2, k2s: see `FIELDS`.
+        tilt: of all fields about the beam axis, rad.
+        eid: its name.
+    """
+
+    supported_tms = frozenset({elements.Quadrupole.default_tm, SecondTM})
+
+    def __init__(
+        self,
+        l: float = 0.0,  # noqa: E741
+        *,
+        k0: float = 0.0,
+        k0s: float = 0.0,
+        k1: float = 0.0,
+        k1s: float = 0.0,
+        k2: float = 0.0,
+        k2s: float = 0.0,
+        tilt: float = 0.0,
+        eid: Any = None,
+        tm: Any = None,
+    ) -> None:
+        atom = CombinedAtom(l, tilt, eid, k0=k0, k0s=k0s, k1=k1, k1s=k1s, k2=k2, k2s=k2s)
+        super().__init__(atom, tm=tm)

@@ -1,0 +1,176 @@
+"""Writing MAD-X: a line of elements, the names those of their families.
+
+AT's saver of this language leaves out tilts, gaps and matrices, so this is one of our own.
+"""
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.write_at import first_order, kicks, second_order
+
+KEYWORDS = (
+    "beam", "drift", "quadrupole", "sextupole", "octupole", "multipole", "solenoid",
+    "sbend", "rbend", "marker", "monitor", "hmonitor", "vmonitor", "instrument",
+    "hkicker", "vkicker", "kicker", "rfcavity", "matrix", "line", "sequence", "ring", "use",
+    "call", "return", "value", "option", "title", "const", "real",
+)  # fmt: skip
+"""Words that MAD-X has a meaning for, or that the file itself uses."""
+
+
+def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
+    """Write plain elements; what it lacks.
+
+    A definition is named for its family. Members of a family that differ have names of their own,
+    `qd..12` for `qd::12`.
+
+    Args:
+        ring: of `plain`.
+        path: to write to.
+    """
+    left_out: Counter[str] = Counter()
+    texts = [_definition(element, ring.map_energy, left_out) for element in ring.elements]
+    kinds: dict[str, dict[str, int]] = {}
+    for element, text in zip(ring.elements, texts, strict=True):
+        known = kinds.setdefault(element.family.casefold(), {})
+        known.setdefault(text, len(known))
+    definitions: dict[str, str] = {}
+    line = []
+    several = set()
+    for element, text in zip(ring.elements, texts, strict=True):
+        family = element.family.casefold()
+        name = _name(family)
+        if len(kinds[family]) > 1 and element.kind == "drift":
+            name += f"..{kinds[family][text]}"
+        elif len(kinds[family]) > 1:
+            name = _name(element.name.casefold().replace("::", ".."))
+            several.add(family)
+        while definitions.setdefault(name, text) != text:  # names that differ in odd characters
+            name += "_"
+        line.append(name)
+    told = [f"{what} ({count} elements)" for what, count in left_out.items()]
+    if several:
+        some = ", ".join(sorted(several)[:4]) + (", ..." if len(several) > 4 else "")
+        told.append(f"members of {some} differ, and have names of their own: NAME..k for NAME::k")
+    particle = "ELECTRON" if ring.radiates else "PROTON"
+    content = [
+        f"! {Path(ring.name).name}, by tmlattice",
+        f"BEAM, PARTICLE={particle}, ENERGY={_number(ring.energy)};",
+        *(f"{name}: {text};" for name, text in definitions.items()),
+        "ring: LINE=(",
+        *(f"  {', '.join(line[i : i + 8])}," for i in range(0, len(line) - 8, 8)),
+        f"  {', '.join(line[(len(line) - 1) // 8 * 8 :])});",
+        "USE, SEQUENCE=ring;",
+        "",
+    ]
+    path.write_text("\n".join(content), encoding="utf-8")
+    return tuple(told)
+
+
+def _name(family: str) -> str:
+    name = re.sub(r"[^a-z0-9_.]", "_", family)
+    return f"e_{name}" if name in KEYWORDS or not name[:1].isalpha() else name
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+THICK = ("QUADRUPOLE", "SEXTUPOLE", "OCTUPOLE", "SBEND")
+
+
+def _with(keyword: str, **values: float) -> str:
+    """A definition with those of its numbers that are not zero, and what it cannot be without."""
+    needed = {"l", "angle"} if keyword in THICK else set()
+    told = (f"{name.upper()}={_number(v)}" for name, v in values.items() if v or name in needed)
+    return ", ".join([keyword, *told])
+
+
+def _definition(element: Element, energy: float, left_out: Counter[str]) -> str:
+    source, l, tilt = element.source, element.length, element.tilt  # noqa: E741
+    if element.kind == "monitor":
+        return _with("MONITOR", l=l)
+    match type(source).__name__:
+        case "Quadrupole":
+            if element.k2:
+                left_out["sextupole fields of quadrupoles are left out"] += 1
+            return _with("QUADRUPOLE", l=l, k1=element.k1, tilt=tilt)
+        case "Sextupole":
+            return _with("SEXTUPOLE", l=l, k2=element.k2, tilt=tilt)
+        case "Octupole":
+            return _with("OCTUPOLE", l=l, k3=float(source.k3), tilt=tilt)
+        case "SBend" | "RBend" | "Bend":
+            return _bend(element, left_out)
+        case "Hcor" | "Vcor":
+            x, y = kicks(element)
+            vertical = element.kind == "vcorrector"
+            if x if vertical else y:
+                return _with("KICKER", l=l, hkick=x, vkick=y)
+            return _with("VKICKER" if vertical else "HKICKER", l=l, kick=y if vertical else x)
+        case "CombinedMultipole":
+            return _combined(element, left_out)
+        case "Multipole" if not l:
+            kn = ", ".join(_number(k) for k in np.asarray(source.kn))
+            return _with("MULTIPOLE", tilt=tilt) + f", KNL={{{kn}}}"
+        case "Cavity":
+            return _with(
+                "RFCAVITY", l=l, volt=1e3 * float(source.v), freq=1e-6 * float(source.freq)
+            )
+        case "Solenoid":
+            return _with("SOLENOID", l=l, ks=2 * float(source.k))
+        case "Drift" | "Marker" | "Monitor":
+            return _with("DRIFT", l=l) if l else "MARKER"
+        case "Matrix" if second_order(source):
+            left_out["what matrix elements do beyond their matrix is left out"] += 1
+        case "Matrix":
+            pass
+        case _:
+            left_out["elements that MAD-X has not are written as first-order matrices"] += 1
+    return _matrix(element, energy)
+
+
+def _combined(element: Element, left_out: Counter[str]) -> str:
+    """A thin one with all its fields, a thick one with those of its kind."""
+    source, l = element.source, element.length  # noqa: E741
+    normal, skew = ([float(getattr(source, f"k{n}{what}")) for n in range(3)] for what in ("", "s"))
+    if not l:
+        knl, ksl = (", ".join(map(_number, fields)) for fields in (normal, skew))
+        return _with("MULTIPOLE", tilt=element.tilt) + f", KNL={{{knl}}}, KSL={{{ksl}}}"
+    order = 2 if element.kind == "sextupole" else 1
+    rest = [k for n in range(3) if n != order for k in (normal[n], skew[n])]
+    if any(rest):
+        left_out["of thick magnets with several fields the main one is written"] += 1
+    own = {f"k{order}": normal[order], f"k{order}s": skew[order], "tilt": element.tilt}
+    return _with("SEXTUPOLE" if order == 2 else "QUADRUPOLE", l=l, **own)
+
+
+def _bend(element: Element, left_out: Counter[str]) -> str:
+    source = element.source
+    text = _with(
+        "SBEND", l=element.length, angle=element.angle, k1=element.k1, k2=element.k2,
+        e1=float(source.e1), e2=float(source.e2), hgap=float(source.gap) / 2,
+        fint=float(source.fint), h1=float(source.h_pole1), h2=float(source.h_pole2),
+        tilt=element.tilt,
+    )  # fmt: skip
+    if source.fintx != source.fint:
+        text += f", FINTX={_number(source.fintx)}"
+    if element.tilt:
+        left_out["tilts of bends turn their design plane"] += 1
+    return text
+
+
+def _matrix(element: Element, energy: float) -> str:
+    """In MAD-X's coordinates: its time has the opposite sign."""
+    sign: Any = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
+    r = sign @ first_order(element, energy) @ sign
+    entries = [
+        f"RM{i + 1}{j + 1}={_number(r[i, j])}"
+        for i in range(6)
+        for j in range(6)
+        if r[i, j] != (i == j)
+    ]
+    return ", ".join([_with("MATRIX", l=element.length), *entries])
