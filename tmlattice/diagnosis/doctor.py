@@ -20,7 +20,8 @@ from tmlattice.effects import Cause, expected_radiation
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
-from tmlattice.observe.global_errors import Judge, Names, Verdict, certain
+from tmlattice.observe.evidence import Names, Verdict, certain
+from tmlattice.observe.global_errors import Judge
 from tmlattice.observe.noise import random_part
 from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
 from tmlattice.observe.sections import Found, Passes

@@ -20,10 +20,19 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.observe.evidence import (
+    GAIN,
+    Names,
+    Terms,
+    Verdict,
+    believable,
+    levels,
+    widely,
+    worth,
+)
 from tmlattice.observe.sections import Found, Passes, Sections, distance, openness
 
 Array = NDArray[np.float64]
-Names = tuple[str, ...]
 
 SHOTS, TURNS = 8, 3
 """That are looked at: a global error is in each."""
@@ -36,20 +45,6 @@ NOISE_WIDTH = np.log(3.0)
 """A stated noise is right to a factor of three, one standard deviation."""
 ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
 """m; first turns have an orbit of a millimetre, to a factor of ten, one standard deviation."""
-GAIN, CERTAIN = 12.0, 15.0
-"""Log evidence from which a global error is told, and from which it is certain: no healthy
-measurement of `benchmarks/doctor.py` gains as much."""
-SHARE = 0.65
-"""Of all that it changes, how much it has to change for the better: a fault's section may win much
-by chance, but then many others lose."""
-CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
-"""Factors by which chi-square of sections or launches falls with what was wrong undone: at least;
-with a unit undone; of sections where launches say the contrary. Units are powers of a thousand."""
-RIGHT = 5.0
-"""Chi-square of launches that are right then."""
-FINE, FINE_GAIN = 0.1, 30.0
-"""Share of the orbit that sections leave from which they agree anyhow, and log evidence that
-curvature, or a few correctors that were set, have to gain then."""
 ALIKE = 3.0
 """Log evidence below which two assumptions explain the data alike."""
 _LAST = ("noise-from-data", "launches-unknown", "readings-doubled", "readings-halved")
@@ -58,68 +53,6 @@ _LAST = ("noise-from-data", "launches-unknown", "readings-doubled", "readings-ha
 BEAM = 4
 """Assumptions, the best ones, that are tried together with every other."""
 _TURNED = np.array([1.0, -1.0, 1.0, -1.0])
-
-
-@dataclass(frozen=True)
-class Terms:
-    """How far the parts of a measurement miss one another, and their freedom.
-
-    Attributes:
-        local, joints: mean squares in units of the noise alone, of sections and of where they
-            meet; those between turns are joints too.
-        freedom: of the sections' terms.
-        launch: mean squares of launches, each plane's own, in units of noise and stated rms, by
-            the scale of the noise: see `Judge`.
-        stated: log of what the stated noise differs by, or 0 where it is not stated; log of the
-            orbit over a usual one; each in standard deviations.
-        blur: log of how little the readings tell of launches and joints: with next to none of them
-            anything agrees.
-        level, share: of the sections: see `Found`.
-        unit: chi-square per reading of a mean square of 1: of the noise as it is stated, or where
-            it is not, as the best assumption leaves it.
-    """
-
-    local: Array
-    joints: Array
-    freedom: NDArray[np.int64]
-    launch: Array
-    stated: Array
-    blur: float
-    level: float
-    share: float
-    unit: float
-
-    def cost(self, square: float) -> Array:
-        """Minus the log likelihood of each term, all scales their own, none below the noise's."""
-        return np.concatenate([
-            self.freedom / 2 * _robust(self.local / square),
-            2 * _robust(self.joints / square),
-            np.log(np.maximum(self.launch, 1.0)),  # their information differs
-            self.stated**2 / 2,
-        ])  # fmt: skip
-
-
-def _robust(misfit: Array) -> Array:
-    return np.where(misfit < 1, misfit - 1, np.log(np.maximum(misfit, 1.0)))
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A global error that makes the data far better.
-
-    Attributes:
-        names: assumptions, together.
-        gain: log evidence.
-        before, after: chi-square per reading of the sections, and of the launches (NaN where none
-            is stated), [2].
-        alike: other assumptions that explain the data as well.
-    """
-
-    names: Names
-    gain: float
-    before: tuple[float, float]
-    after: tuple[float, float]
-    alike: tuple[Names, ...] = ()
 
 
 @dataclass
@@ -327,8 +260,8 @@ class Judge:
     def square(self, several: Iterable[Names]) -> float:
         """Square of the readings' noise in units of the stated one: what the best of several
         assumptions leaves."""
-        levels = [self.found(self.assumed(names))[1].level for names in several]
-        return max(float(np.nanmin(levels)), 1e-12) if np.isfinite(levels).any() else 1.0
+        found = [self.found(self.assumed(names))[1].level for names in several]
+        return max(float(np.nanmin(found)), 1e-12) if np.isfinite(found).any() else 1.0
 
     def verdict(self) -> Verdict | None:
         """The assumption that makes the data far better, if there is one; two together where that
@@ -337,7 +270,7 @@ class Judge:
         square = self.square([(), *several])
         stated = self.terms((), square)
         found = [own for names in several if (own := self._judged(names, stated, square))]
-        found.sort(key=_worth, reverse=True)
+        found.sort(key=worth, reverse=True)
         if not found or found[0].gain < GAIN:
             return None
         pairs = {
@@ -350,11 +283,11 @@ class Judge:
             own for names in sorted(pairs)
             if self._possible(names) and (own := self._judged(names, stated, square))
         ]  # fmt: skip
-        found = [own for own in found if _worth(own) > GAIN and _believable(own, stated.share)]
+        found = [own for own in found if worth(own) > GAIN and believable(own, stated.share)]
         if not found:
             return None
-        best = max(map(_worth, found))
-        alike = [own for own in found if _worth(own) > best - ALIKE]
+        best = max(map(worth, found))
+        alike = [own for own in found if worth(own) > best - ALIKE]
         first = min(alike, key=lambda own: [list(ASSUMPTIONS).index(n) for n in own.names])
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
 
@@ -362,11 +295,11 @@ class Judge:
         """What an assumption gains, if it changes nearly everything that it changes for the
         better."""
         other = self.terms(names, square)
-        if not _widely(stated, other, square):
+        if not widely(stated, other, square):
             return None
         gain = float(stated.cost(square).sum() - other.cost(square).sum())
         gain -= max(other.blur - stated.blur, 0.0)
-        return Verdict(names, gain, _levels(stated), _levels(other))
+        return Verdict(names, gain, levels(stated), levels(other))
 
     def verdicts(self, most: int = 3) -> list[Verdict]:
         """Global errors one after another, each with those before it undone."""
@@ -390,50 +323,6 @@ def _same_part(one: str, other: str) -> bool:
     (a, *_), (b, *_) = one.split("-"), other.split("-")
     units = "-in-" in one and "-in-" in other
     return one == other or (a == b and (units or a in ("monitors", "settings")))
-
-
-def certain(verdict: Verdict) -> bool:
-    """Whether the evidence leaves no doubt."""
-    return _worth(verdict) > CERTAIN
-
-
-def _worth(verdict: Verdict) -> float:
-    """Log evidence; each assumption beyond the first has to be certain by itself."""
-    return verdict.gain - CERTAIN * (len(verdict.names) - 1)
-
-
-def _widely(stated: Terms, other: Terms, square: float) -> bool:
-    """Whether nearly all of what an assumption changes becomes better."""
-    a, b = stated.cost(square), other.cost(square)
-    if len(a) != len(b):
-        return True
-    better, worse = np.maximum(a - b, 0).sum(), np.maximum(b - a, 0).sum()
-    return bool(better > SHARE * (better + worse))
-
-
-def _believable(verdict: Verdict, share: float) -> bool:
-    """Whether what was wrong is right then, and not only a little less wrong.
-
-    Args:
-        verdict: what is believed.
-        share: of the orbit that the sections leave as stated.
-    """
-    (local, launch), (local_then, launch_then) = verdict.before, verdict.after
-    local_clears, launch_clears = local / max(local_then, 1e-12), launch / max(launch_then, 1e-12)
-    if launch_then > RIGHT and local_clears < AGAINST:  # false where no launch is stated
-        return False
-    unit = any("-in-" in name for name in verdict.names)
-    clear = CLEAR_UNIT if unit else CLEAR
-    if local_clears > clear or launch_clears > clear:
-        return True
-    return share < FINE and not unit and verdict.gain > FINE_GAIN
-
-
-def _levels(terms: Terms) -> tuple[float, float]:
-    """Chi-square per reading: of the sections; of the launches, the worse plane."""
-    launch = terms.launch.reshape(-1, 2)
-    worse = float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
-    return terms.unit * terms.level, worse
 
 
 def _kicks(settings: Sequence[Settings]) -> Array:
