@@ -7,26 +7,25 @@ Gradients and skew gradients are fitted together, because skew ones move the tun
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families import STEPS, Family, Told, Trial
+from tmlattice.diagnosis.families import STEPS, Told, Trial
 from tmlattice.diagnosis.state import (
-    ALONE,
     Linear,
     State,
     allow,
     amplitudes,
     begin,
     bend,
-    by_columns,
     forbid,
     jump,
     linear,
+    log_evidence,
     rms_of,
     settle,
 )
@@ -38,13 +37,11 @@ Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
-MISSED = np.array([1.005, 1.005, 1.05])
-"""A step is kept where without it one of the judges (in-plane, coupling, RF) rises above this, and
-they do not fall together; the RF's has some 25 readings, so 14 % of its own."""
-HELPS = 0.995
-"""To what far monitors' misfit has to fall where each column has a number of its own."""
-NOISY = 1.5
-"""Chi2 per reading that is noise, or nearly."""
+LEAST = 5.0
+"""Log evidence that a step has to have."""
+JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.05
+"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
+25 readings), and by how much their sum may fall without a step that stays all the same."""
 FIRST, ROUGH = 4, 0.03
 """Rounds of each block after a family came in, or went, and what one has to gain for another."""
 
@@ -231,26 +228,21 @@ def fit_steps(
         steps[trial] = Step.scored(_title(trial), count, score(state, split.held))
     progress("all together")
     state = settle(bend(jump(state)))
-    worth: dict[Trial, float] = {}
-    refused = []
-    for trial in reversed(trials):
-        progress(f"without {_title(trial)}")
-        without = settle(forbid(state, trial.families), most=FIRST, gain=ROUGH)
-        needed = _needed(state, without, trial)
-        if needed > 0:
-            worth[trial] = needed
-        else:
-            state = without
-            refused.append(replace(steps.pop(trial), kept=False))
-    for trial in sorted(worth, key=lambda t: worth[t])[: max(len(worth) - most, 0)]:
-        state = forbid(state, trial.families)
-        refused.append(replace(steps.pop(trial), kept=False))
+    refused: list[Step] = []
+    worth = _worth(state, steps, progress)
+    while worth and (min(worth.values()) <= 0 or len(worth) > most):
+        least = min(worth, key=lambda trial: worth[trial])
+        state = settle(forbid(state, least.families), most=FIRST, gain=ROUGH)
+        refused.append(replace(steps.pop(least), kept=False))
+        doubted = [trial for trial in steps if worth[trial] <= 0]
+        del worth[least]
+        worth |= _worth(state, doubted, progress)
     progress("result")
     state = settle(bend(jump(replace(state, exploring=False))))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
-    return DenseFit(design, state, tuple(kept), tuple(reversed(refused)), (before, after))
+    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after))
 
 
 def _title(trial: Trial) -> str:
@@ -270,34 +262,31 @@ def _inner(state: State) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(rms), axis=0)))
 
 
+def _worth(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
+) -> dict[Trial, float]:
+    """What each trial is worth beside all the others."""
+    worth = {}
+    for trial in trials:
+        progress(f"without {_title(trial)}")
+        without = settle(forbid(state, trial.families), most=FIRST, gain=ROUGH)
+        worth[trial] = _needed(state, without, trial)
+    return worth
+
+
 def _needed(state: State, without: State, trial: Trial) -> float:
-    """By how much worse the judge is without a trial's families, relative; 0: not needed.
+    """Log evidence of a trial's families beside all the others; 0 or less: not needed.
 
-    Held-out correctors cannot say whether fitted ones have calibrations of their own, for each has
-    its kick fitted: of families whose numbers are columns' each column's far monitors are asked,
-    with the number that its near ones give.
+    Correctors that were not fitted have the veto: evidence takes readings for independent, which
+    what the model lacks is not. Of what fitted correctors have of their own they know nothing.
     """
+    good = state.good & without.good
+    gained = log_evidence(state, good) - log_evidence(without, good) - LEAST
     now, gone = _inner(state), _inner(without)
-    log.info("without %s: inner %s -> %s", _title(trial), now, gone)
-    worse = gone / np.maximum(now, 1e-300)
-    if (worse > MISSED).any() and np.log(worse).sum() > 0:
-        return float(worse.max())
-    columns = [family for family in trial.families if family.per == "column"]
-    return 1.0 if any(_wanted(without, family) for family in columns) else 0.0
-
-
-def _wanted(state: State, family: Family) -> bool:
-    """Whether columns' far monitors want the numbers that their near ones give.
-
-    A wrong focusing wants them too, a little of each: so they have to leave noise alone, or most of
-    what they take away has to be columns' that have nothing else.
-    """
-    _, without, told = by_columns(state, family)
-    if not np.nansum(told) < HELPS**2 * np.nansum(without):
-        return False
-    fall = np.nan_to_num(np.maximum(without - told, 0))
-    alone = fall[told < ALONE**2 * without].sum() > fall.sum() / 2
-    return bool(alone or np.nanmean(told) < NOISY)
+    worse = float(JUDGES @ np.log(gone / np.maximum(now, 1e-300)))
+    log.info("without %s: evidence %+.1f, judges %+.3f", _title(trial), -gained, worse)
+    asked = any(family.per != "column" for family in trial.families)
+    return min(gained, worse) if asked and worse < -VETO else gained
 
 
 # --- what was found -------------------------------------------------------------------------------

@@ -32,6 +32,10 @@ ROUNDS = 12
 """Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
 GAIN = 3e-3
 """Share of the cost that a round has to gain for another one."""
+EACH = 4
+"""Rounds of EM for the priors in a round of the fit."""
+LEARN = 10
+"""Rounds of EM where evidence counts: the priors of what is not there fall slowly."""
 RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
 """How often a round that went astray is repeated; by what trust falls then and grows else, and to
 how much at most."""
@@ -249,7 +253,7 @@ def one_round(state: State, block: int, bold: float = 1.0) -> Moved:
         bold: factor of every trusted change: small where the last rounds went astray.
     """
     there = linear(state, block)
-    found = solve(there.normal, there.groups, there.start, bold * there.trust)
+    found = solve(there.normal, there.groups, there.start, bold * there.trust, rounds=EACH)
     family = {f.variable: f for f in state.families}
     values = {name: family[name].bounded(found.values[at]) for name, at in there.where.items()}
     groups = {group.name: group for group in found.groups}
@@ -312,6 +316,28 @@ def settle(
         if gained < gain:
             break
     return state
+
+
+def log_evidence(state: State, good: Flags) -> float:
+    """Of what is fitted, of the readings of some monitors, both blocks, what the model lacks and
+    the priors at their likeliest; up to a constant of the data."""
+    total = 0.0
+    for block in (0, 1):
+        state = replace(look(state, block), good=good)
+        weights = weight(state, block)
+        use = weights > 0
+        left = np.where(use, state.data.pick(state.at.left, block), 0.0)
+        total += 0.5 * float(np.log(weights[use]).sum() - np.sum(weights * left**2))
+        if state.of_block(block):
+            there = linear(state, block)
+            found = solve(there.normal, there.groups, there.start, rounds=LEARN)
+            moved = found.values - there.start
+            total += float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
+            total += found.occam
+            for rows in there.where.values():
+                groups = [g for g in found.groups if g.basis[rows].any()]
+                total -= 0.5 * _penalty(groups, rows, found.values[rows])
+    return total
 
 
 def look(state: State, block: int) -> State:

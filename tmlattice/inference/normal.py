@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
+ROUNDING = 1e-11
+
+
 @dataclass(frozen=True)
 class Normal:
     """Normal equations; parameters: monitor and plane, then column, then error of the ring.
@@ -94,6 +97,7 @@ class Posterior:
         covariance: of the groups' parameters, in units of their priors, [p, p].
         spread: of the base parameters: basis times prior rms, [parameter, p].
         groups: with the scales that they have learnt.
+        occam: log of the share of the priors that the data leave, 0 where they say nothing.
     """
 
     values: Array
@@ -101,6 +105,7 @@ class Posterior:
     covariance: Array
     spread: Array
     groups: tuple[Group, ...]
+    occam: float
 
 
 def solve(
@@ -130,7 +135,10 @@ def solve(
     for turn in range(max(rounds, 1)):
         prior = np.concatenate([g.scale for g in groups])
         # in units of the priors, so that the matrix is well scaled
-        factor = cho_factor(A * np.outer(prior, prior) + np.eye(len(A)), lower=True)
+        scaled = A * np.outer(prior, prior)
+        # above the rounding of sums over all readings
+        scaled[np.diag_indices(len(A))] += 1 + ROUNDING * np.diag(scaled)
+        factor = cho_factor(scaled, lower=True)
         found = prior * cho_solve(factor, prior * b)
         covariance = dpotri(factor[0], lower=1)[0]
         if turn < rounds:
@@ -140,4 +148,5 @@ def solve(
     covariance = np.tril(covariance) + np.tril(covariance, -1).T
     spread = basis * prior
     sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))
-    return Posterior(basis @ found, sigma, covariance, spread, groups)
+    occam = -float(np.log(np.diag(factor[0])).sum())
+    return Posterior(basis @ found, sigma, covariance, spread, groups, occam)
