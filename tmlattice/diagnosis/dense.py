@@ -232,11 +232,12 @@ def fit_steps(
     worth = _worth(state, steps, progress)
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
         least = min(worth, key=lambda trial: worth[trial])
-        state = settle(forbid(state, least.families), most=FIRST, gain=ROUGH)
+        state = _without(state, least)
         refused.append(replace(steps.pop(least), kept=False))
         doubted = [trial for trial in steps if worth[trial] <= 0]
         del worth[least]
-        worth |= _worth(state, doubted, progress)
+        if doubted:
+            worth |= _worth(state, doubted, progress)
     progress("result")
     state = settle(bend(jump(replace(state, exploring=False))))
     after = score(state, split.held)
@@ -265,28 +266,30 @@ def _inner(state: State) -> Array:
 def _worth(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
 ) -> dict[Trial, float]:
-    """What each trial is worth beside all the others."""
-    worth = {}
+    """Log evidence of each trial's families beside all the others; 0 or less: not needed.
+
+    Correctors that were not fitted have the veto: evidence takes readings for independent, which
+    what the model lacks is not.
+    """
+    worth: dict[Trial, float] = {}
+    inner, evidence = _inner(state), log_evidence(state, state.good)
     for trial in trials:
         progress(f"without {_title(trial)}")
-        without = settle(forbid(state, trial.families), most=FIRST, gain=ROUGH)
-        worth[trial] = _needed(state, without, trial)
+        without = _without(state, trial)
+        good = state.good & without.good
+        with_it = evidence if (good == state.good).all() else log_evidence(state, good)
+        gained = with_it - log_evidence(without, good) - LEAST
+        lost = float(JUDGES @ np.log(_inner(without) / np.maximum(inner, 1e-300)))
+        log.info("without %s: evidence %+.1f, judges %+.3f", _title(trial), -gained, lost)
+        # of what fitted correctors have of their own those that were not fitted know nothing
+        asked = any(family.per != "column" for family in trial.families)
+        worth[trial] = min(gained, lost) if asked and lost < -VETO else gained
     return worth
 
 
-def _needed(state: State, without: State, trial: Trial) -> float:
-    """Log evidence of a trial's families beside all the others; 0 or less: not needed.
-
-    Correctors that were not fitted have the veto: evidence takes readings for independent, which
-    what the model lacks is not. Of what fitted correctors have of their own they know nothing.
-    """
-    good = state.good & without.good
-    gained = log_evidence(state, good) - log_evidence(without, good) - LEAST
-    now, gone = _inner(state), _inner(without)
-    worse = float(JUDGES @ np.log(gone / np.maximum(now, 1e-300)))
-    log.info("without %s: evidence %+.1f, judges %+.3f", _title(trial), -gained, worse)
-    asked = any(family.per != "column" for family in trial.families)
-    return min(gained, worse) if asked and worse < -VETO else gained
+def _without(state: State, trial: Trial) -> State:
+    """All the others settled anew; the other block does not feel it, to first order."""
+    return settle(forbid(state, trial.families), _blocks(trial), FIRST, ROUGH)
 
 
 # --- what was found -------------------------------------------------------------------------------
