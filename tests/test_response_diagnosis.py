@@ -275,7 +275,6 @@ def wandering_gradients(ring, rng):
     [
         (wandering_gradients, "drift of the gradients (focusing, defocusing)"),
         (drifting, "drift of the orbit (betatron waves)"),
-        (off_energy, "energy offset of the beam"),
         (cubic, "nonlinear monitors (cubic)"),
     ],
 )
@@ -297,6 +296,18 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
         assert rows[effect].amount == pytest.approx(amount, rel=share)
     together = rows["none"].on_top_in_plane
     assert together < 0.98 * rows["none"].heldout_rms_in_plane
+
+
+def test_an_energy_offset_is_taken_up_by_gradients(small_ring, rng):
+    """All gradients scaled alike, by families and magnets: it leaves noise, and needs no name."""
+    measured = simulate_response(
+        small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
+    ).measured
+    response = off_energy(small_ring, rng) + rng.normal(0, 1e-9, measured.response.shape)
+    data = response_data(small_ring, replace(measured, response=response))
+    fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)))
+    assert fit.steps[0].heldout_chi2_per_dof > 1e4
+    assert fit.steps[-1].heldout_chi2_per_dof < 2  # 200 readings: 1 +- 0.1, and curvature
 
 
 def test_a_wiggler_that_focuses_is_named(small_ring):
