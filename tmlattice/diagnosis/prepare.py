@@ -87,9 +87,6 @@ def prepare(
     problem = FirstTurns(model=model, data=rough, places=places, judgement=judgement)
     start = _on_its_way(fit(problem, (), data.launches), ring)
     data, noise, estimated = _with_noise(data, start)
-    if estimated:
-        said = (*said, "the noise was estimated from the data: "
-                f"{1e6 * noise[0]:.1f} µm in x, {1e6 * noise[1]:.1f} µm in y")  # fmt: skip
     data, noise, floor = _above_the_floor(data, noise)
     _check_lattice(ring, data, start, judgement)
     said = (*said, *floor)

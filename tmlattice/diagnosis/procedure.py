@@ -121,6 +121,7 @@ def diagnose(
     told = _told(ring, ready, small, explanation, judgement)
     gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
     repaired = apply(ring, told.causes)
+    noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
     return Diagnosis(
         verdict=told.verdict,
@@ -133,10 +134,10 @@ def diagnose(
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=_next(ring, ready, explanation, seed),
         sensitivity=sensitivity(explanation.first, judgement),
-        warnings=_said(said, ready, told, left_out),
+        warnings=_said(said, ready, noise, told, left_out),
         suspects=suspects(ring, explanation, judgement) if told.verdict == "distributed" else (),
         left_out=left_out,
-        noise=ready.noise,
+        noise=noise,
         noise_estimated=ready.estimated,
         provenance={
             "package": _version(),
@@ -228,6 +229,11 @@ def _told(
     )
 
 
+def _noise(ready: Prepared, small: SmallErrors | None) -> tuple[float, float]:
+    """Of a reading: where nobody states it, neighbours take small errors between them for noise."""
+    return ready.noise if small is None else noise_of(small.problem.data)
+
+
 def _held_out(
     ring: Ring,
     heldout: Measurement,
@@ -239,8 +245,7 @@ def _held_out(
     """The gap on shots that the fit did not see: the design's; with the small errors in it, as the
     fit without causes leaves them; with the findings, one by one where there are no small errors.
     """
-    noise = ready.noise if small is None else noise_of(small.problem.data)
-    other = of_measurement(ring, heldout).with_sigma(np.array(noise))
+    other = of_measurement(ring, heldout).with_sigma(np.array(_noise(ready, small)))
     dropped = ready.problem.valid & ~told.problem.valid
     other = same_monitors(other, ready.problem.data, dropped)
 
@@ -293,10 +298,17 @@ def _next(
 
 
 def _said(
-    said: Sequence[str], ready: Prepared, told: _Told, left_out: Sequence[Mapping[str, Any]]
+    said: Sequence[str],
+    ready: Prepared,
+    noise: tuple[float, float],
+    told: _Told,
+    left_out: Sequence[Mapping[str, Any]],
 ) -> tuple[str, ...]:
     """What a reader should know, each once."""
     found = [*said, *ready.said, *told.said]
+    if ready.estimated:
+        x, y = (f"{1e6 * sigma:.1f} µm" for sigma in noise)
+        found.append(f"the noise was estimated from the data: {x} in x, {y} in y")
     if ready.problem.data.active.sum() == 1 and told.findings:
         found.append(
             "one trajectory gives one kick at each place: it locates, but any single multipole "

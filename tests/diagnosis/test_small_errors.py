@@ -1,0 +1,66 @@
+"""Among small errors that nobody has stated a fault is named, and without one none is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import diagnose
+from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.machine import simulate
+
+ALL = {"all": None}
+
+
+def measured(ring, causes, seed=1, **options):
+    return simulate(ring, causes, background=ALL, shots=6, seed=seed, **options).measurement()
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Cause("quadrupole_gradient", "QD::5", -0.2),
+        Cause("monitor_swap", "bpm::1", 1.0),
+        Cause("monitor_gain_y", "bpm::7", -0.6),
+    ],
+)
+def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fault):
+    found = diagnose(small_ring, measured(small_ring, [fault]))
+    assert found.verdict == "named"
+    (finding,) = found.findings
+    assert (finding.effect, finding.element) == (fault.effect, fault.element)
+    assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
+    after = found.heldout.misfits[-1]
+    assert 0.6 < after.chi2_per_dof < 1.5  # 70 readings, correlated
+    assert 0.6 < after.rms / after.expected < 1.5
+    assert after.rms < 0.05 * found.heldout.misfits[0].rms  # of the design
+
+
+def test_small_errors_alone_are_no_fault_and_have_their_sizes(small_ring):
+    found = diagnose(small_ring, measured(small_ring, []))
+    assert (found.verdict, found.findings) == ("distributed", ())
+    seen = [name for name, error in found.prior_errors.items() if error < 0.3]
+    assert {"monitor_gain_x", "monitor_gain_y", "monitor_offset_x"} <= set(seen)
+    for name in seen:
+        pull = np.log(found.priors[name] / CATALOGUE[name].background) / found.prior_errors[name]
+        assert abs(pull) < 4
+
+
+def test_no_small_errors_are_learnt_where_there_are_none(small_ring):
+    clean = simulate(small_ring, [Cause("quadrupole_gradient", "QD::5", -0.2)], shots=6, seed=1)
+    found = diagnose(small_ring, clean.measurement())
+    assert found.verdict == "named"
+    assert not found.priors
+
+
+def test_noise_that_nobody_states_is_not_taken_for_what_neighbours_leave(small_ring):
+    """Errors between neighbouring monitors are alike in all shots, noise is not: neighbours leave 8
+    to 14 times the noise here, from four shots 1 to 4 times of it is learnt."""
+    known = measured(small_ring, [])
+    found = diagnose(small_ring, replace(known, noise=None))
+    assert found.priors
+    assert not found.findings
+    for plane, true in enumerate(np.nanmedian(known.noise, axis=0)):
+        assert 0.8 * true < found.noise[plane] < 5 * true
+    told = f"{1e6 * found.noise[0]:.1f} µm in x, {1e6 * found.noise[1]:.1f} µm in y"
+    assert any(told in warning for warning in found.warnings)
