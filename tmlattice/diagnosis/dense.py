@@ -229,15 +229,17 @@ def fit_steps(
     progress("all together")
     state = settle(bend(jump(state)))
     refused: list[Step] = []
-    worth = _worth(state, steps, progress)
+    worth, without = _worth(state, steps, progress)
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
         least = min(worth, key=lambda trial: worth[trial])
-        state = _without(state, least)
+        state = without[least] if least in without else _without(state, least)
         refused.append(replace(steps.pop(least), kept=False))
         doubted = [trial for trial in steps if worth[trial] <= 0]
         del worth[least]
+        without = {}
         if doubted:
-            worth |= _worth(state, doubted, progress)
+            again, without = _worth(state, doubted, progress)
+            worth |= again
     progress("result")
     state = settle(bend(jump(replace(state, exploring=False))))
     after = score(state, split.held)
@@ -265,17 +267,19 @@ def _inner(state: State) -> Array:
 
 def _worth(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
-) -> dict[Trial, float]:
-    """Log evidence of each trial's families beside all the others; 0 or less: not needed.
+) -> tuple[dict[Trial, float], dict[Trial, State]]:
+    """Log evidence of each trial's families beside all the others (0 or less: not needed), and the
+    states without them.
 
     Correctors that were not fitted have the veto: evidence takes readings for independent, which
     what the model lacks is not.
     """
     worth: dict[Trial, float] = {}
+    states: dict[Trial, State] = {}
     inner, evidence = _inner(state), log_evidence(state, state.good)
     for trial in trials:
         progress(f"without {_title(trial)}")
-        without = _without(state, trial)
+        without = states[trial] = _without(state, trial)
         good = state.good & without.good
         with_it = evidence if (good == state.good).all() else log_evidence(state, good)
         gained = with_it - log_evidence(without, good) - LEAST
@@ -284,7 +288,7 @@ def _worth(
         # of what fitted correctors have of their own those that were not fitted know nothing
         asked = any(family.per != "column" for family in trial.families)
         worth[trial] = min(gained, lost) if asked and lost < -VETO else gained
-    return worth
+    return worth, states
 
 
 def _without(state: State, trial: Trial) -> State:

@@ -244,15 +244,15 @@ class Moved(NamedTuple):
     after: float
 
 
-def one_round(state: State, block: int, bold: float = 1.0) -> Moved:
-    """Linearise the readings of one block, solve, and move.
+def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Moved:
+    """Solve the readings of one block, and move.
 
     Args:
         state: where it stands.
         block: 0 in-plane, 1 coupling.
+        there: `linear` of that block where it stands.
         bold: factor of every trusted change: small where the last rounds went astray.
     """
-    there = linear(state, block)
     found = solve(there.normal, there.groups, there.start, bold * there.trust, rounds=EACH)
     family = {f.variable: f for f in state.families}
     values = {name: family[name].bounded(found.values[at]) for name, at in there.where.items()}
@@ -297,8 +297,9 @@ def settle(
         for block in blocks:
             if not state.of_block(block):
                 continue
+            there = linear(state, block)
             for _ in range(RETRIES):
-                moved = one_round(state, block, bold[block])
+                moved = one_round(state, block, there, bold[block])
                 if moved.after <= moved.before:
                     break
                 bold[block] /= ASTRAY

@@ -61,10 +61,10 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
         search: what is searched.
         told: rms of small errors by effect; empty: there are none; None: the data say.
     """
-    if told is not None and not told:
-        search.progress("scan")
-        return Found(explain(search, ready.before))
     if told is not None:
+        if not told:
+            search.progress("scan")
+            return Found(explain(search, ready.before))
         search.progress("background")
         small = small_errors(ring, ready.problem, ready.known, told, ready.before.nuisances)
         return Found(*_among(ring, ready, search, small))
@@ -100,7 +100,7 @@ def _crowded(ready: Prepared) -> bool:
 
 
 def _explained(found: Explanation, ready: Prepared) -> bool:
-    """Whether few causes leave nothing but noise, and did not need all that they may be."""
+    """Whether few causes leave nothing but noise."""
     more, _ = ready.problem.judgement.noise
     p_value = chi2.sf(found.fit.chi2, freedom(turns_of(found).data, found.fit))
     return bool(p_value >= more)

@@ -65,8 +65,6 @@ def learn_sizes(
         families: usual rms times signature of each error of a family, [error, row].
         noise: parts of the rows whose noise is to be learnt too, [row] each; none: it is known.
 
-    Returns:
-        Sizes; all of it NaN where the readings cannot be brought to a likelihood.
     """
 
     def out(x: Array) -> Array:
@@ -74,13 +72,8 @@ def learn_sizes(
 
     clean = out(rows)
     inside = launches @ launches.T
-    parts = [np.empty((0, 0))] * 0
-    for family in families:
-        own = out(family)
-        parts.append(own.T @ own)
-    for mask in noise:
-        own = out(np.diag(mask.astype(float)))
-        parts.append(own.T @ own)
+    seen = [out(some) for some in (*families, *(np.diag(mask.astype(float)) for mask in noise))]
+    parts = [own.T @ own for own in seen]
     # what has no size of its own: the noise where it is known, and the launches' directions
     base = inside if noise else np.eye(len(rows))
     precision = _prior(len(families), len(noise))
