@@ -140,9 +140,14 @@ def diagnose(
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
-        from tmlattice.measurement import Measurement, OrbitResponse, read_measurement
+        from tmlattice.errors import MeasurementError
+        from tmlattice.measurement import Measurement, OrbitResponse, in_words, read_measurement
 
         data = read_measurement(measurement)
+        if not isinstance(data, Measurement | OrbitResponse):
+            raise MeasurementError(
+                f"'{measurement}' is {in_words(data)}; give first turns or an orbit response"
+            )
         response = isinstance(data, OrbitResponse)
         if response:
             _refuse(

@@ -238,14 +238,14 @@ def trajectories(path: Path, refusal: str) -> "Measurement":
     """The first turns of a measurement folder, or of a table.
 
     Raises:
-        MeasurementError: an orbit response, with what the command says to it.
+        MeasurementError: a measurement of another kind, with what the command says to it.
     """
     from tmlattice.errors import MeasurementError
-    from tmlattice.measurement import Measurement, read_measurement
+    from tmlattice.measurement import Measurement, in_words, read_measurement
 
     data = read_measurement(path)
     if not isinstance(data, Measurement):
-        raise MeasurementError(f"'{path}' is an orbit response{refusal}")
+        raise MeasurementError(f"'{path}' is {in_words(data)}{refusal}")
     return data
 
 

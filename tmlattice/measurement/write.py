@@ -12,10 +12,20 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
-from tmlattice.measurement.folder import FORMAT, READINGS, RESPONSE, RF
+from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
+from tmlattice.measurement.header import finite, header
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse
-from tmlattice.measurement.rows import LARGEST_READING
+from tmlattice.measurement.rows import check_size
+from tmlattice.measurement.stored_files import (
+    KINDS,
+    TURNS,
+    check_readable,
+    fields,
+    plain_settings,
+    quoted,
+    write_readings,
+)
 from tmlattice.measurement.trajectory import (
     COORDINATES,
     Measurement,
@@ -26,14 +36,12 @@ from tmlattice.measurement.trajectory import (
 Array = NDArray[np.float64]
 
 
-def write_measurement(
-    folder: str | Path, measurement: Measurement | OrbitResponse, force: bool = False
-) -> None:
+def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bool = False) -> None:
     """Write a measurement folder: whole, or not at all. What it reads back is bit-identical.
 
     Args:
         folder: made where it is not there.
-        measurement: of either kind.
+        measurement: of any kind.
         force: a measurement that is there already is replaced.
 
     Raises:
@@ -44,6 +52,13 @@ def write_measurement(
     if isinstance(measurement, OrbitResponse):
         check_free(folder, force)
         _write_response(Path(folder), measurement)
+        return
+    if not isinstance(measurement, Measurement):
+        check_free(folder, force)
+        check_readable(measurement)
+        (write,) = (kind.write for kind in KINDS.values() if kind.record is type(measurement))
+        with output_folder(Path(folder)) as temporary:
+            write(temporary, measurement)
         return
     m = measurement
     with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy, force) as writer:
@@ -65,7 +80,7 @@ def check_free(folder: str | Path, force: bool = False) -> None:
     """
     if force:
         return
-    for name in ("measurement.json", "readings.csv", "response.csv"):
+    for name in ("measurement.json", "readings.csv", "response.csv", "tunes.csv"):
         if (Path(folder) / name).exists():
             raise MeasurementError(
                 f"'{folder}' holds a measurement already ({name}); name another folder, or replace "
@@ -75,7 +90,7 @@ def check_free(folder: str | Path, force: bool = False) -> None:
 
 def _write_response(folder: Path, response: OrbitResponse) -> None:
     orbits = [(name, response.response[i]) for i, name in enumerate(response.correctors)]
-    document = _header("orbit_response", response.monitors, response)
+    document = header("orbit_response", response)
     document["columns"] = [
         {"corrector": name, "plane": plane, "kick": float(kick)}
         for name, plane, kick in zip(
@@ -113,56 +128,9 @@ def write_response_table(
         write = csv.writer(file, lineterminator="\n").writerow
         write(RESPONSE)
         for name, orbit in orbits:
-            _check_size(orbit, monitors)
+            check_size(orbit, monitors)
             for monitor, xy in zip(monitors, orbit.tolist(), strict=True):
-                write((name, monitor, *_fields(xy)))
-
-
-def _header(kind: str, monitors: Sequence[str], source: Any) -> dict[str, Any]:
-    """What both kinds of document begin with; `source` has noise, lattice and energy."""
-    from tmlattice import __version__
-
-    header: dict[str, Any] = {
-        "format": FORMAT,
-        "version": 1,
-        "package": __version__,
-        "kind": kind,
-        "lattice": source.lattice,
-        "energy_gev": None if source.energy is None else float(source.energy),
-        "noise": _write_noise(source.noise, monitors),
-    }
-    return {key: value for key, value in header.items() if value is not None}
-
-
-def _write_noise(noise: Array | None, monitors: Sequence[str]) -> dict[str, Any] | None:
-    if noise is None:
-        return None
-
-    def pair(row: Array) -> dict[str, float | None]:
-        return {plane: _finite(v) for plane, v in zip("xy", row.tolist(), strict=True)}
-
-    if np.array_equal(noise, np.tile(noise[0], (len(noise), 1)), equal_nan=True):
-        return pair(noise[0])
-    return {monitor: pair(row) for monitor, row in zip(monitors, noise, strict=True)}
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _fields(xy: Sequence[float]) -> list[str]:
-    """repr is the shortest text that reads back as the same number; a missing one is empty."""
-    return [repr(v) if v == v else "" for v in xy]  # noqa: PLR0124  (NaN)
-
-
-def _check_size(readings: Array, monitors: Sequence[str]) -> None:
-    large = ~(np.abs(readings) <= LARGEST_READING) & ~np.isnan(readings)
-    if large.any():
-        *_, monitor, plane = np.argwhere(large)[0]
-        raise MeasurementError(
-            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
-            f"{LARGEST_READING} m, which no reader takes; readings are in metres"
-        )
+                write((name, monitor, *fields(xy)))
 
 
 class MeasurementWriter:
@@ -188,14 +156,13 @@ class MeasurementWriter:
         self._shots: set[int] = set()
         self._some = False
         self._document, self._table = document, table
-        header = json.dumps(
-            _header("trajectory", self.monitors, self),
+        start = json.dumps(
+            header("trajectory", self),
             indent=2, ensure_ascii=False, allow_nan=False,
         )  # fmt: skip
-        document.write(header.removesuffix("\n}") + ',\n  "shots": [')
-        table.write(",".join(READINGS) + "\n")
-        # a name with a comma or a quote is quoted as CSV has it
-        self._names = [_quoted(name) for name in self.monitors]
+        document.write(start.removesuffix("\n}") + ',\n  "shots": [')
+        table.write(",".join(TURNS) + "\n")
+        self._names = quoted(self.monitors)
 
     def add(
         self,
@@ -225,7 +192,7 @@ class MeasurementWriter:
                 f"shot {shot} has readings of the shape {readings.shape}; it should be "
                 f"[turns, {len(self.monitors)}, 2]"
             )
-        _check_size(readings, self.monitors)
+        check_size(readings, self.monitors)
         entry: dict[str, Any] = {"id": int(shot), "launch": _coordinates(launch, "launch")}
         if None in entry["launch"].values():
             raise MeasurementError(f"the launch of shot {shot} is not finite")
@@ -235,18 +202,11 @@ class MeasurementWriter:
             entry["launch_sigma"] = _coordinates(launch_sigma, "launch_sigma")
         if settings:
             check_settings(shot, settings)
-            entry["settings"] = {
-                name: {key: float(amount) for key, amount in changed.items()}
-                for name, changed in settings.items()
-            }
+            entry["settings"] = plain_settings(settings)
         separator = ",\n    " if self._shots else "\n    "
         self._document.write(separator + json.dumps(entry, ensure_ascii=False, allow_nan=False))
         for turn, row in enumerate(readings.tolist()):
-            start = f"{int(shot)},{turn},"
-            self._table.writelines(
-                f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
-                for name, (x, y) in zip(self._names, row, strict=True)
-            )
+            write_readings(self._table, f"{int(shot)},{turn},", self._names, row)
         self._shots.add(shot)
         self._some |= bool(np.isfinite(readings).any())
 
@@ -261,16 +221,12 @@ class MeasurementWriter:
         self._document.write("\n  ]\n}\n")
 
 
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"' if set(name) & {",", '"'} else name
-
-
 def _coordinates(values: Any, what: str) -> dict[str, float | None]:
     array = np.asarray(values, dtype=float)
     if array.shape not in ((4,), (5,)):
         raise MeasurementError(f"a {what} is x, px, y, py and delta, not {array.shape} numbers")
     padded = np.pad(array, (0, 5 - len(array))).tolist()
-    return {name: _finite(v) for name, v in zip(COORDINATES, padded, strict=True)}
+    return {name: finite(v) for name, v in zip(COORDINATES, padded, strict=True)}
 
 
 @contextmanager
