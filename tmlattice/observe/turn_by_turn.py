@@ -1,0 +1,124 @@
+"""Turn by turn of a stored beam: its betatron lines at every monitor, and its tunes.
+
+A kicked beam oscillates in two modes; each is a line in the spectrum of every monitor, whose
+complex amplitude is the mode's vector there times one complex number of the shot. That number is a
+nuisance (nobody knows the kick's size and phase so well), all else is optics: phases, which no gain
+touches, ratios of amplitudes, and in the other plane coupling.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.stored import Moved
+from tmlattice.effects import Settings
+from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import TurnByTurn
+from tmlattice.observe.spectra import Lines, lines
+from tmlattice.observe.stored import Stored, rf_of, stacked
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+TUNE = 1e-4
+"""Below this a tune is not believed: it moves with the amplitude, which the model leaves out."""
+
+FLOOR = 3e-4
+"""Share of a line below which its error is not believed: what amplitude and decoherence do to the
+ratio of two monitors, which the model leaves out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManyTurns(Stored):
+    """Lines [shot, (monitor, plane, mode, re and im), then two tunes]; m, and 1.
+
+    Nuisances are the complex amplitude of each shot and mode, re and im, [shot, 2, 2].
+    """
+
+    @property
+    def first(self) -> Array:
+        """The amplitudes that fit the ring as it is known best."""
+        shots = len(self.data)
+        view = self.view(self.fixed)
+        nothing = np.zeros((shots, 2, 2))
+        slopes = self.as_rows(self.directions(view, nothing)).T
+        left = self.as_rows(self.data - self.read(view, nothing))
+        solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
+        return np.asarray(solved.reshape(nothing.shape))
+
+    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """A shot is a state."""
+        size = nuisances[..., 0] + 1j * nuisances[..., 1]
+        seen = stacked(states, "modes") * size[:, None, None, :]
+        flat = np.stack([seen.real, seen.imag], axis=-1)
+        flat = flat.reshape(*flat.shape[:-4], -1)
+        return np.concatenate([flat, stacked(states, "tunes")], axis=-1)
+
+    def directions(self, view: object, nuisances: Array) -> Array:
+        """Linear in the nuisances: one after another, the others zero; tunes have none."""
+        out = []
+        nothing = self.read(view, np.zeros_like(nuisances))  # type: ignore[arg-type]
+        for i in range(nuisances.size):
+            one = np.zeros(nuisances.size)
+            one[i] = 1.0
+            there = self.read(view, one.reshape(nuisances.shape))  # type: ignore[arg-type]
+            out.append(there - nothing)
+        return np.array(out)
+
+
+def many_turns(
+    ring: Ring, measured: TurnByTurn, places: Mapping[str, float], spectrum: Lines | None = None
+) -> ManyTurns:
+    """What turns of a stored beam are for an inference.
+
+    A real signal does not tell Q from 1 - Q: the one nearer to the design's is taken.
+
+    Args:
+        ring: the design.
+        measured: readings.
+        places: of each effect, for the prior.
+        spectrum: their lines, where they are known already.
+
+    Raises:
+        MeasurementError: no line can be used.
+        UnknownNameError: a monitor that the ring does not have.
+    """
+    names = [monitor.name for monitor in ring.monitors]
+    found = lines(measured.in_order_of(names)) if spectrum is None else spectrum
+    shots = len(found.tunes)
+    settings: tuple[Settings, ...] = measured.settings or ({},) * shots
+    amplitude, error = found.amplitude, found.error
+    count = len(names)
+    at = np.repeat(np.arange(count), 8)
+    blank = ManyTurns(
+        ring=ring,
+        states=tuple((one, rf_of(one)) for one in settings),
+        data=np.zeros((shots, 8 * count + 2)),
+        errors=np.ones((shots, 8 * count + 2)),
+        read_by=np.tile(np.append(at, [-1, -1]), (shots, 1)),
+        used=np.zeros((shots, 8 * count + 2), dtype=bool),
+        places=places,
+    )
+    design = np.array([beam.tunes for beam in blank.view(()).beams])
+    off = [np.abs((q - design + 0.5) % 1.0 - 0.5) for q in (found.tunes, 1 - found.tunes)]
+    mirrored = off[1] < off[0]  # [shot, mode]
+    tunes = np.where(mirrored, 1 - found.tunes, found.tunes)
+    tunes = design + (tunes - design + 0.5) % 1.0 - 0.5
+    amplitude = np.where(mirrored[:, None, None], amplitude.conj(), amplitude)
+    # what the model leaves out goes with the line of the mode in its own plane
+    size = np.abs(amplitude)
+    error = np.hypot(error, FLOOR * size.max(axis=2, keepdims=True))
+    both = np.stack([amplitude.real, amplitude.imag], axis=-1).reshape(shots, -1)
+    data = np.concatenate([both, tunes], axis=1)
+    errors = np.concatenate(
+        [np.repeat(error.reshape(shots, -1), 2, axis=1), np.hypot(found.tune_error, TUNE)], axis=1
+    )
+    there = np.isfinite(data) & np.isfinite(errors)
+    if not there.any():
+        raise MeasurementError("no betatron line stands out of the noise; kick the beam harder")
+    return replace(
+        blank, data=np.where(there, data, 0.0), errors=np.where(there, errors, 1.0), used=there
+    )
