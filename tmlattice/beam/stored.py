@@ -160,7 +160,7 @@ class StoredBeam:
 
     @cached_property
     def _read_bends(self) -> ComplexArray:
-        """What read-outs that bend add to the modes, per unit of the launch, [monitor, 2, mode, n]."""
+        """What read-outs that bend add to the modes, per unit of launch, [monitor, 2, mode, n]."""
         model, maps = self.model, self.model.maps
         C = model.tangents[maps.at]
         return np.asarray(

@@ -86,6 +86,11 @@ class Among(Problem):
         """Of the inner one."""
         return self.inner.free
 
+    @property
+    def freedom(self) -> int:
+        """Of the inner one."""
+        return self.inner.freedom
+
     def sees(self, hypothesis: Hypothesis) -> bool:
         """As the inner one."""
         return self.inner.sees(hypothesis)

@@ -94,6 +94,11 @@ class Problem(ABC):
         """Number of coordinates of the projection."""
         return int(np.size(self.first))
 
+    @property
+    def freedom(self) -> int:
+        """Readings, and what is known of nuisances, less the nuisances."""
+        return int(self.valid.sum()) - self.free
+
     def sees(self, hypothesis: Hypothesis) -> bool:
         """Whether the kind knows what such a cause would do: of another one it reads nothing."""
         return True
@@ -154,7 +159,7 @@ class Problem(ABC):
 
     @abstractmethod
     def as_rows(self, readings: Array) -> Array:
-        """What was read, or changes of it, [..., *shape of `valid`], as whitened rows [..., row]."""
+        """Readings, or changes of them, [..., *shape of `valid`], as whitened rows [..., row]."""
 
     @abstractmethod
     def left(self, point: Point) -> tuple[Array, Array]:

@@ -106,6 +106,11 @@ class Together(Problem):
         """Of all parts."""
         return sum(part.free for part in self.parts)
 
+    @property
+    def freedom(self) -> int:
+        """Of all parts."""
+        return sum(part.freedom for part in self.parts)
+
     def of_parts(self, nuisances: Array) -> list[Array]:
         """Of each part, in its own shape."""
         flat = np.split(nuisances, _ends([start.size for start in self.starts]))

@@ -181,6 +181,13 @@ class FirstTurns(Problem):
         one = np.tile(np.arange(len(self.monitors)), self.data.turns)
         return np.broadcast_to(one[None, :, None], self.valid.shape)
 
+    @property
+    def freedom(self) -> int:
+        """What is known of a launch counts as readings of it."""
+        free = self.data.launch_sigma > 0
+        priors = int((free & np.isfinite(self.data.launch_sigma)).sum())
+        return int(self.valid.sum()) + priors - int(free.sum())
+
     def as_rows(self, readings: Array) -> Array:
         """With rows of zeros for what is known of the launches."""
         return self.whitening.signature(readings)

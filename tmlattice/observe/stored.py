@@ -2,7 +2,7 @@
 
 A measurement sees the ring in some states (settings of a shot, steps of the RF). In each the beam
 has a closed orbit, two tunes and two modes; what the monitors show of these is linear in them, and
-so `told` is prediction and derivative in one. To add a kind, write a class with `told` and its data.
+so `told` is prediction and derivative in one. A new kind is a class with `told` and its data.
 """
 
 from abc import abstractmethod
@@ -116,7 +116,7 @@ class Stored(Steady):
         return self.told([_seen(b.shown, matrix, constant) for b in view.beams], nuisances)
 
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
-        """Effects on the ring in closed form, those of monitors by differences; of the launch none."""
+        """Effects on the ring in closed form, those of monitors by differences."""
         out = np.zeros((len(hypotheses), *self.used.shape))
         kinds = [find(name) for name, _ in hypotheses]
         on_ring = [i for i, kind in enumerate(kinds) if isinstance(kind, RingEffect)]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.stored import Moved
 from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.problem import Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
@@ -49,6 +50,10 @@ class ManyTurns(Stored):
         solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
         return np.asarray(solved.reshape(nothing.shape))
 
+    def left(self, point: Point) -> tuple[Array, Array]:
+        """A line is no single reading: none is left out alone."""
+        return np.zeros(self.used.shape), np.ones(self.used.shape)
+
     def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """A shot is a state."""
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
@@ -74,7 +79,7 @@ def many_turns(
 ) -> ManyTurns:
     """What turns of a stored beam are for an inference.
 
-    A real signal does not tell Q from 1 - Q: the one nearer to the design's is taken.
+    A real signal does not tell Q from 1 - Q: lines are looked for near to the design's tunes.
 
     Args:
         ring: the design.
@@ -87,38 +92,37 @@ def many_turns(
         UnknownNameError: a monitor that the ring does not have.
     """
     names = [monitor.name for monitor in ring.monitors]
-    found = lines(measured.in_order_of(names)) if spectrum is None else spectrum
-    shots = len(found.tunes)
-    settings: tuple[Settings, ...] = measured.settings or ({},) * shots
-    amplitude, error = found.amplitude, found.error
-    count = len(names)
-    at = np.repeat(np.arange(count), 8)
+    settings: tuple[Settings, ...] = measured.settings or ({},) * len(measured.shots)
+    count, shots = len(names), len(measured.shots)
+    shape = (shots, 8 * count + 2)
     blank = ManyTurns(
         ring=ring,
         states=tuple((one, rf_of(one)) for one in settings),
-        data=np.zeros((shots, 8 * count + 2)),
-        errors=np.ones((shots, 8 * count + 2)),
-        read_by=np.tile(np.append(at, [-1, -1]), (shots, 1)),
-        used=np.zeros((shots, 8 * count + 2), dtype=bool),
+        data=np.zeros(shape),
+        errors=np.ones(shape),
+        read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1, -1]), (shots, 1)),
+        used=np.zeros(shape, dtype=bool),
         places=places,
     )
     design = np.array([beam.tunes for beam in blank.view(()).beams])
-    off = [np.abs((q - design + 0.5) % 1.0 - 0.5) for q in (found.tunes, 1 - found.tunes)]
-    mirrored = off[1] < off[0]  # [shot, mode]
-    tunes = np.where(mirrored, 1 - found.tunes, found.tunes)
-    tunes = design + (tunes - design + 0.5) % 1.0 - 0.5
-    amplitude = np.where(mirrored[:, None, None], amplitude.conj(), amplitude)
+    found = spectrum
+    if found is None:
+        at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
+        found = lines(measured.in_order_of(names), near=design[0], at=at)
     # what the model leaves out goes with the line of the mode in its own plane
-    size = np.abs(amplitude)
-    error = np.hypot(error, FLOOR * size.max(axis=2, keepdims=True))
-    both = np.stack([amplitude.real, amplitude.imag], axis=-1).reshape(shots, -1)
-    data = np.concatenate([both, tunes], axis=1)
-    errors = np.concatenate(
-        [np.repeat(error.reshape(shots, -1), 2, axis=1), np.hypot(found.tune_error, TUNE)], axis=1
-    )
+    size = np.abs(found.amplitude).max(axis=2, keepdims=True)
+    error = np.hypot(found.error, FLOOR * size).reshape(shots, -1)
+    both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
+    tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
+    data = np.concatenate([both.reshape(shots, -1), tunes], axis=1)
+    tune_error = np.hypot(found.tune_error, TUNE)
+    errors = np.concatenate([np.repeat(error, 2, axis=1), tune_error], axis=1)
     there = np.isfinite(data) & np.isfinite(errors)
     if not there.any():
-        raise MeasurementError("no betatron line stands out of the noise; kick the beam harder")
+        raise MeasurementError(
+            "no betatron line stands out of the noise"
+            + (f": {'; '.join(found.said)}" if found.said else "; kick the beam harder")
+        )
     return replace(
         blank, data=np.where(there, data, 0.0), errors=np.where(there, errors, 1.0), used=there
     )
