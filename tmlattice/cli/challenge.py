@@ -8,6 +8,7 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
     background_option,
     console,
     json_option,
@@ -121,7 +122,7 @@ def run(
             screen.print(f"case {name}: {error}")
 
 
-@challenge.command("score")
+@challenge.command("score", cls=Careful)
 @click.argument("folder", type=FILE)
 @click.option("--out", type=FILE, metavar="DIR", help="Figures: confusion, calibration, detection.")
 @click.option(

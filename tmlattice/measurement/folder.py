@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
-from tmlattice.measurement.documents import located, read_document
+from tmlattice.measurement.documents import check_table, located, read_document
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.rows import dense, match_names, read_rows
@@ -96,6 +96,7 @@ def _trajectory(
         )  # fmt: skip
     names, place = match_names(rows, "monitor", monitors)
     readings = dense(rows, order, len(shots), place, len(names))
+    check_table(document, rows.path)  # what is wrong in a line is told with the line
     with located(file):
         return Measurement(
             launches=launches,
@@ -165,6 +166,7 @@ def _orbit_response(
     names, place = match_names(rows, "monitor", monitors)
     response = np.full((len(columns) + 1, len(names), 2), np.nan)
     response[column_of[of_row], place] = rows.xy
+    check_table(document, rows.path)
     with located(file):
         if dispersion and len(columns) not in column_of:
             raise MeasurementError(

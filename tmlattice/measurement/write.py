@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
+from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import FORMAT, READINGS, RESPONSE, RF
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse
@@ -92,8 +93,11 @@ def _write_response(folder: Path, response: OrbitResponse) -> None:
             document["dispersion"] = True
             orbits.append((RF, response.rf.orbit))
     with output_folder(folder) as temporary:
-        write_json(temporary / "measurement.json", document)
-        write_response_table(temporary / "response.csv", response.monitors, orbits)
+        table = temporary / "response.csv"
+        write_response_table(table, response.monitors, orbits)
+        digest = Digest()
+        digest.add(table.read_bytes())
+        write_json(temporary / "measurement.json", {**document, "table_sha256": digest.told()})
 
 
 def write_response_table(
@@ -193,7 +197,8 @@ class MeasurementWriter:
             indent=2, ensure_ascii=False, allow_nan=False,
         )  # fmt: skip
         document.write(header.removesuffix("\n}") + ',\n  "shots": [')
-        table.write(",".join(READINGS) + "\n")
+        self._digest = Digest()
+        self._write([",".join(READINGS) + "\n"])
         # a name with a comma or a quote is quoted as CSV has it
         self._names = [_quoted(name) for name in self.monitors]
 
@@ -243,12 +248,17 @@ class MeasurementWriter:
         self._document.write(separator + json.dumps(entry, ensure_ascii=False, allow_nan=False))
         for turn, row in enumerate(readings.tolist()):
             start = f"{int(shot)},{turn},"
-            self._table.writelines(
+            self._write(
                 f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
                 for name, (x, y) in zip(self._names, row, strict=True)
             )
         self._shots.add(shot)
         self._some |= bool(np.isfinite(readings).any())
+
+    def _write(self, lines: Iterable[str]) -> None:
+        text = "".join(lines)
+        self._digest.add(text.encode())
+        self._table.write(text)
 
     def close(self) -> None:
         """End the document.
@@ -258,7 +268,7 @@ class MeasurementWriter:
         """
         if not self._some:
             raise MeasurementError("no reading was written; a measurement has one at least")
-        self._document.write("\n  ]\n}\n")
+        self._document.write(f'\n  ],\n  "table_sha256": "{self._digest.told()}"\n}}\n')
 
 
 def _quoted(name: str) -> str:
