@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
-from tmlattice.measurement.documents import located, read_document
+from tmlattice.measurement.documents import check_table, located, read_document
 from tmlattice.measurement.header import FORMAT, number, read_noise
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
@@ -93,6 +93,7 @@ def read_measurement(
     kind = document["kind"]
     if kind in KINDS:
         measured: AnyMeasurement = KINDS[kind].read(file, document, monitors)
+        check_table(document, file.with_name(KINDS[kind].table))
         return measured
     read = _trajectory if kind == "trajectory" else _orbit_response
     return read(file, document, monitors)
@@ -108,6 +109,7 @@ def _trajectory(
     order = places_of(rows, "shot", shots)
     names, place = match_names(rows, "monitor", monitors)
     readings = dense(rows, order, len(shots), place, len(names))
+    check_table(document, rows.path)  # what is wrong in a line is told with the line
     with located(file):
         return Measurement(
             launches=launches,
@@ -177,6 +179,7 @@ def _orbit_response(
     names, place = match_names(rows, "monitor", monitors)
     response = np.full((len(columns) + 1, len(names), 2), np.nan)
     response[column_of[of_row], place] = rows.xy
+    check_table(document, rows.path)
     with located(file):
         if dispersion and len(columns) not in column_of:
             raise MeasurementError(

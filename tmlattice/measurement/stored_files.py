@@ -1,10 +1,11 @@
 """Folders of a stored beam's turns, closed orbits, dispersion and tunes: see `measurement.folder`.
 
-Each kind has a reader of its document and table, and a writer of both into an empty folder.
+Each kind has a reader of its document and table, and a writer of the table that tells the
+document.
 """
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -12,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.files import write_json
 from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import located
@@ -150,50 +150,46 @@ def places_of(rows: Rows, column: str, known: Sequence[int]) -> NDArray[np.int64
 
 
 # --- writing --------------------------------------------------------------------------------------
-def _write_turns(folder: Path, m: TurnByTurn) -> None:
-    write_json(folder / "measurement.json", header("turn_by_turn", m) | _written_shots(m))
-    with (folder / "readings.csv").open("w", encoding="utf-8", newline="") as table:
-        table.write(",".join(TURNS) + "\n")
-        names = quoted(m.monitors)
-        for shot, turns in zip(m.shots, m.readings, strict=True):
-            for turn, row in enumerate(turns.tolist()):
-                write_readings(table, f"{shot},{turn},", names, row)
+def _write_turns(table: TextIO, m: TurnByTurn) -> Document:
+    table.write(",".join(TURNS) + "\n")
+    names = quoted(m.monitors)
+    for shot, turns in zip(m.shots, m.readings, strict=True):
+        for turn, row in enumerate(turns.tolist()):
+            table.writelines(reading_lines(f"{shot},{turn},", names, row))
+    return header("turn_by_turn", m) | _written_shots(m)
 
 
-def _write_orbits(folder: Path, m: ClosedOrbit) -> None:
-    write_json(folder / "measurement.json", header("closed_orbit", m) | _written_shots(m))
-    with (folder / "readings.csv").open("w", encoding="utf-8", newline="") as table:
-        table.write(",".join(ORBITS) + "\n")
-        for shot, row in zip(m.shots, m.orbit.tolist(), strict=True):
-            write_readings(table, f"{shot},", quoted(m.monitors), row)
+def _write_orbits(table: TextIO, m: ClosedOrbit) -> Document:
+    table.write(",".join(ORBITS) + "\n")
+    for shot, row in zip(m.shots, m.orbit.tolist(), strict=True):
+        table.writelines(reading_lines(f"{shot},", quoted(m.monitors), row))
+    return header("closed_orbit", m) | _written_shots(m)
 
 
-def _write_dispersion(folder: Path, m: Dispersion) -> None:
+def _write_dispersion(table: TextIO, m: Dispersion) -> Document:
+    table.write(",".join(STEPS) + "\n")
+    for step, row in enumerate(m.orbits.tolist()):
+        table.writelines(reading_lines(f"{step},", quoted(m.monitors), row))
     steps = [
         {"frequency_hz": float(s.frequency), "harmonic": int(s.harmonic), "step_hz": float(s.step)}
         for s in m.steps
     ]
-    write_json(folder / "measurement.json", header("dispersion", m) | {"steps": steps})
-    with (folder / "readings.csv").open("w", encoding="utf-8", newline="") as table:
-        table.write(",".join(STEPS) + "\n")
-        for step, row in enumerate(m.orbits.tolist()):
-            write_readings(table, f"{step},", quoted(m.monitors), row)
+    return header("dispersion", m) | {"steps": steps}
 
 
-def _write_tunes(folder: Path, m: TuneReading) -> None:
-    write_json(folder / "measurement.json", header("tunes", m) | _written_shots(m))
+def _write_tunes(table: TextIO, m: TuneReading) -> Document:
     nothing = np.full_like(m.tune, np.nan)
     values, errors = (
         np.concatenate([nothing if part is None else part for part in parts], axis=1)
         for parts in ((m.tune, m.chromaticity), (m.tune_error, m.chromaticity_error))
     )
-    with (folder / "tunes.csv").open("w", encoding="utf-8", newline="") as table:
-        write = csv.writer(table, lineterminator="\n").writerow
-        write(TUNES)
-        for shot, own, sigma in zip(m.shots, values.tolist(), errors.tolist(), strict=True):
-            for name, pair in zip(QUANTITIES, zip(own, sigma, strict=True), strict=True):
-                if not np.isnan(pair).all():
-                    write((shot, name, *fields(pair)))
+    write = csv.writer(table, lineterminator="\n").writerow
+    write(TUNES)
+    for shot, own, sigma in zip(m.shots, values.tolist(), errors.tolist(), strict=True):
+        for name, pair in zip(QUANTITIES, zip(own, sigma, strict=True), strict=True):
+            if not np.isnan(pair).all():
+                write((shot, name, *fields(pair)))
+    return header("tunes", m) | _written_shots(m)
 
 
 def _written_shots(m: TurnByTurn | ClosedOrbit | TuneReading) -> Document:
@@ -225,14 +221,12 @@ def fields(pair: Sequence[float]) -> list[str]:
     return [repr(v) if v == v else "" for v in pair]  # noqa: PLR0124  (NaN)
 
 
-def write_readings(
-    table: TextIO, start: str, names: Sequence[str], readings: Sequence[Sequence[float]]
-) -> None:
+def reading_lines(
+    start: str, names: Sequence[str], readings: Sequence[Sequence[float]]
+) -> Iterator[str]:
     """Rows of readings [monitor, 2] that begin with the same columns; names are `quoted`."""
-    table.writelines(
-        f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
-        for name, (x, y) in zip(names, readings, strict=True)
-    )
+    for name, (x, y) in zip(names, readings, strict=True):
+        yield f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
 
 
 class Kind(NamedTuple):
@@ -241,7 +235,7 @@ class Kind(NamedTuple):
     record: type
     table: str
     read: Callable[[Path, Document, Known], Any]
-    write: Callable[[Path, Any], None]
+    write: Callable[[TextIO, Any], Document]
 
 
 KINDS = {

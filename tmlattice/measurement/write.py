@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
+from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
 from tmlattice.measurement.header import finite, header
 from tmlattice.measurement.monitors import Names, noise_table
@@ -24,7 +25,7 @@ from tmlattice.measurement.stored_files import (
     fields,
     plain_settings,
     quoted,
-    write_readings,
+    reading_lines,
 )
 from tmlattice.measurement.trajectory import (
     COORDINATES,
@@ -56,9 +57,12 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
     if not isinstance(measurement, Measurement):
         check_free(folder, force)
         check_readable(measurement)
-        (write,) = (kind.write for kind in KINDS.values() if kind.record is type(measurement))
+        (kind,) = (kind for kind in KINDS.values() if kind.record is type(measurement))
         with output_folder(Path(folder)) as temporary:
-            write(temporary, measurement)
+            table = temporary / kind.table
+            with table.open("w", encoding="utf-8", newline="") as file:
+                document = kind.write(file, measurement)
+            _write_signed(temporary, document, table)
         return
     m = measurement
     with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy, force) as writer:
@@ -107,8 +111,18 @@ def _write_response(folder: Path, response: OrbitResponse) -> None:
             document["dispersion"] = True
             orbits.append((RF, response.rf.orbit))
     with output_folder(folder) as temporary:
-        write_json(temporary / "measurement.json", document)
-        write_response_table(temporary / "response.csv", response.monitors, orbits)
+        table = temporary / "response.csv"
+        write_response_table(table, response.monitors, orbits)
+        _write_signed(temporary, document, table)
+
+
+def _write_signed(folder: Path, document: dict[str, Any], table: Path) -> None:
+    """measurement.json beside its table, with what says that they belong together."""
+    digest = Digest()
+    with table.open("rb") as file:
+        while part := file.read(1 << 20):
+            digest.add(part)
+    write_json(folder / "measurement.json", {**document, "table_sha256": digest.told()})
 
 
 def write_response_table(
@@ -161,7 +175,8 @@ class MeasurementWriter:
             indent=2, ensure_ascii=False, allow_nan=False,
         )  # fmt: skip
         document.write(start.removesuffix("\n}") + ',\n  "shots": [')
-        table.write(",".join(TURNS) + "\n")
+        self._digest = Digest()
+        self._write([",".join(TURNS) + "\n"])
         self._names = quoted(self.monitors)
 
     def add(
@@ -206,9 +221,14 @@ class MeasurementWriter:
         separator = ",\n    " if self._shots else "\n    "
         self._document.write(separator + json.dumps(entry, ensure_ascii=False, allow_nan=False))
         for turn, row in enumerate(readings.tolist()):
-            write_readings(self._table, f"{int(shot)},{turn},", self._names, row)
+            self._write(reading_lines(f"{int(shot)},{turn},", self._names, row))
         self._shots.add(shot)
         self._some |= bool(np.isfinite(readings).any())
+
+    def _write(self, lines: Iterable[str]) -> None:
+        text = "".join(lines)
+        self._digest.add(text.encode())
+        self._table.write(text)
 
     def close(self) -> None:
         """End the document.
@@ -218,7 +238,7 @@ class MeasurementWriter:
         """
         if not self._some:
             raise MeasurementError("no reading was written; a measurement has one at least")
-        self._document.write("\n  ]\n}\n")
+        self._document.write(f'\n  ],\n  "table_sha256": "{self._digest.told()}"\n}}\n')
 
 
 def _coordinates(values: Any, what: str) -> dict[str, float | None]:
