@@ -105,7 +105,8 @@ class NameList(click.ParamType):  # type: ignore[type-arg]
 
 
 INPUTS = (
-    "lattice", "measurement", "measurements", "references", "calibration", "settings_file", "network", "files",
+    "lattice", "measurement", "measurements", "references", "calibration", "settings_file",
+    "network", "files",
 )  # fmt: skip
 MARKS = ("monitors", "correctors", "particle")
 OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out")
