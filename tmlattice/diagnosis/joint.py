@@ -230,7 +230,9 @@ def _told(
     kept = problem.without(found.dropped)
     stages = _stages(kept, found, small, causes)
     views = _views(parts, kept, stages)
-    heldout = _held_out(parts, stages, since=0 if small is None else max(len(stages) - 2, 0))
+    aside = {ring.monitors[m].name for m in found.monitors}
+    since = 0 if small is None else max(len(stages) - 2, 0)
+    heldout = _held_out(parts, stages, aside, since)
     if heldout is None:
         said = (*said, "nothing is held out, so nobody but the fit judges the gap")
     warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
@@ -361,9 +363,16 @@ def _pairs(parts: Sequence[Part], problem: Together, stage: _Stage) -> list[tupl
     return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
 
 
-def _held_out(parts: Sequence[Part], stages: Sequence[_Stage], since: int) -> Gap | None:
-    """Half of the monitors gives a held-out shot its nuisances, the other half judges."""
-    judges = [part.heldout for part in parts if part.heldout is not None]
+def _held_out(
+    parts: Sequence[Part], stages: Sequence[_Stage], aside: set[str], since: int
+) -> Gap | None:
+    """Half of the monitors gives a held-out shot its nuisances, the other half judges; monitors
+    that were set aside do neither."""
+    judges = []
+    for part in parts:
+        if (judge := part.heldout) is not None:
+            lost = [i for i, name in enumerate(judge.monitors) if name in aside]
+            judges.append(judge.without(np.isin(judge.owner(), lost)))
     if not judges:
         return None
     misfits = []
