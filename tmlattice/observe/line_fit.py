@@ -85,7 +85,7 @@ def fit_lines(
     for step in range(rounds):
         patterns = _quadratures(amplitude)
         values, cover = least_squares(
-            patterns, (data - offset[:, None] * there).T, there.T, 1 / noise**2
+            patterns, (data - offset[:, None] * there).T, there.T, 1 / noise**2, prior=1.0
         )
         envelopes = np.empty((len(lines), turns), dtype=complex)
         for i, width in enumerate(widths):
@@ -113,7 +113,11 @@ def fit_lines(
 
 
 def least_squares(
-    basis: Array, data: Array, there: Mask, weights: Array | None = None
+    basis: Array,
+    data: Array,
+    there: Mask,
+    weights: Array | None = None,
+    prior: float = 0.0,
 ) -> tuple[Array, Array]:
     """Coefficients of many signals in one basis, each from what was read of it.
 
@@ -122,6 +126,8 @@ def least_squares(
         data: [signal, sample], 0 where missing.
         there: [signal, sample].
         weights: of the samples; None: 1.
+        prior: what the coefficients are known to be beforehand, 1 over the square of their size:
+            what no sample shows stays small, instead of being noise.
 
     Returns:
         Coefficients and the diagonal of the inverse normal matrix, both [signal, function]; the
@@ -133,12 +139,13 @@ def least_squares(
     right = data @ (weighted / size)
     whole = there.all(axis=1)
     inverse = np.empty((len(data), basis.shape[1], basis.shape[1]))
-    inverse[whole] = _inverse((basis / size).T @ (weighted / size))
+    known = np.diag(prior / size**2)
+    inverse[whole] = _inverse((basis / size).T @ (weighted / size) + known)
     if not whole.all():
         functions = basis.shape[1]
         products = (basis / size)[:, :, None] * (weighted / size)[:, None, :]
         normal = there[~whole].astype(float) @ products.reshape(len(basis), -1)
-        inverse[~whole] = _inverse(normal.reshape(-1, functions, functions))
+        inverse[~whole] = _inverse(normal.reshape(-1, functions, functions) + known)
     found = np.einsum("sfg,sg->sf", inverse, right) / size
     return np.asarray(found), np.asarray(np.diagonal(inverse, axis1=1, axis2=2) / size**2)
 
