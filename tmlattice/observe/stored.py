@@ -6,7 +6,7 @@ so `told` is prediction and derivative in one. A new kind is a class with `told`
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 SMALL = 1e-3
 """Of a monitor's largest error: the step of the differences."""
 
+FEW = 10
+"""Causes with which a model is made from the one without; of more it is kept."""
+
 
 @dataclass(frozen=True)
 class Beams:
@@ -57,6 +60,7 @@ class Stored(Steady):
         states: settings and relative RF frequency of each.
         data, errors: what was read and its noise, of the kind's shape.
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
+        kept: a model of each state and the causes in it, from which others are made.
     """
 
     ring: Ring = field(repr=False)
@@ -64,6 +68,9 @@ class Stored(Steady):
     data: Array = field(repr=False)
     errors: Array = field(repr=False)
     read_by: NDArray[np.int64] = field(repr=False)
+    kept: dict[int, tuple[tuple[Cause, ...], ResponseModel]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     @abstractmethod
     def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
@@ -97,18 +104,28 @@ class Stored(Steady):
     def view(self, causes: Sequence[Cause]) -> Beams:
         """A closed orbit for each state."""
         made: list[StoredBeam] = []
-        first: dict[int, ResponseModel] = {}
         for i, (settings, frequency) in enumerate(self.states):
-            same = next((j for j in range(i) if self.states[j][0] == settings), i)
-            if same == i:
-                ring = apply(self.ring, causes, settings)
-                first[i] = ResponseModel(ring, 6, frequency)
-                made.append(StoredBeam(first[i]))
-            elif self.states[same][1] == frequency:
-                made.append(made[same])
+            same = [j for j in range(i) if self.states[j][0] == settings]
+            twin = next((j for j in same if self.states[j][1] == frequency), None)
+            if twin is not None:
+                made.append(made[twin])
+            elif same:
+                made.append(StoredBeam(made[same[0]].model.at_frequency(frequency)))
             else:
-                made.append(StoredBeam(first[same].at_frequency(frequency)))
+                made.append(StoredBeam(self._model(i, tuple(causes))))
         return Beams(tuple(made), monitors_with(self.ring, causes))
+
+    def _model(self, state: int, causes: tuple[Cause, ...]) -> ResponseModel:
+        """Most of the causes are the same from one call to the next: what was made for them is
+        changed by the others."""
+        settings, frequency = self.states[state]
+        known, base = self.kept.get(state, ((), None))
+        if base is None or causes[: len(known)] != known:
+            known = causes if len(causes) > FEW else ()
+            base = ResponseModel(apply(self.ring, known, settings), 6, frequency)
+            self.kept[state] = (known, base)
+        rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
+        return base.changed_to(apply(base.ring, rest)) if rest else base
 
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Monitors' errors and all."""
@@ -128,20 +145,16 @@ class Stored(Steady):
                 if id(beam) not in known:
                     known[id(beam)] = _seen(beam.moved(some), matrix)
             out[on_ring] = self.told([known[id(beam)] for beam in view.beams], nuisances)
+        place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
         for name in dict.fromkeys(name for name, _ in hypotheses):
             effect = find(name)
             if isinstance(effect, ReadingEffect):
                 own = [i for i, h in enumerate(hypotheses) if h[0] == name]
                 changed = self._of_monitors(view, nuisances, effect)
                 for i in own:
-                    m = self.place[self.ring[hypotheses[i][1] or ""].name]
-                    out[i] = np.where(self.read_by == m, changed, 0.0)
+                    mine = self.read_by == place[hypotheses[i][1] or ""]
+                    out[i][mine] = changed[mine]
         return out
-
-    @property
-    def place(self) -> Mapping[str, int]:
-        """Of each monitor among those of the ring."""
-        return {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
 
     def _of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
         """d readings / d amount of an effect on top, every monitor's own."""
@@ -161,11 +174,17 @@ class Stored(Steady):
 
 def _seen(shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0) -> Moved:
     """What monitors make of it."""
-    return Moved(
-        np.einsum("mij,...mj->...mi", matrix, shown.orbit) + constant,
-        tunes * shown.tunes,
-        np.einsum("mij,...mjp->...mip", matrix, shown.modes),
-    )
+    orbit, modes = shown.orbit + constant, shown.modes
+    wrong = np.flatnonzero((matrix != np.eye(2)).any(axis=(1, 2)))
+    if len(wrong):
+        modes, orbit = modes.copy(), orbit.copy()
+        own = matrix[wrong]
+        modes[..., wrong, :, :] = np.einsum(
+            "mij,...mjp->...mip", own, shown.modes[..., wrong, :, :]
+        )
+        beam = shown.orbit[..., wrong, :]
+        orbit[..., wrong, :] += np.einsum("mij,...mj->...mi", own, beam) - beam
+    return Moved(orbit, tunes * shown.tunes, modes)
 
 
 def rf_of(settings: Settings) -> float:
