@@ -134,7 +134,10 @@ class ResponseModel:
             free=self.free, turn=self._turn, tolerance=1e-15
         )
         self.state = self.path[0]
-        self.inverse = np.linalg.inv(self.tangents)
+        try:
+            self.inverse = np.linalg.inv(self.tangents)
+        except np.linalg.LinAlgError:  # the matrices have grown beyond all bounds
+            raise UnstableRingError(NO_ORBIT) from None
         self._solve = closing(self.tangents[-1], self.free, np.arange(len(self.free)))
 
         at, maps = self.maps.at, self.maps

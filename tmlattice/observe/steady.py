@@ -143,7 +143,7 @@ class Steady(Problem):
         """In units of the noise, what is not used left out."""
         scaled = readings / self.sigma
         if self.used.all():
-            return np.asarray(scaled.reshape(*scaled.shape[: -self.used.ndim], -1))
+            return np.asarray(scaled.reshape(*scaled.shape[: -self.used.ndim], self.used.size))
         return np.asarray(scaled[..., self.used])
 
     def left(self, point: Point) -> tuple[Array, Array]:
