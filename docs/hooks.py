@@ -109,8 +109,13 @@ def schema(name: str) -> str:
 def _fields(
     root: dict[str, Any], node: dict[str, Any], prefix: str
 ) -> Iterator[tuple[str, str, str]]:
-    branches = [node, node.get("else", {}), node.get("then", {})]  # a file of one kind, of another
-    for key, child in [item for b in branches for item in b.get("properties", {}).items()]:
+    # a file of one kind, of another; what stands in several is told of the first
+    kinds = [node.get("else", {}), node.get("then", {})]
+    kinds += [one.get("then", {}) for one in node.get("allOf", [])]
+    found: dict[str, Any] = {}
+    for branch in [node, *kinds]:
+        found = branch.get("properties", {}) | found
+    for key, child in found.items():
         where = f"{prefix}{key}"
         text = child.get("description", "")
         inner = _resolved(root, child)

@@ -56,9 +56,14 @@ def check(
 
     with output_file(json_file) if json_file else nullcontext() as path:
         from tmlattice.diagnosis.doctor import check_data
-        from tmlattice.measurement import read_measurement
+        from tmlattice.measurement import Measurement, OrbitResponse, in_words, read_measurement
 
         data = read_measurement(measurement)
+        if not isinstance(data, Measurement | OrbitResponse):
+            raise MeasurementError(
+                f"'{measurement}' is {in_words(data)}; the check knows first turns and orbit "
+                "responses"
+            )
         ring = open_ring(lattice, sequence, energy)
         try:
             found = check_data(ring, data, assumed=assumed, radiation=radiation)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from tmlattice.cli.options import FILE, console, quiet_option
+from tmlattice.cli.options import FILE, Careful, console, quiet_option
 
 if TYPE_CHECKING:
     from tmlattice.importers import Imported
 
 
-@click.command("import")
+@click.command("import", cls=Careful)
 @click.argument("files", nargs=-1, required=True, type=FILE)
 @click.option(
     "--out",

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike
 
-from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.result import Diagnosis, PartView
 from tmlattice.effects import find
 from tmlattice.lattice import Ring
 from tmlattice.lattice.survey import survey
@@ -41,8 +41,11 @@ MOST = 4000
 def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """By the name that the picture of `plots.diagnosis.figures` has."""
     made = {"plan": plan(diagnosis)}
-    if diagnosis.kind == "trajectory":
-        made |= {"readings": readings(diagnosis), "scan": scan(diagnosis)}
+    if not diagnosis.by_steps:
+        left = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
+        if left or not diagnosis.parts:
+            made["readings"] = parts(diagnosis, left) if left else readings(diagnosis)
+        made["scan"] = scan(diagnosis)
         if diagnosis.heldout is not None:
             made["gap"] = gap(diagnosis)
         return made
@@ -228,6 +231,35 @@ def readings(diagnosis: Diagnosis) -> Figure:
     return {"data": traces, "layout": layout, "strip": "y3"}
 
 
+def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
+    """What each measurement leaves at each monitor in units of the noise, before and after."""
+    places = {monitor.name: monitor.s for monitor in diagnosis.ring.monitors}
+    height = 0.9 / len(shown)
+    traces, axes = [], {}
+    for k, part in enumerate(shown):
+        axis = "y" if k == 0 else f"y{k + 1}"
+        s = np.array([places[diagnosis.ring[name].name] for name in part.monitors])
+        order = np.argsort(s)
+        names = [part.monitors[i] for i in order]
+        for model, colour, left in zip(
+            ("design", "with the findings"), (BEFORE, AFTER), part.left, strict=True
+        ):
+            traces.append(
+                _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
+                       told=f"<br>{part.label}, {model}<br>%{{y:.3g}} times the noise",
+                       showlegend=not k, legendgroup=model, yaxis=axis)
+            )  # fmt: skip
+        top = 1 - k * height
+        axes[axis.replace("y", "yaxis")] = _axis(
+            f"{part.label}<br>left / noise", type="log", dtick=1, domain=[top - 0.85 * height, top]
+        )
+    last = f"y{len(shown) + 1}"
+    axes[last.replace("y", "yaxis")] = {**_STRIP_AXIS, "domain": [0, 0.06]}
+    layout = _layout(120 + 180 * len(shown), xaxis=_axis("s [m]", anchor=last),
+                     shapes=_marks(diagnosis), **axes)  # fmt: skip
+    return {"data": traces, "layout": layout, "strip": last}
+
+
 def _amount(effect: str, power_of_it: float) -> str:
     power = find(effect).power
     return amount_text(effect, float(np.sign(power_of_it) * abs(power_of_it) ** (1 / power)))
@@ -242,8 +274,8 @@ def scan(diagnosis: Diagnosis) -> Figure:
     layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
     order = np.argsort(layers)
     order_of = {group: k for k, group in enumerate(COLOURS)}
-    traces = [_trace(layers[order], np.maximum(free.statistic[order], FLOOR),
-                     "a free kick in each shot", "@faint")]  # fmt: skip
+    kicks = np.maximum(free.statistic[order], FLOOR)
+    traces = [_trace(layers[order], kicks, "a free kick in each shot", "@faint")]
     by_effect: dict[str, list[int]] = {}
     for i in drawn:
         by_effect.setdefault(found.hypotheses[i][0], []).append(int(i))
@@ -257,12 +289,13 @@ def scan(diagnosis: Diagnosis) -> Figure:
                    text=told, legendgroup=group, showlegend=group not in shown)
         )  # fmt: skip
         shown.add(group)
-    named, kicks = thresholds(diagnosis)
+    named, of_kicks = thresholds(diagnosis)
     ends = [0.0, diagnosis.ring.length]
-    traces += [
-        _trace(ends, [named, named], f"threshold {named:.1f}", "@ink", dash="dash"),
-        _trace(ends, [kicks, kicks], f"of free kicks {kicks:.1f}", "@faint", dash="dot"),
-    ]
+    traces.append(_trace(ends, [named] * 2, f"threshold {named:.1f}", "@ink", dash="dash"))
+    text = f"of free kicks {of_kicks:.1f}"
+    traces.append(_trace(ends, [of_kicks] * 2, text, "@faint", dash="dot"))
+    if not len(order):
+        del traces[0], traces[-1]
     layout = _layout(
         480, xaxis=_axis("s [m]", anchor="y2"), shapes=_marks(diagnosis),
         yaxis=_axis("fall of chi²", type="log", dtick=1, domain=[0.13, 1], exponentformat="power"),

@@ -145,8 +145,11 @@ def notes(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     if diagnosis.bad_monitors:
         yield "bad monitors, left out", ", ".join(diagnosis.bad_monitors)
     if diagnosis.left_out:
-        places = [f"{row['monitor']} {row['plane']} (shot {row['shot']}, turn {row['turn']})"
-                  for row in diagnosis.left_out]  # fmt: skip
+        places = [
+            f"{row['monitor']} {row['plane']}"
+            + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
+            for row in diagnosis.left_out
+        ]
         more = f" and {len(places) - MOST} more" if len(places) > MOST else ""
         yield "readings left out", ", ".join(places[:MOST]) + more
     for name in diagnosis.provenance["options"].get("assume", ()):
