@@ -1,5 +1,6 @@
 """The ordered steps on simulated orbit responses whose errors are known, and the measured one."""
 
+import csv
 import json
 import os
 from dataclasses import replace
@@ -159,8 +160,8 @@ def test_options_act_and_are_told(small_ring, measured):
     assert options["false_alarm"] == 0.01
     with pytest.raises(MeasurementError, match="does not see monitor_offset_x"):
         diagnose(small_ring, measured, effects=["monitor_offset_x"])
-    with pytest.raises(MeasurementError, match="'reference' has no meaning for an orbit response"):
-        diagnose(small_ring, measured, reference=measured)
+    with pytest.raises(MeasurementError, match="'radiation' has no meaning for an orbit response"):
+        diagnose(small_ring, measured, radiation=True)
 
 
 SIGNATURES = [
@@ -396,6 +397,39 @@ def test_command(tmp_path, measured, result):
     own = (np.arange(kept.sum()), slice(None), [int(p == "y") for p in
            np.array(measured.planes)[kept]])  # fmt: skip
     assert np.sqrt(np.mean(miss[own] ** 2)) < 0.01 * np.sqrt(np.mean(gap[own] ** 2))
+
+
+def test_predict_reproduces_the_held_out_figure_with_an_energy_spread(tmp_path, small_ring):
+    spread = Cause("energy_spread", None, 2.5e-3)
+    measured = simulate_response(
+        small_ring, [*CAUSES, spread], kick=1e-5, noise=2e-9, engine="ocelot", progress=False,
+        seed=3,
+    ).measured  # fmt: skip
+    write_measurement(tmp_path / "m", measured)
+    ring, out, told = (tmp_path / name for name in ("ring.json", "predicted.csv", "found.json"))
+    calibration = tmp_path / "ring.json.calibration.json"
+    for words in (
+        ("diagnose", SMALL, tmp_path / "m", "--lattice-out", ring, "--json", told),
+        ("predict", ring, "--calibration", calibration, "--out", out, "--kick", "1e-5"),
+    ):
+        done = CliRunner().invoke(tmlattice, [str(word) for word in words])
+        assert done.exit_code == 0, done.output
+    assert "energy_spread" in calibration.read_text()
+    figure = json.loads(told.read_text())["steps"][-1]["heldout_rms_in_plane"]
+    with out.open(encoding="utf-8") as table:
+        rows = {(row["corrector"], row["monitor"]): row for row in csv.DictReader(table)}
+    # the same judges as the diagnosis had: the kick from one half of the monitors
+    data = response_data(small_ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(0))
+    left = []
+    for c in np.flatnonzero(split.held):
+        name, plane = data.measured.correctors[c], data.measured.planes[c]
+        own = [rows[small_ring[name].name, m] for m in data.measured.monitors]
+        model = np.array([float(row[plane]) for row in own])
+        read, near = data.pick(data.orbits)[c], split.half[c]
+        kick = model[near] @ read[near] / (model[near] @ model[near])
+        left.append((read - kick * model)[~near])
+    assert np.isclose(np.sqrt(np.mean(np.square(left))), figure, rtol=0.05)  # the third order
 
 
 def test_options_that_have_no_meaning(tmp_path, measured):

@@ -43,16 +43,17 @@ if TYPE_CHECKING:
     "--reference",
     type=FILE,
     metavar="DIR",
-    help="A measurement of the same machine before the fault: static errors cancel.",
+    help="A measurement of the same machine and kind before the fault: static errors cancel, and "
+    "what changed is told.",
 )
 @background_option("Small errors everywhere (not given: the data say)")
 @assume_option
 @click.option(
     "--max-effects",
     type=click.IntRange(1),
-    default=8,
-    show_default=True,
-    help="Findings at most; of an orbit response, steps that are kept at most.",
+    default=None,
+    help="Findings at most; of an orbit response, steps that are kept at most. 8 where nothing is "
+    "said, 40 of a change between two responses.",
 )
 @click.option(
     "--effects",
@@ -146,14 +147,22 @@ def diagnose(
         response = isinstance(data, OrbitResponse)
         if response:
             _refuse(
-                "an orbit response", reference=reference, background=background, network=network,
+                "an orbit response", background=background, network=network,
                 radiation=options.pop("radiation"),
             )  # fmt: skip
             options["missing"] = missing
+            if reference is not None:
+                _refuse(
+                    "a change since a reference", missing=missing, lattice_out=lattice_out,
+                    repaired_out=repaired_out,
+                )  # fmt: skip
+                options["reference"] = read_measurement(reference)
         else:
             _refuse("first turns", missing=missing)
             before = None if reference is None else trajectories(reference, "; give first turns")
             options |= {"reference": before, "background": dict(background) or None}
+        if options["max_effects"] is None:
+            del options["max_effects"]
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
         ring = open_ring(lattice, sequence, energy)
         if lattice_out and lattice_out == repaired_out:

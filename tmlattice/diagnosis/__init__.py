@@ -16,7 +16,7 @@ from tmlattice.measurement import Measurement, OrbitResponse
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"]
 
-_OF_TRAJECTORIES = ("reference", "background", "heldout", "radiation")
+_OF_TRAJECTORIES = ("background", "heldout", "radiation")
 
 
 def diagnose(ring: Ring, measurement: Measurement | OrbitResponse, **options: Any) -> Diagnosis:
@@ -26,21 +26,37 @@ def diagnose(ring: Ring, measurement: Measurement | OrbitResponse, **options: An
         ring: the design.
         measurement: first turns (or a few turns) of one or more shots, or an orbit response.
         options: for both kinds holdout, effects, max_effects, false_alarm, seed and progress; for
-            trajectories also reference, background, heldout and radiation, see
+            both too reference, a measurement of the same kind and machine from before; for
+            trajectories also background, heldout and radiation, see
             `diagnosis.procedure.diagnose`; for an orbit response missing, see
-            `diagnosis.response.diagnose_response`.
+            `diagnosis.response.diagnose_response`, and with a reference
+            `diagnosis.before_after.diagnose_change`.
 
     Raises:
         MeasurementError: data that cannot be used, or an option without meaning for them.
         UnknownNameError: a monitor or an effect that does not exist.
     """
     response = isinstance(measurement, OrbitResponse)
+    reference: Measurement | OrbitResponse | None = options.get("reference")
+    if reference is not None and isinstance(reference, OrbitResponse) != response:
+        own, other = ("first turns", "an orbit response")[:: -1 if response else 1]
+        raise MeasurementError(
+            f"the measurement is {own} and the reference {other}: give a reference of the same kind"
+        )
     for name in _OF_TRAJECTORIES if response else ("missing",):
         if options.pop(name, None):
             kind = "an orbit response" if response else "first turns"
             raise MeasurementError(f"the option '{name}' has no meaning for {kind}; leave it out")
+    if isinstance(measurement, OrbitResponse) and isinstance(reference, OrbitResponse):
+        from tmlattice.diagnosis.before_after import diagnose_change
+
+        del options["reference"]
+        if options.pop("missing", False):
+            raise MeasurementError("the option 'missing' has no meaning beside a reference")
+        return diagnose_change(ring, reference, measurement, **options)
     if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response import diagnose_response
 
+        options.pop("reference", None)
         return diagnose_response(ring, measurement, **options)
     return diagnose_trajectories(ring, measurement, **options)

@@ -7,7 +7,7 @@ Gradients and skew gradients are fitted together, because skew ones move the tun
 """
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -217,13 +217,10 @@ def fit_steps(
         most: steps that are kept at most.
         progress: called with each step's name.
     """
-    design = state = begin(data, split)
+    design = begin(data, split)
     before = score(design, split.held)
     steps: dict[Trial, Step] = {}
-    for trial in trials:
-        progress(_title(trial))
-        state = bend(state) if trial.own else state
-        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
+    for trial, state in one_by_one(design, trials, progress):
         count = sum(family.count(data) for family in trial.families)
         steps[trial] = Step.scored(_title(trial), count, score(state, split.held))
     progress("all together")
@@ -246,6 +243,17 @@ def fit_steps(
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
     return DenseFit(design, state, tuple(kept), tuple(refused), (before, after))
+
+
+def one_by_one(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
+) -> Iterator[tuple[Trial, State]]:
+    """The state with one trial's families after another, each fitted beside those before it."""
+    for trial in trials:
+        progress(_title(trial))
+        state = bend(state) if trial.own else state
+        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
+        yield trial, state
 
 
 def _title(trial: Trial) -> str:

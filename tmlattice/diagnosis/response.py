@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.families import STEPS, Told, Trial
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
-from tmlattice.effects import apply, find, names
+from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, Misfit
@@ -82,7 +82,7 @@ def diagnose_response(
     """
     begun = time.perf_counter()
     measured = mended(ring, measured, assume)
-    trials, data = _trials(effects), response_data(ring, measured)
+    trials, data = trials_of(effects), response_data(ring, measured)
     said = consulted(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
@@ -95,18 +95,41 @@ def diagnose_response(
         fit, found, degenerate = few.fit, few.told, ()
         verdict = few.verdict
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
-    repaired = apply(ring, fit.state.at.errors.ring)
-    causes = tuple(cause for cause, _ in found)
-    good = fit.state.good
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
         **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
-    return Diagnosis(
+    causes = tuple(cause for cause, _ in found)
+    return as_diagnosis(
+        ring, fit, fit.state.at.errors.ring, found,
+        noise_estimated=False,
         verdict=verdict,
         findings=() if few is None else with_consequences(ring, few.findings, causes),
+        warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
+        degenerate=degenerate,
+        hypotheses=rows,
+        provenance=provenance(ring, options, seed, begun),
+    )  # fmt: skip
+
+
+def as_diagnosis(
+    ring: Ring, fit: DenseFit, within: Sequence[Cause], found: Sequence[Told], **told: Any
+) -> Diagnosis:
+    """What a fit of a response says, as a diagnosis.
+
+    Args:
+        ring: the design.
+        fit: with its steps.
+        within: what the ring as found has.
+        found: causes with their errors.
+        told: what else the diagnosis is to say.
+    """
+    data, good = fit.state.data, fit.state.good
+    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
+    causes = tuple(cause for cause, _ in found)
+    repaired = apply(ring, within)
+    return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
         heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
@@ -115,10 +138,7 @@ def diagnose_response(
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=None,
         sensitivity={},
-        warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
         noise=(noise_x, noise_y),
-        noise_estimated=False,
-        provenance=_provenance(ring, options, seed, begun),
         ring=ring,
         repaired=repaired,
         causes=causes,
@@ -128,9 +148,8 @@ def diagnose_response(
         refused=fit.refused,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
         priors={name: group.rms for name, group in fit.state.groups.items()},
-        degenerate=degenerate,
-        hypotheses=rows,
-    )  # fmt: skip
+        **told,
+    )
 
 
 def _view(fit: DenseFit) -> ResponseView:
@@ -139,7 +158,8 @@ def _view(fit: DenseFit) -> ResponseView:
     return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
 
 
-def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
+def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
+    """What made a diagnosis."""
     from tmlattice import __version__
 
     return {
@@ -152,16 +172,16 @@ def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> di
     }
 
 
-def _trials(effects: Sequence[str] | None) -> list[Trial]:
+def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:
     """Steps of families that may be tried."""
     if effects is None:
-        return list(STEPS)
+        return list(steps)
     wanted = set(names(effects))
     kept = [
         replace(trial, families=tuple(f for f in trial.families if wanted & set(f.effects)))
-        for trial in STEPS
+        for trial in steps
     ]
-    known = {effect for trial in STEPS for family in trial.families for effect in family.effects}
+    known = {effect for trial in steps for family in trial.families for effect in family.effects}
     known |= {name for name in names() if find(name).responds}
     if not known & wanted:
         raise MeasurementError(

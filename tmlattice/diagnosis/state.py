@@ -236,6 +236,29 @@ def linear(state: State, block: int) -> Linear:
     )  # fmt: skip
 
 
+def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
+    """What the readings say of some variables of the ring, all others with their priors taken out.
+
+    Args:
+        there: where the fit stands.
+        names: of variables.
+
+    Returns:
+        Information, and score with all these numbers at zero: their likelihood is
+        exp(score x - x information x / 2).
+    """
+    A = there.normal.matrix
+    pull = there.normal.vector + A @ there.start
+    own = np.concatenate([np.arange(len(A))[there.where[name]] for name in names])
+    spread = np.concatenate([group.basis * group.scale for group in there.groups], axis=1)
+    spread = spread[:, ~spread[own].any(axis=0)]
+    inside = spread.T @ A @ spread + np.eye(spread.shape[1])
+    across = A[own] @ spread
+    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ pull]))
+    information = A[np.ix_(own, own)] - across @ taken[:, :-1]
+    return (information + information.T) / 2, pull[own] - across @ taken[:, -1]
+
+
 class Moved(NamedTuple):
     """A state after a round, and the cost that the round was to lessen, before and after."""
 

@@ -84,8 +84,25 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 # --- the sentences --------------------------------------------------------------------------------
+def since_reference(diagnosis: Diagnosis) -> bool:
+    """Whether the findings are what changed between two orbit responses."""
+    options = diagnosis.provenance["options"]
+    return diagnosis.kind != "trajectory" and bool(options.get("reference"))
+
+
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
+    if not since_reference(diagnosis):
+        return _verdict_sentence(diagnosis)
+    if diagnosis.verdict == "nothing":
+        return (
+            "Nothing changed since the reference but what monitors, correctors and magnets drift "
+            "by anyway."
+        )
+    return f"Since the reference: {_verdict_sentence(diagnosis)}"
+
+
+def _verdict_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.findings
     if diagnosis.verdict == "named":
         many = f"{len(found)} faults: " if len(found) > 1 else ""
