@@ -34,7 +34,8 @@ from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.response import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
-from tmlattice.diagnosis.state import State, begin, bend, jump, linear, marginal, settle
+from tmlattice.diagnosis.rounds import linear, marginal, settle
+from tmlattice.diagnosis.state import State, begin, bend, jump
 from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
