@@ -29,6 +29,8 @@ from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
+from tmlattice.diagnosis.state import begin
+from tmlattice.diagnosis.strangers import strangers
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -88,7 +90,17 @@ def diagnose_response(
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
     if few is None:
-        fit = fit_steps(data, split, trials, max_effects, progress)
+        odd = strangers(begin(data, split))
+        while True:
+            if odd.any:
+                said += odd.said
+                measured = odd.without(measured)
+                data = response_data(ring, measured)
+                split = split_columns(data, holdout, np.random.default_rng(seed))
+            fit = fit_steps(data, split, trials, max_effects, progress)
+            odd = strangers(fit.state)
+            if not odd.any:
+                break
         found, degenerate = told(fit.state)
         verdict = _verdict(fit, false_alarm)
     else:
