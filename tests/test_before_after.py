@@ -115,23 +115,32 @@ def test_a_reference_of_another_kind_or_machine_is_a_sentence(small_ring, before
         diagnose(small_ring, after, reference=few)
 
 
-def test_command_report_and_json(tmp_path, before, after):
+def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
     for name, measured in (("before", before), ("after", after)):
         write_measurement(tmp_path / name, measured)
+    asked = {}
+
+    def found(ring, measured, **options):  # the work is another test's
+        asked.update(options, correctors=measured.correctors)
+        return change
+
+    monkeypatch.setattr("tmlattice.diagnosis.diagnose", found)
+    words = ["diagnose", SMALL, str(tmp_path / "after"), "--reference", str(tmp_path / "before")]
     done = CliRunner().invoke(
-        tmlattice,
-        ["diagnose", SMALL, str(tmp_path / "after"), "--reference", str(tmp_path / "before"),
-         "--out", str(tmp_path / "out")],
-        catch_exceptions=False,
-    )  # fmt: skip
+        tmlattice, [*words, "--out", str(tmp_path / "out")], catch_exceptions=False
+    )
     assert done.exit_code == 0, done.output
+    assert asked["reference"].correctors == before.correctors == asked["correctors"]
     assert "Since the reference: 2 faults" in done.output
     document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     schema = files("tmlattice") / "schemas" / "diagnosis.schema.json"
     jsonschema.validate(document, json.loads(schema.read_text()))
     assert document["provenance"]["options"]["reference"] is True
-    assert [own["element"] for own in document["findings"]] in (["qf", "QD::5"], ["QD::5", "qf"])
+    assert {own["element"] for own in document["findings"]} == {"qf", "QD::5"}
     assert "Since the reference" in (tmp_path / "out" / "report.html").read_text()
+    wrong = CliRunner().invoke(tmlattice, [*words, "--lattice-out", str(tmp_path / "r.json")])
+    assert wrong.exit_code == 2
+    assert "no meaning for a change since a reference" in wrong.output
 
 
 @pytest.mark.slow

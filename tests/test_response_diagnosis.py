@@ -22,10 +22,11 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
 from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response as simulated
-from tmlattice.measurement import read_measurement, write_measurement
+from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
+from tmlattice.observe.response_noise import learnt_noise
 from tmlattice.optics import twiss
 from tmlattice.report.plain import report_text
 
@@ -136,6 +137,39 @@ def test_a_faultless_ring_is_nothing(small_ring):
     found = diagnose(small_ring, measured)
     assert found.verdict == "nothing"
     assert not found.warnings
+
+
+def test_a_response_without_rf_step_and_noise_is_fitted_and_says_so(small_ring, measured):
+    bare = replace(measured, rf=None, noise=None)
+    found = diagnose(small_ring, bare, effects=["quadrupole_gradient"])
+    assert found.noise_estimated
+    assert max(found.noise) < 2 * 2e-8  # as simulated
+    assert found.steps[-1].heldout_rms_in_plane < 0.3 * found.steps[0].heldout_rms_in_plane
+    said = " ".join(found.warnings)
+    assert "noise of the readings is not stated" in said
+    assert "there is no RF step" in said
+    json.dumps(found.as_json(), allow_nan=True)
+    assert "nan" not in report_text(found)
+
+
+@pytest.mark.parametrize("noise", [2e-8, 5e-7])
+def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noise):
+    exact = ResponseModel(small_ring)
+    monitors = [m.name for m in small_ring.monitors]
+    names = [f"v{i}" for i in range(16)]
+    orbits = 1e-5 * exact.response(names)
+    read = orbits + noise * rng.standard_normal(orbits.shape)
+    measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
+    assert 0.6 < learnt_noise(measured)[0, 1] / noise < 1.5  # of 16 columns
+
+
+def test_readings_that_resemble_nothing_are_named_and_left_out(small_ring, measured, rng):
+    response = measured.response.copy()
+    response[:, 6, 1] = rng.permutation(response[:, 6, 1])
+    found = diagnose(small_ring, replace(measured, response=response))
+    assert any(f"{measured.monitors[6]} in y" in said for said in found.warnings)
+    good = diagnose(small_ring, measured)
+    assert found.steps[-1].heldout_rms_in_plane < 2 * good.steps[-1].heldout_rms_in_plane
 
 
 def test_what_the_fit_may_not_mend_is_warned_about(small_ring):

@@ -32,7 +32,7 @@ from tmlattice.diagnosis.families import (
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
-from tmlattice.diagnosis.response import as_diagnosis, provenance, trials_of
+from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, trials_of
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.diagnosis.rounds import linear, marginal, settle
 from tmlattice.diagnosis.state import State, begin, bend, jump
@@ -117,6 +117,7 @@ def diagnose_change(
     said += _lost(before, after)
     before, after = alike(ring, before, after)
     first, second = response_data(ring, before), response_data(ring, after)
+    said += assumed_of(after, second)
     progress("the reference")
     rng = np.random.default_rng(seed)
     fitted = _reference(first, split_columns(first, holdout, rng))

@@ -273,6 +273,11 @@ def _inner(state: State) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(rms), axis=0)))
 
 
+def _lost(without: Array, inner: Array) -> float:
+    """By how much the judges' figures rise; those that nobody read (no RF step) say nothing."""
+    return float(np.nansum(JUDGES * np.log(without / np.maximum(inner, 1e-300))))
+
+
 def _worth(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, float], dict[Trial, State]]:
@@ -294,7 +299,7 @@ def _worth(
         good = state.good & without.good
         with_it = evidence if (good == state.good).all() else log_evidence(state, good)
         gained = with_it - log_evidence(without, good) - LEAST
-        lost = float(JUDGES @ np.log(_inner(without) / np.maximum(inner, 1e-300)))
+        lost = _lost(_inner(without), inner)
         log.info("without %s: evidence %+.1f, judges %+.3f", _title(trial), -gained, lost)
         worth[trial] = min(gained, lost) if _asked(trial) and lost < -VETO else gained
     return worth, states
@@ -329,8 +334,7 @@ def _quickly(
         other, values = linear_evidence(there, _priors(trial, state))
         worth[trial] = evidence - other - LEAST
         try:
-            without = _inner(state.moved({**state.values, **values}))
-            lost = float(JUDGES @ np.log(without / np.maximum(inner, 1e-300)))
+            lost = _lost(_inner(state.moved({**state.values, **values})), inner)
         except TmlatticeError:  # no closed orbit without it
             lost = np.inf
         against[trial] = _asked(trial) and lost < -VETO

@@ -38,7 +38,7 @@ from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import ResponseData, response_data, split_columns
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,8 @@ def diagnose_response(
 
     Args:
         ring: the design.
-        measured: with an RF step, and the noise of its readings.
+        measured: with an RF step, if it can be, and the noise of its readings; else that is
+            learnt.
         holdout: share of the correctors that is never fitted.
         effects: only families of these are tried; else all.
         max_effects: steps that are kept at most.
@@ -78,14 +79,14 @@ def diagnose_response(
         progress: called with the name of each stage.
 
     Raises:
-        MeasurementError: no RF step, no noise, too few correctors, or effects that have no family.
+        MeasurementError: too few correctors, or effects that have no family.
         UnknownNameError: an effect or a monitor that does not exist.
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
     measured = mended(ring, measured, assume)
     trials, data = trials_of(effects), response_data(ring, measured)
-    said = consulted(ring, measured)
+    said = [*consulted(ring, measured), *assumed_of(measured, data)]
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
@@ -115,7 +116,7 @@ def diagnose_response(
     causes = tuple(cause for cause, _ in found)
     return as_diagnosis(
         ring, fit, fit.state.at.errors.ring, found,
-        noise_estimated=False,
+        noise_estimated=measured.noise is None,
         verdict=verdict,
         findings=() if few is None else with_consequences(ring, few.findings, causes),
         warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
@@ -123,6 +124,23 @@ def diagnose_response(
         hypotheses=rows,
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
+
+
+def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
+    """What the measurement does not say, and what is taken instead."""
+    said = []
+    if measured.noise is None or np.isnan(measured.noise).any():
+        x, y = (f"{1e6 * size:.2g} µm" for size in np.median(data.noise, axis=0))
+        said.append(
+            f"the noise of the readings is not stated; from what neighbouring monitors leave it is "
+            f"{x} in x and {y} in y (a jitter of the beam is not in it)"
+        )
+    if measured.rf is None or measured.rf.orbit is None:
+        said.append(
+            "there is no RF step: dispersion is not known, and only what is usual tells the scale "
+            "of all correctors from that of all monitors"
+        )
+    return said
 
 
 def as_diagnosis(

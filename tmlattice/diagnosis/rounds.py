@@ -264,9 +264,12 @@ def linear_evidence(
         rounds: of EM for the priors.
     """
     left = [group for group in there.groups if group.name not in gone]
-    found = solve(there.normal, left, there.start, rounds=rounds)
-    moved = found.values - there.start
+    found = solve(there.normal, left, there.start, rounds=rounds) if left else None
+    nothing = np.zeros_like(there.start)
+    moved = (nothing if found is None else found.values) - there.start
     total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
+    if found is None:
+        return total, {name: nothing[rows] for name, rows in there.where.items()}
     total += found.occam
     for rows in there.where.values():
         groups = [g for g in found.groups if g.basis[rows].any()]

@@ -160,8 +160,9 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 
 def rms_of(parts: Iterable[Array]) -> float:
-    """Over all of them."""
-    return float(np.sqrt(np.mean(np.square(np.concatenate(list(parts))))))
+    """Over all of them; NaN where there is none."""
+    values = np.concatenate(list(parts))
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
 def amplitudes(patterns: Array, data: Array, near: Flags, far: Flags) -> tuple[Array, Array]:

@@ -88,14 +88,15 @@ def response_change(
     model = ResponseModel(ring)
     response = model.response(columns)[:, before.at] * kicks[:, None, None]
     rf = before.measured.rf
-    assert rf is not None
-    orbit = model.rf_change(before.kicks[-1])[before.at]
+    if rf is not None and rf.orbit is not None:
+        orbit = model.rf_change(before.kicks[-1])[before.at]
+        rf = replace(rf, orbit=orbit + change[-1])
     measured = replace(
         before.measured,
         kicks=kicks,
         response=response + change[:-1],
         noise=noise,
-        rf=replace(rf, orbit=orbit + change[-1]),
+        rf=rf,
     )
     return ring, measured
 

@@ -22,7 +22,7 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
             f"{1e6 * step.heldout_rms_position:.3g}",
             f"{1e6 * step.heldout_rms_coupling:.3g}",
             f"{1e6 * step.heldout_rms_roll:.3g}" if np.isfinite(step.heldout_rms_roll) else "",
-            f"{1e6 * step.dispersion_rms:.3g}",
+            f"{1e6 * step.dispersion_rms:.3g}" if np.isfinite(step.dispersion_rms) else "",
             f"{step.heldout_chi2_per_dof:.3g}",
         )
         for step in steps

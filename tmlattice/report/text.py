@@ -139,8 +139,13 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
         "µm, that of held-out ones from "
         f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
         f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
-        f"{1e6 * last.heldout_rms_coupling:.1f} µm, and that of the RF's response from "
-        f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+        f"{1e6 * last.heldout_rms_coupling:.1f} µm"
+        + (
+            ", and that of the RF's response from "
+            f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+            if np.isfinite(last.dispersion_rms)
+            else "."
+        )
     )
 
 
