@@ -28,6 +28,7 @@ from tmlattice.diagnosis.families import STEPS, Told, Trial
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
+from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.diagnosis.state import begin
 from tmlattice.diagnosis.strangers import strangers
@@ -122,6 +123,7 @@ def diagnose_response(
         warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
         hypotheses=rows,
+        reasons=None if few is not None else explain_gradients(fit.state),
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
 
