@@ -190,11 +190,17 @@ def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.argument("lattice", default="petra3")(lattice_options(function))
 
 
+def change_option(
+    default: float | None, text: str
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """--change, of the magnet that an experiment weakens."""
+    return click.option("--change", type=float, default=default, help=text,
+                        show_default=default is not None)  # fmt: skip
+
+
 def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """What `tune-fit` and its study share: the perturbation, the measurement, the fit."""
     for decorate in reversed((
-        click.option("--change", type=float, default=-0.2, show_default=True,
-                     help="Relative change of the magnet's strength."),
         click.option("--launch", type=LAUNCH, default="1e-3,0,1e-3,0", show_default=True,
                      help="State at the start of the ring, m and rad."),
         click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True,
