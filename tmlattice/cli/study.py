@@ -8,6 +8,7 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
     change_option,
     console,
     json_option,
@@ -45,7 +46,7 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
         return number
 
 
-@study.command("tune-fit")
+@study.command("tune-fit", cls=Careful)
 @lattice_argument
 @click.option(
     "--magnets",
@@ -153,7 +154,7 @@ def tune_fit(
         _print(summary)
 
 
-@study.command("localisation")
+@study.command("localisation", cls=Careful)
 @lattice_argument
 @click.option(
     "--cases",

@@ -20,6 +20,7 @@ from tmlattice.cli.options import (
     quiet_option,
     recipe_options,
     table,
+    table_options,
     trajectories,
 )
 
@@ -45,7 +46,8 @@ if TYPE_CHECKING:
     "--measurement",
     type=FILE,
     metavar="DIR",
-    help="Fit these data, a measurement folder, and change no magnet; all shots together.",
+    help="Fit these data, a measurement folder or a file of readings, and change no magnet; all "
+    "shots together.",
 )
 @click.option(
     "--regularization",
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
     "the ring unstable.",
 )
 @recipe_options
+@table_options
 @json_option
 @quiet_option
 def tune_fit(
@@ -85,6 +88,8 @@ def tune_fit(
     json_file: Path | None,
     quiet: bool,
     methods: tuple[str, ...],
+    map_file: Path | None,
+    unit: str | None,
     **options: Any,
 ) -> None:
     """Predict the tunes of a perturbed ring from one first-turn orbit.
@@ -113,10 +118,11 @@ def tune_fit(
             ring = open_ring(lattice, sequence, energy)
             outcome = run(ring, progress=not quiet, **options)
         else:
-            data = trajectories(
-                measurement, "; tune-fit takes a trajectory, the first turn of a beam"
-            )
             ring = open_ring(lattice, sequence, energy)
+            refusal = "; tune-fit takes a trajectory, the first turn of a beam"
+            data = trajectories(
+                measurement, refusal, ring, map_file=map_file, unit=unit, quiet=quiet
+            )
             outcome = _fit(ring, data, measurement, quiet, options)
         written = _draw(outcome, folder)
         result = outcome.as_json()

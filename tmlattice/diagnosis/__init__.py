@@ -6,41 +6,78 @@
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 
+from collections.abc import Mapping
 from typing import Any
 
+from tmlattice.diagnosis.kinds import Measured, kind_of
 from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement import Measurement, OrbitResponse, in_words
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"]
 
-_OF_TRAJECTORIES = ("reference", "background", "heldout", "radiation")
+_OPTIONS = {
+    "first turns": ("reference", "background", "heldout", "radiation"),
+    "an orbit response": ("missing",),
+    "several measurements, or those of a stored beam": ("reference", "background"),
+}
+_OWN = {name for names in _OPTIONS.values() for name in names}
 
 
-def diagnose(ring: Ring, measurement: Measurement | OrbitResponse, **options: Any) -> Diagnosis:
+def diagnose(
+    ring: Ring, measurement: Measured | Mapping[str, Measured], **options: Any
+) -> Diagnosis:
     """Where the gap between a ring and its measurement lies, what causes it, how far it shrinks.
 
     Args:
         ring: the design.
-        measurement: first turns (or a few turns) of one or more shots, or an orbit response.
-        options: for both kinds holdout, effects, max_effects, false_alarm, seed and progress; for
-            trajectories also reference, background, heldout and radiation, see
-            `diagnosis.procedure.diagnose`; for an orbit response missing, see
-            `diagnosis.response.diagnose_response`.
+        measurement: of any kind; or several of one machine by name, which are diagnosed together.
+        options: for every kind holdout, effects, max_effects, false_alarm, assume, seed and
+            progress; for first turns also reference, background, heldout and radiation, see
+            `diagnosis.procedure.diagnose`; for an orbit response alone missing, see
+            `diagnosis.response.diagnose_response`; for several, and for those of a stored beam,
+            reference and background, see `diagnosis.joint.diagnose_together`.
 
     Raises:
         MeasurementError: data that cannot be used, or an option without meaning for them.
         UnknownNameError: a monitor or an effect that does not exist.
     """
-    response = isinstance(measurement, OrbitResponse)
-    for name in _OF_TRAJECTORIES if response else ("missing",):
+    measurement = _alone(measurement)
+    if isinstance(measurement, Measurement):
+        of = "first turns"
+    elif isinstance(measurement, OrbitResponse):
+        of = "an orbit response"
+    else:
+        of = "several measurements, or those of a stored beam"
+    for name in sorted(_OWN - set(_OPTIONS[of])):
         if options.pop(name, None):
-            kind = "an orbit response" if response else "first turns"
-            raise MeasurementError(f"the option '{name}' has no meaning for {kind}; leave it out")
+            raise MeasurementError(f"the option '{name}' has no meaning for {of}; leave it out")
+    if isinstance(measurement, Measurement | OrbitResponse) and "reference" in options:
+        before = options["reference"] = _alone(options["reference"])
+        if before is not None and type(before) is not type(measurement):
+            raise MeasurementError(
+                f"the reference is {in_words(before)}; give {of}, as it was measured"
+            )
+    if isinstance(measurement, Measurement):
+        return diagnose_trajectories(ring, measurement, **options)
     if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response import diagnose_response
 
         return diagnose_response(ring, measurement, **options)
-    return diagnose_trajectories(ring, measurement, **options)
+    from tmlattice.diagnosis.joint import diagnose_together
+
+    if not isinstance(measurement, Mapping):
+        measurement = {kind_of(measurement): measurement}
+    before = options.pop("reference", None)
+    if before is not None and not isinstance(before, Mapping):
+        before = {kind_of(before): before}
+    return diagnose_together(ring, measurement, reference=before, **options)
+
+
+def _alone(measured: Any) -> Any:
+    """One measurement that stands in a mapping, itself."""
+    if isinstance(measured, Mapping) and len(measured) == 1:
+        return next(iter(measured.values()))
+    return measured

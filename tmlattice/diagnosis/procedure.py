@@ -203,14 +203,14 @@ def _told(
 ) -> _Told:
     result, problem, left = explanation.fit, turns_of(explanation), explanation.left
     findings = findings_of(ring, explanation, ready.dead, judgement)
-    p_value = float(chi2.sf(result.chi2, freedom(problem.data, result)))
+    p_value = float(chi2.sf(result.chi2, freedom(problem, result)))
     verdict, standing, said = verdict_of(explanation, findings, p_value, ready.estimated, judgement)
     if verdict == "nothing" and small is not None and small.evidence is not None:
         verdict = "distributed"  # the gap has a cause: many small ones
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         result, left = explanation.before, explanation.first_kicks
         problem = ready.problem if small is None else small.problem
-        p_value = float(chi2.sf(result.chi2, freedom(problem.data, result)))
+        p_value = float(chi2.sf(result.chi2, freedom(problem, result)))
     elif result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     fits = [explanation.before, result] if result.causes or result.kicks else [explanation.before]

@@ -17,9 +17,9 @@ from tmlattice.diagnosis.prepare import Prepared
 from tmlattice.effects import Cause, background_rms, find
 from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.problem import Problem
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.lattice import Ring
-from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import turns_of
 from tmlattice.observe.noise import local_misfit
 
@@ -102,7 +102,7 @@ def _crowded(ready: Prepared) -> bool:
 def _explained(found: Explanation, ready: Prepared) -> bool:
     """Whether few causes leave nothing but noise."""
     more, _ = ready.problem.judgement.noise
-    p_value = chi2.sf(found.fit.chi2, freedom(turns_of(found).data, found.fit))
+    p_value = chi2.sf(found.fit.chi2, freedom(found.problem, found.fit))
     return bool(p_value >= more)
 
 
@@ -179,17 +179,15 @@ def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Caus
         tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
         return (tried, tried.causes) if tried.good else None
     found = explanation.fit
-    left = chi2.sf(found.chi2, freedom(turns_of(explanation).data, found))
+    left = chi2.sf(found.chi2, freedom(explanation.problem, found))
     if not (explanation.monitors or (found.causes and (explanation.count > 1 or left < 0.01))):
         return None
     # the others may be the background's
     return found, (_strongest(explanation),) if explanation.named else ()
 
 
-def freedom(data: Data, result: Fit) -> int:
+def freedom(problem: Problem, result: Fit) -> int:
     """Degrees of freedom: readings and priors, less what was fitted."""
-    free = data.launch_sigma > 0
-    priors = int((free & np.isfinite(data.launch_sigma)).sum())
     amounts = sum(not find(cause.effect).discrete for cause in result.causes)
     kicks = sum(len(values) for values in result.kicks.values())
-    return max(int(data.valid.sum()) + priors - int(free.sum()) - amounts - kicks, 1)
+    return max(problem.freedom - amounts - kicks, 1)

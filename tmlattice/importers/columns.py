@@ -81,7 +81,7 @@ def _csv(path: Path) -> list[Column]:
     )  # fmt: skip
     rows = [(i, [field.strip() for field in cut(line)]) for i, line in lines]
     header = rows.pop(0)[1]
-    if above and all(_is_number(field) for field in header if field):
+    if above and any(_is_number(field) for field in header):
         rows.insert(0, (lines[0][0], header))
         header = [field.strip() for field in cut(above[-1])]
     for line, row in rows:

@@ -92,7 +92,7 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
         readings[where] = value
     left = [device for device in devices if monitor.get(device) is None]
     bad = sorted({names[at] for at in finder.bad if np.isfinite(readings[:, :, at]).any()})
-    readings[:, :, sorted(finder.bad)] = np.nan
+    taken[:, :, sorted(finder.bad)] = False
     read = np.flatnonzero(taken.any(axis=(0, 1, 3)))
     noise = None if told.noise is None else np.full((len(read), 2), told.noise)
     data = Measurement(
@@ -327,7 +327,7 @@ class _Finder:
         return found
 
     def _same(self, device: str, at: int) -> bool:
-        return _norm(device) == _norm(self._names[at])
+        return _norm(device) in (_norm(self._names[at]), *self._told)
 
     def _find(self, device: str) -> int | None:
         plain = _norm(device)

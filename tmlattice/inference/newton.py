@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 SHRINK = (1.0, 0.5, 0.25, 0.0625)
 """Shares of a step that are tried, until one makes things better."""
 
+UNSEEN = 1e-12
+"""Information about an amount below which these readings do not see it: its error would be a
+million, in any unit."""
+
 
 class Outcome(StrEnum):
     """How a fit ended; all but the first are told to whoever reads the result."""
@@ -267,6 +271,8 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         log_evidence += problem.amounts.log_density(cause)
     if named:
         full = gram + np.diag(_pulls(problem, point, len(rows))[0])
+        if (np.diagonal(full)[: len(named)] < UNSEEN).any():
+            return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
         size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
         scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))
         inverse = np.linalg.inv(scaled) / size[:, None] / size

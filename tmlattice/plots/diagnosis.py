@@ -12,6 +12,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
+from tmlattice.plots.parts import plot_parts
 from tmlattice.plots.readings import AFTER, BEFORE, mark, plot_readings, readings_caption
 from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import lattice_strip
@@ -35,8 +36,7 @@ WIDE = 300.0
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
-    own = _trajectory_figures if diagnosis.kind == "trajectory" else response_figures
-    yield from own(diagnosis)
+    yield from (response_figures if diagnosis.by_steps else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         if len(finding.remedies) > 1:
             height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
@@ -49,12 +49,16 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
             )
 
 
-def _trajectory_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
-    yield (
-        "readings",
-        readings_caption(diagnosis),
-        plot_readings(diagnosis),
-    )
+def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
+    if not diagnosis.parts:
+        yield "readings", readings_caption(diagnosis), plot_readings(diagnosis)
+    elif any(np.isfinite(part.left).any() for part in diagnosis.parts):
+        yield (
+            "readings",
+            "What is left at each monitor in units of the noise, of each measurement, with the "
+            "design and with what was found.",
+            plot_parts(diagnosis),
+        )
     yield (
         "scan",
         "How much better each hypothesis alone explains the data (fall of chi-square), along the "
@@ -176,11 +180,11 @@ def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
     explanation = diagnosis.explanation
     rate = diagnosis.provenance["options"]["false_alarm"]
     free = explanation.first_kicks
+    named = explanation.first.threshold(rate * DEFAULT.shares["named"])
+    if not len(free.places):
+        return named, named
     freedom = max(int(np.median(free.freedom)), 1)
-    return (
-        explanation.first.threshold(rate * DEFAULT.shares["named"]),
-        free_threshold(rate * DEFAULT.shares["kick"], freedom, len(free.places)),
-    )
+    return named, free_threshold(rate * DEFAULT.shares["kick"], freedom, len(free.places))
 
 
 def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
@@ -190,10 +194,11 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     groups = np.array([find(effect).group for effect, _ in found.hypotheses])
     layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
     order = np.argsort(layers)
-    ax.plot(
-        layers[order], np.maximum(free.statistic[order], FLOOR),
-        color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
-    )  # fmt: skip
+    if len(order):
+        ax.plot(
+            layers[order], np.maximum(free.statistic[order], FLOOR),
+            color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
+        )  # fmt: skip
     for name, colour in COLOURS.items():
         own = (groups == name) & np.isfinite(s) & (found.statistic > FLOOR)
         if own.any():
@@ -205,7 +210,9 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     ax.axhline(
         named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
     )
-    ax.axhline(kicks, color="0.5", linestyle=":", linewidth=1.2, label=f"of free kicks {kicks:.1f}")
+    if len(order):
+        label = f"of free kicks {kicks:.1f}"
+        ax.axhline(kicks, color="0.5", linestyle=":", linewidth=1.2, label=label)
     ax.set_ylabel("fall of chi-square")
     ax.grid(alpha=0.25)
 
@@ -309,8 +316,9 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     else:
         ax.set_ylim(0, 1.18 * max(rms.max(), noise))
     shots = ", ".join(map(str, diagnosis.heldout_shots))
+    title = f"Held-out shots {shots}" if shots else "Held-out readings"
     ax.set_ylabel("held-out readings less model,\nrms [µm]")
-    ax.set_title(f"Held-out shots {shots}", loc="left", fontsize="medium")
+    ax.set_title(title, loc="left", fontsize="medium")
     ax.legend(loc="upper right", fontsize="small")
     ax.grid(axis="y", alpha=0.25)
     return ax
