@@ -1,12 +1,16 @@
 """A stored beam of the virtual machine: turns, closed orbits, dispersion, tunes, against AT's own
 tools and against one another."""
 
+from pathlib import Path
+
 import at
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from tmlattice import Cause, load_ring
+from tmlattice import Cause, load_ring, read_measurement
+from tmlattice.cli.command import tmlattice
 from tmlattice.errors import LatticeError, TmlatticeError, UnstableRingError
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
@@ -16,6 +20,7 @@ from tmlattice.machine.stored_beam import (
     simulate_tunes,
     simulate_turns,
 )
+from tmlattice.measurement import ClosedOrbit, Dispersion, TuneReading, TurnByTurn, read_truth
 from tmlattice.observe.spectra import lines
 
 CAUSES = [
@@ -239,3 +244,61 @@ def test_truth_says_what_was_done(tiny):
 def test_what_cannot_be_is_a_sentence(tiny, run, error, words):
     with pytest.raises(error, match=words):
         run(tiny)
+
+
+SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
+
+
+def command(*words):
+    return CliRunner().invoke(tmlattice, ["simulate", SMALL, *map(str, words)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "table", "record"),
+    [
+        ("turn-by-turn", ["--turns", "32", "--shots", "2", "--amplitude", "1e-4"], "readings.csv",
+         TurnByTurn),
+        ("closed-orbit", ["--shots", "2", "--noise", "1e-6"], "readings.csv", ClosedOrbit),
+        ("dispersion", ["--rf-step", "200", "--one-sided"], "readings.csv", Dispersion),
+        ("tunes", ["--noise", "1e-4"], "tunes.csv", TuneReading),
+    ],
+)  # fmt: skip
+def test_command_writes_each_kind(tmp_path, kind, words, table, record):
+    folder, truth = tmp_path / "m", tmp_path / "truth.json"
+    done = command("--kind", kind, *words, "--effect", "quadrupole_gradient QF::3 0.01",
+                   "--seed", "3", "--out", folder, "--truth", truth)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert table in done.output
+    measured = read_measurement(folder)
+    assert type(measured) is record
+    assert read_truth(truth).effects[0]["amount"] == 0.01
+    assert not any("QF" in file.read_text() for file in folder.iterdir())
+
+
+def test_command_has_the_kinds_own_defaults(tmp_path, small_ring):
+    done = command("--kind", "turn-by-turn", "--amplitude", "1e-4", "--out", tmp_path / "m")
+    assert done.exit_code == 0, done.output
+    assert read_measurement(tmp_path / "m").readings.shape == (1, 1000, 35, 2)
+    done = command("--kind", "tunes", "--noise", "3e-4", "--out", tmp_path / "t")
+    measured = read_measurement(tmp_path / "t")
+    assert measured.tune_error.tolist() == [[3e-4, 3e-4]]
+    assert_allclose(
+        measured.tune, simulate_tunes(small_ring, noise=(0, 0)).measured.tune, atol=2e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--kind", "tunes", "--turns", "30"], "--turns has no meaning for --kind tunes"),
+        (["--kind", "closed-orbit", "--engine", "ocelot"], "--engine has no meaning"),
+        (["--particles", "10"], "take it out, or give --kind turn-by-turn"),
+        (["--kind", "turn-by-turn", "--emittance", "1e-9"], "give two emittances in m rad"),
+        (["--kind", "dispersion", "--kick", "1e-4"], "or give --kind orbit-response"),
+    ],
+)
+def test_options_of_other_kinds_are_refused(tmp_path, words, said):
+    done = command(*words, "--out", tmp_path / "m")
+    assert done.exit_code == 2
+    assert said in " ".join(done.output.replace("│", " ").split())
+    assert not (tmp_path / "m").exists()
