@@ -203,8 +203,8 @@ def test_what_is_known_is_written_beside_the_lattice(small_ring, monday, tmp_pat
     from tmlattice.lattice import save_ring
 
     save_ring(small_ring, tmp_path / "ring.json")
-    write_measurement(tmp_path / "monday", _turns(small_ring, small))
-    write_measurement(tmp_path / "tuesday", _turns(small_ring, small, seed=99))
+    write_measurement(tmp_path / "monday", _orbit(small_ring, small))
+    write_measurement(tmp_path / "tuesday", _orbit(small_ring, small, seed=99))
     tmlattice(
         "diagnose", "ring.json", "monday", "--lattice-out", "twin.json", "-q", cwd=tmp_path, check=0
     )
