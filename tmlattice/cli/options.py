@@ -53,6 +53,7 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
 LAUNCH = Numbers(
     "x,px,y,py", " is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0"
 )
+EMITTANCE = Numbers("X,Y", ": give two emittances in m rad, such as 1e-9,1e-11", least=0.0)
 LAUNCH_SIGMA = Numbers(
     "X,PX,Y,PY,DELTA", ": give five rms values, such as 1e-4,2e-5,1e-4,2e-5,0", least=0.0
 )
