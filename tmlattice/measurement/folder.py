@@ -4,6 +4,7 @@ The shots, or the columns of an orbit response, stand in `measurement.json`; wha
 in `readings.csv`, or `response.csv`. Numbers are written so that they read back bit by bit.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.errors import MeasurementError, UnknownNameError, plain
 from tmlattice.measurement.documents import check_table, located, read_document
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
@@ -31,6 +32,8 @@ FORMAT = "tmlattice-measurement"
 READINGS = ("shot", "turn", "monitor", "x", "y")
 RESPONSE = ("corrector", "monitor", "x", "y")
 RF = "rf"
+FEWEST, MOST_UNREAD = 100, 10
+"""Shots that may be listed without a reading: so many, and so many times those that were read."""
 
 
 def read_measurement(
@@ -95,6 +98,12 @@ def _trajectory(
             "add it there, or take the row out",
         )  # fmt: skip
     names, place = match_names(rows, "monitor", monitors)
+    read = len(np.unique(order))
+    if len(shots) > FEWEST + MOST_UNREAD * read:  # before anything is laid out for them
+        raise MeasurementError(
+            f"{file}: it lists {len(shots)} shots, and {rows.path.name} has readings of {read}; "
+            "take the others out"
+        )
     readings = dense(rows, order, len(shots), place, len(names))
     check_table(document, rows.path)  # what is wrong in a line is told with the line
     with located(file):
@@ -203,6 +212,13 @@ def _read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) ->
             every[name]  # an UnknownNameError where the ring has no such monitor
     names = Names("monitor", read)
     there = {name: _pair(entry) for name, entry in noise.items() if names.find(name) is not None}
+    unread = [name for name in table.names if names.find(name) is None]
+    if unread and known is None:
+        warnings.warn(
+            f"the noise names {len(unread)} monitors of which nothing was read, such as "
+            f"'{plain(unread[0], 60)}'; mend the name where it should be another",
+            stacklevel=2,
+        )
     return noise_table(there, read)
 
 
