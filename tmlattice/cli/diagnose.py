@@ -1,5 +1,6 @@
 """`tmlattice diagnose`: where the gap lies, what causes it, how far it shrinks."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ from tmlattice.cli.options import (
     console,
     json_option,
     lattice_options,
+    no_numbers,
     open_ring,
     quiet_option,
     read_data,
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
     from tmlattice.inference.among import Known
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
+
+log = logging.getLogger(__name__)
 
 
 @click.command("diagnose", cls=Careful)
@@ -355,6 +359,9 @@ def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
         return run(ring, data, **options)
     except (MeasurementError, UnknownNameError) as error:
         raise MeasurementError(f"{where}: {error}") from error
+    except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:  # singular, lost
+        log.info("the numbers of a measurement", exc_info=True)
+        raise MeasurementError(f"{where}: {no_numbers(error)}") from error
 
 
 @contextmanager
