@@ -143,7 +143,38 @@ def before_and_after(result):
     return figure
 
 
-MAKERS = (diagnosis, credible, tunes, optics, response, real_ring)
+def report():
+    """The top of the page of a diagnosis, as Chromium shows it; needs playwright."""
+    import shutil
+    from tempfile import TemporaryDirectory
+
+    from playwright.sync_api import sync_playwright
+
+    from tmlattice.report.page import draw, page
+
+    faults = [
+        Cause("quadrupole_gradient", "qd::12", -0.05),
+        Cause("corrector_kick_x", "hcor_a4_3", 1e-4),
+        Cause("monitor_gain_x", "bpm_a6_u1_6", 0.2),
+    ]
+    result = tmlattice.diagnose(petra3(), tmlattice.simulate(petra3(), faults).measurement())
+    with TemporaryDirectory() as place, sync_playwright() as driver:
+        file = Path(place) / "report.html"
+        shown = {**result.provenance, "measurement": "day_1"}
+        file.write_text(page(result, draw(result, file.parent), shown), encoding="utf-8")
+        browser = driver.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
+        tab = browser.new_page(viewport={"width": 1100, "height": 760})
+        tab.goto(file.as_uri())
+        tab.wait_for_timeout(500)
+        tab.screenshot(path=file.with_suffix(".png"))
+        figure = plt.figure(figsize=(11, 7.6))
+        figure.figimage(plt.imread(file.with_suffix(".png")))
+        yield "report", figure
+
+
+MAKERS = (diagnosis, credible, tunes, optics, response, report, real_ring)
 
 
 def main(names):

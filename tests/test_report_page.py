@@ -59,7 +59,9 @@ def together(small_ring, tmp_path_factory):
                      noise=2e-6).measurement()  # fmt: skip
     beam = StoredBeam(ResponseModel(apply(small_ring, [WEAK])))
     tunes = TuneReading(tune=beam.tunes[None], tune_error=np.full((1, 2), 1e-4))
-    return written(diagnose(small_ring, {"turns": turns, "tunes": tunes}), tmp_path_factory.mktemp("together"))
+    return written(
+        diagnose(small_ring, {"turns": turns, "tunes": tunes}), tmp_path_factory.mktemp("together")
+    )
 
 
 @pytest.fixture(scope="module")
