@@ -1,9 +1,9 @@
 """What a new user waits for: `python benchmarks/first_minute.py`.
 
-A fresh virtual environment, the package's own install with `constraints.txt` and without extras, its
-size and seconds, the largest packages; then the README's first commands in an empty folder with an
-empty cache, and again. Seconds of the clock: packages come from the registry or from pip's cache,
-and the machine may be shared. Prints the table of docs/results/first_minute.md.
+A fresh virtual environment, the package's own install with `constraints.txt` and without extras,
+its size and seconds, the largest packages; then the README's first commands in an empty folder with
+an empty cache, and again. Seconds of the clock: packages come from the registry or from pip's
+cache, and the machine may be shared. Prints the table of docs/results/first_minute.md.
 """
 
 import os
