@@ -51,8 +51,17 @@ class MeasurementError(TmlatticeError):
     """A measurement that does not fit the ring, or is not a measurement."""
 
 
+class ChoiceError(TmlatticeError, ValueError):
+    """A word for which there is a list, and that is not on it; the message gives the list."""
+
+
 class EffectError(TmlatticeError):
     """An effect that cannot be as it was asked for."""
+
+
+def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError:
+    """The error for a word that is none of a short list; all of them are named."""
+    return ChoiceError(f"no {kind} '{name}'; there are {', '.join(known)}")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:

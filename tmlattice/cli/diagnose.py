@@ -18,6 +18,8 @@ from tmlattice.cli.options import (
     lattice_options,
     open_ring,
     quiet_option,
+    read_data,
+    table_options,
 )
 
 if TYPE_CHECKING:
@@ -45,17 +47,17 @@ if TYPE_CHECKING:
     type=FILE,
     metavar="DIR",
     multiple=True,
-    help="A measurement of the same machine before the fault: static errors cancel. Repeat it "
-    "where several are diagnosed together.",
+    help="A measurement of the same machine and kind before the fault: static errors cancel, and "
+    "what changed is told. Repeat it where several are diagnosed together.",
 )
 @background_option("Small errors everywhere (not given: the data say)")
 @assume_option
 @click.option(
     "--max-effects",
     type=click.IntRange(1),
-    default=8,
-    show_default=True,
-    help="Findings at most; of an orbit response, steps that are kept at most.",
+    default=None,
+    help="Findings at most; of an orbit response, steps that are kept at most. 8 where nothing is "
+    "said, 40 of a change between two responses.",
 )
 @click.option(
     "--effects",
@@ -98,6 +100,7 @@ if TYPE_CHECKING:
     "the machine as found, make it the design again (a quadrupole that gives 20 % less is told "
     "25 % more). What no setting mends is printed.",
 )
+@table_options
 @json_option
 @click.option(
     "--out",
@@ -123,12 +126,16 @@ def diagnose(
     out: Path | None,
     quiet: bool,
     holdout: float | None,
+    map_file: Path | None,
+    unit: str | None,
     **options: Any,
 ) -> None:
     """Say where the ring differs from LATTICE, by which effect, and how far the gap shrinks.
 
     MEASUREMENT is a folder, as `tmlattice simulate` writes it: first turns, turns of a stored beam,
-    a closed orbit, dispersion, tunes, an orbit response. Several of one machine are diagnosed
+    a closed orbit, dispersion, tunes, an orbit response; or a file of first turns as a control room
+    has it (.csv, .txt, .h5, .sdds), its columns taken as they come and what is assumed of them
+    said. Several of one machine are diagnosed
     together. The verdict is one of named, equivalent (several explanations fit alike), located
     (something is there that the catalogue does not explain), distributed (no single place) and
     nothing; the exit code is 0 for each of them. An orbit response alone ends in a step for each
@@ -146,7 +153,9 @@ def diagnose(
         background_rms(dict(background))
         from tmlattice.measurement import Measurement, OrbitResponse
 
-        data, before = _read(measurements), _read(references)
+        ring = open_ring(lattice, sequence, energy)
+        told = (map_file, unit, quiet)
+        (data, said), (before, _) = (_read(p, ring, *told) for p in (measurements, references))
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
         turns = isinstance(first, Measurement) and not more
@@ -157,13 +166,19 @@ def diagnose(
             _refuse(what, network=network, radiation=options.pop("radiation"))
         if response:
             options["missing"] = missing
+            if before:
+                _refuse(
+                    "a change since a reference", missing=missing, lattice_out=lattice_out,
+                    repaired_out=repaired_out,
+                )  # fmt: skip
         else:
             _refuse("anything but an orbit response alone", missing=missing)
             options["background"] = dict(background) or None
         if before:
             options["reference"] = before
+        if options["max_effects"] is None:
+            del options["max_effects"]
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
-        ring = open_ring(lattice, sequence, energy)
         if lattice_out and lattice_out == repaired_out:
             raise click.UsageError(f"--lattice-out and --repaired-out are both '{lattice_out}'")
         for option, path in (("lattice", lattice_out), ("repaired", repaired_out)):
@@ -179,7 +194,10 @@ def diagnose(
                 assert isinstance(first, Measurement)
                 progress("network")
                 reading = _weights(ring, network, first, assumed)
-            _write(result, " ".join(map(str, measurements)), folder, extra, progress)
+            source: dict[str, Any] = {"measurement": " ".join(map(str, measurements))}
+            if said:
+                source["assumed_of_files"] = said
+            _write(result, source, folder, extra, progress)
             written = _write_rings(result, lattice_out, repaired_out)
             if folder and reading:
                 _write_weights(reading, folder)
@@ -189,21 +207,24 @@ def diagnose(
             _print_weights(ring, reading)
 
 
-def _read(paths: tuple[Path, ...]) -> "dict[str, Measured]":
-    """Measurements by the names of their folders; by the whole path where two have one name."""
-    from tmlattice.measurement import read_measurement
-
+def _read(
+    paths: tuple[Path, ...], ring: "Ring", map_file: Path | None, unit: str | None, quiet: bool
+) -> "tuple[dict[str, Measured], list[str]]":
+    """Measurements by the names of their folders, by the whole path where two have one name; and
+    what was assumed of files that are none."""
     names = [path.resolve().name for path in paths]
     twice = len(set(names)) < len(names)
-    return {
-        str(path) if twice else name: read_measurement(path)
-        for name, path in zip(names, paths, strict=True)
-    }
+    found: dict[str, Measured] = {}
+    said: list[str] = []
+    for name, path in zip(names, paths, strict=True):
+        found[str(path) if twice else name], own = read_data(path, ring, map_file, unit, quiet)
+        said += own
+    return found, said
 
 
 def _write(
     result: "Diagnosis",
-    measurement: str,
+    source: dict[str, Any],
     folder: Path | None,
     extra: Path | None,
     progress: Callable[[str], None],
@@ -212,7 +233,7 @@ def _write(
     from tmlattice.files import write_json
 
     document = result.as_json()
-    document["provenance"] = {**document["provenance"], "measurement": measurement}
+    document["provenance"] = {**document["provenance"], **source}
     if folder:
         progress("figures")
         _write_folder(result, folder, document["provenance"])

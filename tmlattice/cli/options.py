@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from tmlattice.lattice import Ring
-    from tmlattice.measurement import Measurement
+    from tmlattice.measurement import AnyMeasurement, Measurement
 
 FILE = click.Path(path_type=Path)
 
@@ -106,7 +106,7 @@ class NameList(click.ParamType):  # type: ignore[type-arg]
 
 INPUTS = (
     "lattice", "measurement", "measurements", "references", "calibration", "settings_file",
-    "network", "files",
+    "network", "files", "map_file",
 )  # fmt: skip
 MARKS = ("monitors", "correctors", "particle")
 OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out")
@@ -227,11 +227,17 @@ def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.argument("lattice", default="petra3")(lattice_options(function))
 
 
+def change_option(
+    default: float | None, text: str
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """--change, of the magnet that an experiment weakens."""
+    return click.option("--change", type=float, default=default, help=text,
+                        show_default=default is not None)  # fmt: skip
+
+
 def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """What `tune-fit` and its study share: the perturbation, the measurement, the fit."""
     for decorate in reversed((
-        click.option("--change", type=float, default=-0.2, show_default=True,
-                     help="Relative change of the magnet's strength."),
         click.option("--launch", type=LAUNCH, default="1e-3,0,1e-3,0", show_default=True,
                      help="State at the start of the ring, m and rad."),
         click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True,
@@ -271,16 +277,56 @@ def quiet_option(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors.")(function)
 
 
-def trajectories(path: Path, refusal: str) -> "Measurement":
-    """The first turns of a measurement folder, or of a table.
+def table_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """--map and --unit, of a file whose columns are taken as they come."""
+    for decorate in (
+        click.option("--unit", type=click.Choice(["m", "mm", "um", "nm"]),
+                     help="Of readings whose file states none; else taken from their size, with a "
+                     "word."),
+        click.option("--map", "map_file", type=FILE, metavar="FILE",
+                     help="YAML: names, unit, noise, bad monitors of a file of readings "
+                     "(`tmlattice import --example` writes one)."),
+    ):  # fmt: skip
+        function = decorate(function)
+    return function
+
+
+def read_data(
+    path: Path, ring: "Ring", map_file: Path | None = None, unit: Any = None, quiet: bool = False
+) -> "tuple[AnyMeasurement, tuple[str, ...]]":
+    """A measurement folder, or a file of readings as they come, and what was assumed of it.
+
+    The assumptions are printed too: nothing is taken for granted silently.
+    """
+    from tmlattice.measurement import read_measurement
+
+    if not path.is_file() or path.name == "measurement.json":
+        return read_measurement(path), ()
+    from tmlattice.importers import Options, bring_in, described
+    from tmlattice.importers.told import read_told
+
+    told = None if map_file is None else read_told(map_file)
+    brought = bring_in([path], Options(ring=ring, unit=unit, told=told))
+    said = (*brought.assumed, *brought.doubts)
+    if not quiet:
+        screen = console()
+        screen.print(f"{path}: {described(brought)}", soft_wrap=True)
+        for sentence in said:
+            screen.print(f"- {sentence}", soft_wrap=True)
+        screen.print()
+    return brought.measurement, said
+
+
+def trajectories(path: Path, refusal: str, ring: "Ring", **given: Any) -> "Measurement":
+    """The first turns of a measurement folder, or of a file of readings; see `read_data`.
 
     Raises:
         MeasurementError: a measurement of another kind, with what the command says to it.
     """
     from tmlattice.errors import MeasurementError
-    from tmlattice.measurement import Measurement, in_words, read_measurement
+    from tmlattice.measurement import Measurement, in_words
 
-    data = read_measurement(path)
+    data, _ = read_data(path, ring, **given)
     if not isinstance(data, Measurement):
         raise MeasurementError(f"'{path}' is {in_words(data)}{refusal}")
     return data

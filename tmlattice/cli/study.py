@@ -9,6 +9,7 @@ import click
 from tmlattice.cli.options import (
     FILE,
     Careful,
+    change_option,
     console,
     json_option,
     lattice_argument,
@@ -93,6 +94,7 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     metavar="DIR",
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
 )
+@change_option(-0.2, "Relative change of the magnet's strength.")
 @recipe_options
 @json_option
 @quiet_option

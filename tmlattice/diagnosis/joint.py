@@ -31,6 +31,7 @@ from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Blocks, Together
 from tmlattice.lattice import Ring
+from tmlattice.observe.stored import Kept, Stored
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -87,8 +88,16 @@ def diagnose_together(
     parts = [_named(label, one, how) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
+    kept = Kept()
+    first, then = (
+        [
+            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            for part in some
+        ]
+        for some in (parts, before)
+    )
     problem = replace(
-        Together.of([part.problem for part in parts], [part.problem for part in before]),
+        Together.of(first, then),
         places=places, judgement=judgement, fixed=(),
     )  # fmt: skip
     hypotheses = [
@@ -163,11 +172,12 @@ def _sought(
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
         return small_errors_of(problem, everywhere, usual, nuisances, causes, learn=told is None)
 
-    narrow = replace(search, unnamed=False)
     small = learnt((), start.nuisances)
     if told is None and small.log_evidence < CLEAR:
         assert few is not None
         return (explain(search, start) if few.full else few), None
+    # two findings say already whether the sizes have to be learnt again beside them
+    narrow = replace(search, unnamed=False, most=min(2, search.most))
     found = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(problem.judgement.retaken):
         beside = (*found.fit.causes, *_doubted(found))
@@ -181,6 +191,9 @@ def _sought(
         small, found = about, again
         if same:
             break
+    if found.full and search.most > narrow.most:
+        whole = replace(search, unnamed=False, problem=small.problem)
+        found = explain(whole, small.before)
     return found, small
 
 
@@ -207,7 +220,7 @@ def _doubted(found: Explanation) -> tuple[Cause, ...]:
     """The likeliest cause that was not taken: sizes that were learnt with a fault among them are
     too large, and it passes for a small error; it has to be weighed with sizes learnt without."""
     top = int(np.argmax(found.scan.statistic)) if len(found.scan.statistic) else -1
-    if top < 0 or found.full or found.scan.statistic[top] < DOUBT:
+    if top < 0 or found.scan.statistic[top] < DOUBT:
         return ()
     name, place = found.scan.hypotheses[top]
     if find(name).discrete:

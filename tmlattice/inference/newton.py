@@ -259,6 +259,8 @@ def _best_move(
     for shrink in SHRINK:
         trial = _moved(problem, point, shrink * change, shrink * moved)
         cost = _cost(problem, trial)
+        if trial.lost:  # nothing to go on from, even where the start is worth no more
+            continue
         if cost < now or (shrink == 1.0 and cost <= now + 1e-6):
             return trial
     return None

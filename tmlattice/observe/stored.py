@@ -6,6 +6,7 @@ so `told` is prediction and derivative in one. A new kind is a class with `told`
 """
 
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -37,6 +38,52 @@ SMALL = 1e-3
 FEW = 10
 """Causes with which a model is made from the one without; of more it is kept."""
 
+BEAMS = 6
+"""Stored beams that are remembered: some megabytes each."""
+
+
+class Kept:
+    """Models made a moment ago: measurements of one machine ask for the same ones, and most causes
+    are the same from one call to the next."""
+
+    def __init__(self) -> None:
+        self._bases: dict[str, tuple[tuple[Cause, ...], ResponseModel]] = {}
+        self._beams: deque[tuple[str, float, tuple[Cause, ...], StoredBeam]] = deque(maxlen=BEAMS)
+
+    def beam(
+        self, ring: Ring, settings: Settings, frequency: float, causes: tuple[Cause, ...]
+    ) -> StoredBeam:
+        """The stored beam of a ring with settings and causes.
+
+        Raises:
+            UnstableRingError: there is none.
+        """
+        key, near = repr(settings), None
+        for own, at, known, beam in self._beams:
+            if own == key and known == causes:
+                if at == frequency:
+                    return beam
+                near = beam
+        if near is not None:
+            made = StoredBeam(near.model.at_frequency(frequency))
+        else:
+            made = StoredBeam(self._model(ring, settings, causes).at_frequency(frequency))
+        self._beams.append((key, frequency, causes, made))
+        return made
+
+    def _model(self, ring: Ring, settings: Settings, causes: tuple[Cause, ...]) -> ResponseModel:
+        key = repr(settings)
+        known, base = self._bases.get(key, ((), None))
+        if base is None or causes[: len(known)] != known:
+            pairs = enumerate(zip(causes, known, strict=False))
+            same = next((i for i, (a, b) in pairs if a != b), min(len(causes), len(known)))
+            many = same if same > FEW else len(causes)
+            known = causes[:many] if len(causes) > FEW else ()
+            base = ResponseModel(apply(ring, known, settings))
+            self._bases[key] = (known, base)
+        rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
+        return base.changed_to(apply(base.ring, rest)) if rest else base
+
 
 @dataclass(frozen=True)
 class Beams:
@@ -60,7 +107,7 @@ class Stored(Steady):
         states: settings and relative RF frequency of each.
         data, errors: what was read and its noise, of the kind's shape.
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
-        kept: a model of each state and the causes in it, from which others are made.
+        kept: models made a moment ago; those of the same ring may share one.
     """
 
     ring: Ring = field(repr=False)
@@ -68,9 +115,7 @@ class Stored(Steady):
     data: Array = field(repr=False)
     errors: Array = field(repr=False)
     read_by: NDArray[np.int64] = field(repr=False)
-    kept: dict[int, tuple[tuple[Cause, ...], ResponseModel]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
+    kept: Kept = field(default_factory=Kept, repr=False, compare=False)
 
     @abstractmethod
     def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
@@ -103,29 +148,9 @@ class Stored(Steady):
 
     def view(self, causes: Sequence[Cause]) -> Beams:
         """A closed orbit for each state."""
-        made: list[StoredBeam] = []
-        for i, (settings, frequency) in enumerate(self.states):
-            same = [j for j in range(i) if self.states[j][0] == settings]
-            twin = next((j for j in same if self.states[j][1] == frequency), None)
-            if twin is not None:
-                made.append(made[twin])
-            elif same:
-                made.append(StoredBeam(made[same[0]].model.at_frequency(frequency)))
-            else:
-                made.append(StoredBeam(self._model(i, tuple(causes))))
-        return Beams(tuple(made), monitors_with(self.ring, causes))
-
-    def _model(self, state: int, causes: tuple[Cause, ...]) -> ResponseModel:
-        """Most of the causes are the same from one call to the next: what was made for them is
-        changed by the others."""
-        settings, frequency = self.states[state]
-        known, base = self.kept.get(state, ((), None))
-        if base is None or causes[: len(known)] != known:
-            known = causes if len(causes) > FEW else ()
-            base = ResponseModel(apply(self.ring, known, settings), 6, frequency)
-            self.kept[state] = (known, base)
-        rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
-        return base.changed_to(apply(base.ring, rest)) if rest else base
+        there = tuple(causes)
+        beams = tuple(self.kept.beam(self.ring, *state, there) for state in self.states)
+        return Beams(beams, monitors_with(self.ring, causes))
 
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Monitors' errors and all."""

@@ -17,6 +17,10 @@ COLOURS = {
 }
 
 
+METHOD_COLOURS = {"adam": "C3", "sparse": "C2", "map": "C1"}
+"""Of the methods of a fit, in every figure that holds them together."""
+
+
 def lattice_strip(ring: Ring, ax: Axes) -> Axes:
     """Draw the magnets of a ring along s: bends blue, quadrupoles red (up focuses in x),
     sextupoles green, wigglers purple.

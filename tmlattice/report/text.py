@@ -85,8 +85,25 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 # --- the sentences --------------------------------------------------------------------------------
+def since_reference(diagnosis: Diagnosis) -> bool:
+    """Whether the findings are what changed between two orbit responses."""
+    options = diagnosis.provenance["options"]
+    return diagnosis.kind != "trajectory" and bool(options.get("reference"))
+
+
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
+    if not since_reference(diagnosis):
+        return _verdict_sentence(diagnosis)
+    if diagnosis.verdict == "nothing":
+        return (
+            "Nothing changed since the reference but what monitors, correctors and magnets drift "
+            "by anyway."
+        )
+    return f"Since the reference: {_verdict_sentence(diagnosis)}"
+
+
+def _verdict_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.findings
     if diagnosis.verdict == "named":
         many = f"{len(found)} faults: " if len(found) > 1 else ""
@@ -123,8 +140,13 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
         "µm, that of held-out ones from "
         f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
         f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
-        f"{1e6 * last.heldout_rms_coupling:.1f} µm, and that of the RF's response from "
-        f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+        f"{1e6 * last.heldout_rms_coupling:.1f} µm"
+        + (
+            ", and that of the RF's response from "
+            f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+            if np.isfinite(last.dispersion_rms)
+            else "."
+        )
     )
 
 
