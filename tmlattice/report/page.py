@@ -97,10 +97,12 @@ def page(
         provenance: where it should state more than the diagnosis' own.
     """
     parts = files("tmlattice.report")
+    stated = diagnosis.provenance if provenance is None else provenance
     return render(
         "diagnosis.html",
-        diagnosis.provenance if provenance is None else provenance,
+        stated,
         diagnosis=diagnosis,
+        told=list(tables.notes(diagnosis, stated)),
         report=report,
         dense=response_text,
         tables=tables,
