@@ -364,6 +364,25 @@ class VerticalFocusing(_Thin):
         return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
 
 
+class EdgeFocusing(_Thin):
+    """Vertical focusing of dipoles: their edges and fringe fields, alike in dipoles of one type."""
+
+    name, effect = "edge_focusing", "vertical_focusing"
+    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    block, variable, trust = 0, "edge", 3e-3
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("bend",))
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each, and of families."""
+        places = self.places(data)
+        return [
+            Group(self.name, np.eye(len(places)), 1e-4, TAILS),
+            Group(f"{self.name} of families", families(places)[1], 1e-3),
+        ]
+
+
 class EnergySpread(Family):
     """Of the beam: mean square energy deviation, in units of `DELTA` squared."""
 
@@ -417,6 +436,7 @@ STEPS = (
     Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
     Trial((MonitorGain(),), 2, 0),
     Trial((QuadrupoleGradient(),), 4, 0),
+    Trial((EdgeFocusing(),), 2, 0),
     Trial((EnergySpread(),), 2, 0),
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),
