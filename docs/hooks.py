@@ -1,23 +1,26 @@
 """What the pages take from the package when they are built: the catalogue, what may be assumed of
-data, the schemas.
+data, the schemas, example files.
 
-A page says `<!-- effects -->`, `<!-- assumptions -->` or `<!-- schema measurement -->` where one
-is to stand.
+A page says `<!-- effects -->`, `<!-- assumptions -->`, `<!-- schema measurement -->` or
+`<!-- example trajectory -->` where one is to stand.
 """
 
 import json
 import re
 from collections.abc import Iterator
 from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-MARK = re.compile(r"^<!-- (effects|assumptions|schema) ?([\w-]*) -->$", re.MULTILINE)
+MARK = re.compile(r"^<!-- (effects|assumptions|schema|example) ?([\w-]*) -->$", re.MULTILINE)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the marks of a page."""
-    made = {"effects": effects, "assumptions": assumptions}
-    return MARK.sub(lambda mark: made[mark[1]]() if mark[1] in made else schema(mark[2]), markdown)
+    made = {"effects": lambda _: effects(), "assumptions": lambda _: assumptions(),
+            "schema": schema, "example": example}  # fmt: skip
+    return MARK.sub(lambda mark: made[mark[1]](mark[2]), markdown)
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -70,6 +73,31 @@ def assumptions() -> str:
     return table(["--assume", "what is written down wrongly", "first turns", "responses"], rows)
 
 
+def example(name: str) -> str:
+    """The files of a measurement of two shots, or steps, and two monitors, as they are written."""
+    import numpy as np
+
+    from tmlattice.measurement import Measurement, OrbitResponse, RfStep, write_measurement
+
+    monitors, noise = ("bpm_1", "bpm_2"), np.full((2, 2), 2e-5)
+    readings = 1e-6 * np.array([[[1230, -450], [980, 120]], [[-310, 890], [455, np.nan]]])
+    written: Any = OrbitResponse(
+        ("h1",), ("x",), np.array([1e-4]), monitors, readings[:1], noise / 10,
+        RfStep(499.65e6, 3840, 100.0, readings[1]), "my_ring.mat", 6.0,
+    )  # fmt: skip
+    if name == "trajectory":
+        launches = np.array([[1e-3, 0, 0, 0, 0], [0, 0, 1e-3, 0, 0]])
+        written = Measurement(launches, readings[:, None], monitors, noise, 0.1 * launches)
+    with TemporaryDirectory() as place:
+        folder = Path(place) / name
+        write_measurement(folder, written)
+        files_of_it = sorted(folder.iterdir())
+        return "\n\n".join(
+            f'```{path.suffix[1:]} title="{path.name}"\n{path.read_text().strip()}\n```'
+            for path in files_of_it
+        )
+
+
 def schema(name: str) -> str:
     """The fields of one of the package's JSON files, from its schema."""
     path = files("tmlattice") / "schemas" / f"{name}.schema.json"
@@ -81,8 +109,13 @@ def schema(name: str) -> str:
 def _fields(
     root: dict[str, Any], node: dict[str, Any], prefix: str
 ) -> Iterator[tuple[str, str, str]]:
-    branches = [node, node.get("else", {}), node.get("then", {})]  # a file of one kind, of another
-    for key, child in [item for b in branches for item in b.get("properties", {}).items()]:
+    # a file of one kind, of another; what stands in several is told of the first
+    kinds = [node.get("else", {}), node.get("then", {})]
+    kinds += [one.get("then", {}) for one in node.get("allOf", [])]
+    found: dict[str, Any] = {}
+    for branch in [node, *kinds]:
+        found = branch.get("properties", {}) | found
+    for key, child in found.items():
         where = f"{prefix}{key}"
         text = child.get("description", "")
         inner = _resolved(root, child)

@@ -102,16 +102,16 @@ def test_run_needs_no_truth_and_score_does(made, tmp_path):
     folder = tmp_path / "blind"
     shutil.copytree(made, folder)
     (folder / "truth").rename(tmp_path / "hidden")
-    results = run(folder, jobs=1, progress=False)
+    results = run(folder, jobs=1, progress=False, lattice=LATTICE)
     assert len(results) == 3
     assert all("error" not in result for result in results.values())
     written = {p.name: p.stat().st_mtime_ns for p in (folder / "results").iterdir()}
-    run(folder, jobs=1, progress=False)  # nothing is done twice
+    run(folder, jobs=1, progress=False, lattice=LATTICE)  # nothing is done twice
     assert written == {p.name: p.stat().st_mtime_ns for p in (folder / "results").iterdir()}
     with pytest.raises(TmlatticeError, match="truth"):
-        score(folder, progress=False)
+        score(folder, progress=False, lattice=LATTICE)
     (tmp_path / "hidden").rename(folder / "truth")
-    result = score(folder, jobs=1, progress=False)
+    result = score(folder, jobs=1, progress=False, lattice=LATTICE)
     assert result["cases"] == 3
     assert not result["failed"]
     schema = resources.files("tmlattice") / "schemas" / "challenge.schema.json"
@@ -324,8 +324,8 @@ def test_several_causes_need_a_finding_each():
 def scored(folder, tier, cases, lattice=LATTICE, **options):
     """A challenge made, run and scored; no case may fail."""
     make(tier, cases, 20, folder / tier, lattice=lattice, progress=False, **options)
-    run(folder / tier, jobs=1, progress=False)
-    found = score(folder / tier, jobs=1, oracle=False, progress=False)
+    run(folder / tier, jobs=1, progress=False, lattice=LATTICE)
+    found = score(folder / tier, jobs=1, oracle=False, progress=False, lattice=LATTICE)
     assert not found["failed"]
     return found
 

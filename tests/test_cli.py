@@ -55,10 +55,68 @@ def test_tune_fit_on_the_built_in_ring(outcome):
     assert json.loads((folder / "figures" / "tune-fit.json").read_text()) == result
 
 
+def test_tune_fit_has_a_column_for_each_method_and_says_which_to_trust(outcome):
+    folder, done = outcome
+    result = json.loads((folder / "result.json").read_text())
+    assert [m["method"] for m in result["methods"]] == ["adam", "sparse", "map"]
+    adam, sparse, most = result["methods"]
+    assert adam["tunes"] == result["tunes"]["network"]
+    assert adam["tune_sigma"] is None
+    assert (result["best"], result["trusted"]) == ("sparse", "sparse")
+    (named,) = sparse["named"]
+    assert named["magnet"] == result["magnet"]
+    assert abs(named["change"] + 0.2) < 5 * named["change_sigma"] < 0.01
+    for method in (sparse, most):
+        for error, sigma in zip(method["error"]["absolute"], method["tune_sigma"], strict=True):
+            assert error < 4 * sigma < 0.01
+        assert max(method["error"]["relative"]) < 0.1 * max(adam["error"]["relative"])
+        assert method["orbit_rms"] < 1.1 * result["noise"] < 0.5 * adam["orbit_rms"]
+    said = " ".join(done.stdout.split())
+    assert "Trust sparse" in said
+    assert f"492 readings do not tell {1519 * (16 + 40):,} weights" in said
+    assert f"{result['magnet']} -20." in said
+    assert "more than the noise of 20 µm" in said
+
+
+def test_a_method_alone_does_not_pay_for_the_others(tmp_path):
+    code = (
+        "import sys, tmlattice.fitting.adam as adam\n"
+        "from tmlattice.cli.command import main\n"
+        "adam._adam = None\n"  # whoever fits by it fails
+        "main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "tune-fit", SMALL, *QUICK, "--noise", "1e-6", "--method",
+         "sparse", "--json", "a.json"],
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    result = json.loads((tmp_path / "a.json").read_text())
+    jsonschema.validate(result, schema("tune-fit"))
+    assert [m["method"] for m in result["methods"]] == ["sparse"]
+    assert result["regularization"] is None
+    assert sorted(p.name for p in (tmp_path / "tune-fit").iterdir()) == [
+        "network.pt", "orbit.png", "spectrum.png", "tune-fit.json"
+    ]  # fmt: skip
+
+
+def test_the_weights_that_are_kept_are_those_of_the_best_method(outcome, petra3):
+    import numpy as np
+
+    from tmlattice.network import load_network
+    from tmlattice.optics import one_turn_optics
+
+    folder, _ = outcome
+    result = json.loads((folder / "result.json").read_text())
+    network = load_network(petra3, folder / "figures" / "network.pt")
+    tunes = result["methods"][1]["tunes"]
+    np.testing.assert_allclose(one_turn_optics(network).tunes, tunes, atol=1e-9)
+
+
 def test_tune_fit_prints_the_table_and_writes_three_figures(outcome):
     folder, done = outcome
     for words in ("1519 layers", "246 monitors", "true, perturbed (OCELOT)", "relative to the frac",
-                  "rms [µm]", "noise", "seconds"):  # fmt: skip
+                  "rms [µm]", "noise", "seconds", "(of sparse)"):  # fmt: skip
         assert words in done.stdout
     assert sorted(p.name for p in (folder / "figures").iterdir()) == [
         "loss.png", "network.pt", "orbit.png", "spectrum.png", "tune-fit.json"
@@ -248,14 +306,18 @@ def folders(tmp_path_factory, small_ring):
         place / "corrector",
         Measurement(launches, readings, network.monitors, settings=({}, {"v1": {"kick": 1e-5}})),
     )
-    write_measurement(place / "axis", Measurement(np.zeros((2, 4)), readings, network.monitors))
+    axis = Measurement(np.zeros((2, 4)), readings, network.monitors, None, np.zeros((2, 4)))
+    write_measurement(place / "axis", axis)
+    clean = TaylorNetwork.from_ring(machine)(launches[:, :4]).detach().numpy()[:, None]
+    noisy = clean + 2e-7 * np.random.default_rng(3).standard_normal(clean.shape)
+    write_measurement(place / "blind", Measurement(np.zeros((2, 4)), noisy, network.monitors))
     write_measurement(
         place / "response",
         OrbitResponse(("v1",), ("y",), np.ones(1), ("last_a",), np.zeros((1, 1, 2))),
     )
     (place / "strange").mkdir()
     for file in (place / "on").iterdir():
-        text = file.read_text().replace("last_a", "last_c")
+        text = file.read_text().replace("last_a", "last_c").replace("table_sha256", "_")
         (place / "strange" / file.name).write_text(text)
     return place
 
@@ -280,6 +342,27 @@ def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
     assert done.stderr == ""
     for figure in ("loss", "orbit", "spectrum"):
         assert (tmp_path / "fit" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_launches_and_noise_that_nobody_states_are_fitted_beside(folders, tmp_path, small_ring):
+    """Launches of 1e-4 m and rad, stated as unknown about the axis; 0.2 µm of noise."""
+    from tmlattice.fitting.experiment import perturbed_ring
+    from tmlattice.maps import ring_matrix
+    from tmlattice.optics import matrix_tunes
+
+    done = tmlattice("tune-fit", SMALL, "--measurement", folders / "blind", "--epochs", 300,
+                     "--out", "fit", cwd=tmp_path, check=0)  # fmt: skip
+    result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
+    assert result["noise_estimated"]
+    assert "(estimated)" in done.stdout
+    assert result["noise"] == pytest.approx(2e-7, rel=0.4)  # a robust width of some 100 readings
+    assert result["orbit_rms"]["before"] > 2 * result["noise"]
+    _, sparse, most = result["methods"]
+    assert [named["magnet"] for named in sparse["named"]] == ["QD::5"]
+    true = matrix_tunes(ring_matrix(perturbed_ring(small_ring, "QD::5", -0.02)))
+    for method in (sparse, most):
+        for tune, sigma, right in zip(method["tunes"], method["tune_sigma"], true, strict=True):
+            assert abs(tune - right) < 4 * sigma
 
 
 @pytest.mark.parametrize(

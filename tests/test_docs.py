@@ -1,6 +1,8 @@
 """The documentation is built, with warnings as errors, and holds what it promises."""
 
+import html
 import os
+import re
 import subprocess
 import sys
 import zlib
@@ -19,6 +21,7 @@ ROOT = Path(__file__).parent.parent
 def site(tmp_path_factory):
     pytest.importorskip("mkdocstrings", reason="mkdocs is not installed: pip install '.[docs]'")
     pytest.importorskip("mkdocs_click", reason="mkdocs is not installed: pip install '.[docs]'")
+    pytest.importorskip("latex2mathml", reason="mkdocs is not installed: pip install '.[docs]'")
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
@@ -64,3 +67,47 @@ def test_no_mark_is_left_and_shots_are_in_the_format(site):
     assert "<!-- schema" not in page
     for field in ("shots[].launch_sigma.px", "columns[].kick", "findings[].credible_set[].effect"):
         assert f"<code>{field}</code>" in page, field
+
+
+def test_commands_have_no_default_where_they_have_none(site):
+    assert "UNSET" not in text(site, "command_line")
+
+
+def test_equations_are_drawn_and_nothing_is_fetched(site):
+    page = text(site, "method")
+    assert page.count("<math") >= 5
+    assert "\\(" not in page
+    assert "\\[" not in page
+    fetched = [
+        (path.name, found)
+        for path in site.rglob("*.html")
+        for found in re.findall(
+            r'<(?:script|link|img|iframe)[^>]*(?:src|href)="(https?:[^"]*)"',
+            path.read_text(encoding="utf-8"),
+        )
+    ]
+    assert not fetched
+
+
+def test_notebooks_are_pages_with_their_pictures(site):
+    for notebook in (ROOT / "notebooks").glob("*.ipynb"):
+        page = text(site, f"notebooks/{notebook.stem}")
+        pictures = re.findall(r'src="\.\./([^"]+\.png)"', page)
+        assert len(pictures) >= 2, notebook.stem
+        for picture in pictures:
+            assert (site / "notebooks" / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_example_files_of_the_formats_are_read_as_they_stand(site, tmp_path):
+    """The page's own text makes a folder, and the reader takes it."""
+    page = text(site, "formats")
+    shown = re.findall(r'<span class="filename">([\w.]+)</span>.*?<code>(.*?)</code>', page, re.S)
+    assert [name for name, _ in shown] == [
+        "measurement.json", "readings.csv", "measurement.json", "response.csv",
+    ]  # fmt: skip
+    for kind, files in (("trajectory", shown[:2]), ("orbit_response", shown[2:])):
+        (tmp_path / kind).mkdir()
+        for name, marked in files:
+            plain = html.unescape(re.sub(r"<[^>]+>", "", marked))
+            (tmp_path / kind / name).write_text(plain)
+        assert tmlattice.read_measurement(tmp_path / kind).monitors == ("bpm_1", "bpm_2")

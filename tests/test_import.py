@@ -632,7 +632,7 @@ def test_wide_table(lattice, tmp_path):
         ("corrector,monitor,x,y,kick\nqf::0,bpm::0,1e-4,0,1e-4", "no corrector"),
         ("corrector,monitor,x,y,kick\ncor_h::0,bpm::77,1e-4,0,1e-4", "bpm::77"),
         ("monitor,plane,cor_h::0\nbpm::0,z,1.0", "plane 'z'"),
-        ("", "no rows"),
+        ("", "the file is empty"),
     ],
 )
 def test_damaged_tables_are_a_sentence(lattice, tmp_path, text, told):

@@ -300,7 +300,7 @@ def test_files_with_no_ring_end_in_one_sentence(tmp_path):
     savemat(tmp_path / "d.mat", {"x": np.arange(3.0)})
     with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
         load_ring(tmp_path / "d.mat")
-    with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
+    with pytest.raises(LatticeError, match="cannot be read as a MATLAB file"):
         load_ring(write(tmp_path, "e.mat", "no matlab"))
     with pytest.raises(LatticeError, match="no lattice file that can be read"):
         load_ring(write(tmp_path, "f.xyz", ""))

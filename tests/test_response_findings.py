@@ -8,7 +8,8 @@ from tmlattice.diagnosis.few import few_causes
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
-from tmlattice.observe.response_problem import NOTHING, Response, single_causes
+from tmlattice.observe.response_problem import Response, single_causes
+from tmlattice.observe.steady import NOTHING
 
 
 def measured(ring, causes, **options):

@@ -20,6 +20,7 @@ ORDER = (
 BESIDE = {
     "errors",
     "files",
+    "temporaries",
     "cache",
     "batch",
     "schemas",

@@ -1,7 +1,26 @@
 """The package's own errors. Each message is one sentence: what is wrong, where, what mends it."""
 
 import difflib
+import unicodedata
 from collections.abc import Iterable
+
+
+def plain(text: str, longest: int | None = None) -> str:
+    """A text from a file as it may be shown: in one line, without what steers a terminal.
+
+    Control characters, and those that turn the direction of writing, become their escapes.
+
+    Args:
+        text: as it stands in the file.
+        longest: characters; what is beyond is left out.
+    """
+    shown = "".join(
+        repr(c)[1:-1] if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp") else c
+        for c in " ".join(text.split())
+    )
+    if longest is None or len(shown) <= longest:
+        return shown
+    return shown[: longest - 3] + "..."
 
 
 class TmlatticeError(Exception):
@@ -32,8 +51,17 @@ class MeasurementError(TmlatticeError):
     """A measurement that does not fit the ring, or is not a measurement."""
 
 
+class ChoiceError(TmlatticeError, ValueError):
+    """A word for which there is a list, and that is not on it; the message gives the list."""
+
+
 class EffectError(TmlatticeError):
     """An effect that cannot be as it was asked for."""
+
+
+def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError:
+    """The error for a word that is none of a short list; all of them are named."""
+    return ChoiceError(f"no {kind} '{name}'; there are {', '.join(known)}")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:

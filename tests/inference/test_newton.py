@@ -1,6 +1,7 @@
 """How a fit ends is said, and where it has to be said: linear algebra and rings as referees."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.errors import BeamLostError
 from tmlattice.inference.dual import most_probable
-from tmlattice.inference.newton import Outcome, fit
-from tmlattice.inference.priors import Student
+from tmlattice.inference.newton import Outcome, _best_move, fit
+from tmlattice.inference.priors import AmountPrior, Student
+from tmlattice.inference.problem import Point
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
@@ -83,6 +85,16 @@ def test_the_false_alarm_rate_acts_on_what_would_have_been_seen(small_ring):
     assert strict.provenance["options"]["false_alarm"] == 1e-9
 
 
+def test_a_step_that_loses_the_beam_is_not_taken_even_from_a_start_that_cannot_be():
+    """Both cost infinity: an amount beyond the prior's bound, and no trajectory at all."""
+    amounts = AmountPrior(Student(0.3, np.inf), bound=0.1)
+    start = Point((Cause("quadrupole_gradient", "QD::5", 0.2),), np.zeros(0), {}, np.ones(1),
+                  None, np.zeros(0), None)  # fmt: skip
+    lost = replace(start, lost="the beam is lost")
+    problem = SimpleNamespace(amounts=amounts, at=lambda *_: lost, moved=lambda old, _: old)
+    assert _best_move(problem, start, np.zeros(1), np.zeros(0), np.inf) is None
+
+
 class Straight:
     """Readings that are a matrix times the amounts."""
 
@@ -102,6 +114,10 @@ class Straight:
 
     def transposed(self, rows):
         return self.J.T @ rows
+
+    @property
+    def matrix(self):
+        return self.J
 
     def kernel(self, variance):
         return (self.J * variance) @ self.J.T

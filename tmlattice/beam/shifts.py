@@ -80,9 +80,11 @@ class Shifts:
         return np.asarray(J[self.present])
 
     def launch_kernel(self, sigma: Array) -> Array:
-        """Covariance of the readings by errors of the launches, rms sigma [n], [row, row]."""
+        """Covariance of the readings by errors of the launches, rms sigma [n] or [shot, n]:
+        [row, row]."""
         shots, monitors = self.rows.shape[:2]
-        scaled = (self.rows * sigma).reshape(shots, monitors * 2, -1)
+        each = np.broadcast_to(sigma, (shots, self.rows.shape[3]))
+        scaled = (self.rows * each[:, None, None]).reshape(shots, monitors * 2, -1)
         K = np.zeros((shots, monitors * 2, shots, monitors * 2))
         for s in range(shots):
             K[s, :, s] = scaled[s] @ scaled[s].T

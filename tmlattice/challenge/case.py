@@ -150,6 +150,34 @@ def case_names(folder: Path) -> list[str]:
     return sorted(path.parent.name for path in (folder / "cases").glob("*/case.json"))
 
 
+def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
+    """A challenge's lattice, where loading it runs nothing that the caller has not named.
+
+    Args:
+        place: the file that names it, for the error.
+        lattice: a built-in name or a path.
+        trusted: the lattice whose code may be run.
+
+    Raises:
+        TmlatticeError: Python code that is not the trusted one, or no name.
+    """
+    if not isinstance(lattice, str) or not lattice:
+        raise TmlatticeError(f"{place}: its lattice is {lattice!r:.40}; it should be a name")
+    if Path(lattice).suffix.casefold() == ".py" and lattice != trusted:
+        raise TmlatticeError(
+            f"{place}: its lattice '{lattice}' is Python code, which would be run; if you trust "
+            f"that file, say --lattice {lattice} (in Python: lattice=)"
+        )
+    return lattice
+
+
+def trusted_case(folder: Path, name: str, trusted: str | None) -> Case:
+    """A case whose lattice may be loaded, see `check_lattice`."""
+    case = read_case(folder, name)
+    check_lattice(folder / "cases" / name / "case.json", case.lattice, trusted)
+    return case
+
+
 def read_case(folder: Path, name: str) -> Case:
     """The public part of a case."""
     own = folder / "cases" / name

@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.batch import run_batch
-from tmlattice.challenge.case import Case, case_names, read_case, read_set, ring_of
+from tmlattice.challenge.case import (
+    Case,
+    case_names,
+    check_lattice,
+    read_set,
+    ring_of,
+    trusted_case,
+)
 from tmlattice.diagnosis import diagnose
 
 log = logging.getLogger(__name__)
@@ -33,20 +40,22 @@ def run(
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: bool = True,
+    lattice: str | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Diagnose every case of a challenge that has no result yet.
 
     Args:
         folder: of the challenge; its truth is not read and may be absent.
+        lattice: the challenge's, where it is Python code that may be run, see `check_lattice`.
         jobs, scheduler, progress: see `run_batch`.
 
     Returns:
         Results by case; a failed one has "error".
     """
-    read_set(folder)
+    check_lattice(folder / "challenge.json", read_set(folder)["lattice"], lattice)
 
     def load(name: str) -> Any:
-        return lambda: read_case(folder, name)
+        return lambda: trusted_case(folder, name, lattice)
 
     cases = {name: load(name) for name in case_names(folder)}
     return run_batch(

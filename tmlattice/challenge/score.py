@@ -15,10 +15,12 @@ from tmlattice.challenge.case import (
     Case,
     Truth,
     case_names,
+    check_lattice,
     read_case,
     read_set,
     read_truth,
     ring_of,
+    trusted_case,
 )
 from tmlattice.challenge.figures import Row, summary
 from tmlattice.challenge.oracle import judge
@@ -53,6 +55,7 @@ def score(
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: bool = True,
+    lattice: str | None = None,
 ) -> dict[str, Any]:
     """All metrics of a challenge, in the format `tmlattice-challenge`.
 
@@ -60,6 +63,7 @@ def score(
         folder: of the challenge, with results and truth.
         oracle: with oracle and baselines, which take some seconds a case the first time.
         jobs, scheduler, progress: of the oracle, see `run_batch`.
+        lattice: the challenge's, where it is Python code that may be run, see `check_lattice`.
 
     Raises:
         TmlatticeError: no results.
@@ -67,6 +71,7 @@ def score(
     from tmlattice import __version__
 
     described = read_set(folder)
+    check_lattice(folder / "challenge.json", described["lattice"], lattice)
     results = finished(folder / "results")
     names = [name for name in case_names(folder) if name in results]
     if not names:
@@ -77,10 +82,10 @@ def score(
     if oracle:
 
         def load(name: str) -> Callable[[], tuple[Case, Truth]]:
-            return lambda: (read_case(folder, name), truths[name])
+            return lambda: (trusted_case(folder, name, lattice), truths[name])
 
         def load_case(name: str) -> Callable[[], Case]:
-            return lambda: read_case(folder, name)
+            return lambda: trusted_case(folder, name, lattice)
 
         where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
         judged = run_batch(judge, {n: load(n) for n in names}, folder / "oracle", **where)

@@ -8,6 +8,7 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
     background_option,
     console,
     json_option,
@@ -38,6 +39,11 @@ def _cluster_options(function: Any) -> Any:
     for decorate in (
         click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler instead."),
         click.option("--jobs", type=click.IntRange(1), help="Local processes; else one a core."),
+        click.option(
+            "--lattice",
+            metavar="FILE.py",
+            help="The challenge's lattice where it is Python code: named here, it is run.",
+        ),
     ):
         function = decorate(function)
     return function
@@ -101,11 +107,13 @@ def make(
 @click.argument("folder", type=FILE)
 @_cluster_options
 @quiet_option
-def run(folder: Path, jobs: int | None, scheduler: str | None, quiet: bool) -> None:
+def run(
+    folder: Path, jobs: int | None, scheduler: str | None, lattice: str | None, quiet: bool
+) -> None:
     """Diagnose every case in FOLDER that has no result yet; the truth is not read."""
     from tmlattice.challenge import run as run_cases
 
-    results = run_cases(folder, jobs=jobs, scheduler=scheduler, progress=not quiet)
+    results = run_cases(folder, jobs=jobs, scheduler=scheduler, progress=not quiet, lattice=lattice)
     failed = {name: result["error"] for name, result in results.items() if "error" in result}
     if not quiet:
         screen = console()
@@ -114,7 +122,7 @@ def run(folder: Path, jobs: int | None, scheduler: str | None, quiet: bool) -> N
             screen.print(f"case {name}: {error}")
 
 
-@challenge.command("score")
+@challenge.command("score", cls=Careful)
 @click.argument("folder", type=FILE)
 @click.option("--out", type=FILE, metavar="DIR", help="Figures: confusion, calibration, detection.")
 @click.option(
@@ -132,6 +140,7 @@ def score(
     oracle: bool,
     jobs: int | None,
     scheduler: str | None,
+    lattice: str | None,
     json_file: Path | None,
     quiet: bool,
 ) -> None:
@@ -144,7 +153,12 @@ def score(
         output_folder(out) if out else nullcontext() as figures,
     ):
         result = score_cases(
-            folder, oracle=oracle, jobs=jobs, scheduler=scheduler, progress=not quiet
+            folder,
+            oracle=oracle,
+            jobs=jobs,
+            scheduler=scheduler,
+            progress=not quiet,
+            lattice=lattice,
         )
         if path:
             write_json(path, result)

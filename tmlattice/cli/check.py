@@ -14,6 +14,8 @@ from tmlattice.cli.options import (
     lattice_options,
     open_ring,
     quiet_option,
+    read_data,
+    table_options,
 )
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ WRONG = 1
 @lattice_options
 @assume_option
 @click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
+@table_options
 @json_option
 @quiet_option
 @click.pass_context
@@ -39,6 +42,8 @@ def check(
     energy: float | None,
     assumed: tuple[str, ...],
     radiation: bool,
+    map_file: Path | None,
+    unit: str | None,
     json_file: Path | None,
     quiet: bool,
 ) -> None:
@@ -56,10 +61,15 @@ def check(
 
     with output_file(json_file) if json_file else nullcontext() as path:
         from tmlattice.diagnosis.doctor import check_data
-        from tmlattice.measurement import read_measurement
+        from tmlattice.measurement import Measurement, OrbitResponse, in_words
 
-        data = read_measurement(measurement)
         ring = open_ring(lattice, sequence, energy)
+        data, _ = read_data(measurement, ring, map_file, unit, quiet)
+        if not isinstance(data, Measurement | OrbitResponse):
+            raise MeasurementError(
+                f"'{measurement}' is {in_words(data)}; the check knows first turns and orbit "
+                "responses"
+            )
         try:
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
         except (MeasurementError, UnknownNameError) as error:

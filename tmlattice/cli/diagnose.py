@@ -18,11 +18,13 @@ from tmlattice.cli.options import (
     lattice_options,
     open_ring,
     quiet_option,
-    trajectories,
+    read_data,
+    table_options,
 )
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
+    from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 
 @click.command("diagnose", cls=Careful)
 @click.argument("lattice")
-@click.argument("measurement", type=FILE)
+@click.argument("measurements", metavar="MEASUREMENT...", type=FILE, nargs=-1, required=True)
 @lattice_options
 @click.option(
     "--holdout",
@@ -41,10 +43,12 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--reference",
+    "references",
     type=FILE,
     metavar="DIR",
+    multiple=True,
     help="A measurement of the same machine and kind before the fault: static errors cancel, and "
-    "what changed is told.",
+    "what changed is told. Repeat it where several are diagnosed together.",
 )
 @background_option("Small errors everywhere (not given: the data say)")
 @assume_option
@@ -96,6 +100,7 @@ if TYPE_CHECKING:
     "the machine as found, make it the design again (a quadrupole that gives 20 % less is told "
     "25 % more). What no setting mends is printed.",
 )
+@table_options
 @json_option
 @click.option(
     "--out",
@@ -106,10 +111,10 @@ if TYPE_CHECKING:
 @quiet_option
 def diagnose(
     lattice: str,
-    measurement: Path,
+    measurements: tuple[Path, ...],
     sequence: str | None,
     energy: float | None,
-    reference: Path | None,
+    references: tuple[Path, ...],
     background: tuple[tuple[str, float | None], ...],
     effects: tuple[str, ...] | None,
     network: Path | None,
@@ -121,15 +126,20 @@ def diagnose(
     out: Path | None,
     quiet: bool,
     holdout: float | None,
+    map_file: Path | None,
+    unit: str | None,
     **options: Any,
 ) -> None:
     """Say where the ring differs from LATTICE, by which effect, and how far the gap shrinks.
 
-    MEASUREMENT is a folder of first turns, or of an orbit response, as `tmlattice simulate` writes
-    it. The verdict is one of named, equivalent (several explanations fit alike), located (something
-    is there that the catalogue does not explain), distributed (no single place) and nothing; the
-    exit code is 0 for each of them. An orbit response ends in a step for each family of errors, and
-    options that speak of launches have no meaning for it.
+    MEASUREMENT is a folder, as `tmlattice simulate` writes it: first turns, turns of a stored beam,
+    a closed orbit, dispersion, tunes, an orbit response; or a file of first turns as a control room
+    has it (.csv, .txt, .h5, .sdds), its columns taken as they come and what is assumed of them
+    said. Several of one machine are diagnosed
+    together. The verdict is one of named, equivalent (several explanations fit alike), located
+    (something is there that the catalogue does not explain), distributed (no single place) and
+    nothing; the exit code is 0 for each of them. An orbit response alone ends in a step for each
+    family of errors, and options that speak of launches have no meaning for it.
     """
     from tmlattice.files import output_file, output_folder
 
@@ -141,46 +151,53 @@ def diagnose(
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
-        from tmlattice.measurement import Measurement, OrbitResponse, read_measurement
+        from tmlattice.measurement import Measurement, OrbitResponse
 
-        data = read_measurement(measurement)
-        response = isinstance(data, OrbitResponse)
+        ring = open_ring(lattice, sequence, energy)
+        told = (map_file, unit, quiet)
+        (data, said), (before, _) = (_read(p, ring, *told) for p in (measurements, references))
+        (first, *more) = data.values()
+        response = isinstance(first, OrbitResponse) and not more
+        turns = isinstance(first, Measurement) and not more
         if response:
-            _refuse(
-                "an orbit response", background=background, network=network,
-                radiation=options.pop("radiation"),
-            )  # fmt: skip
+            _refuse("an orbit response", background=background)
+        if not turns:
+            what = "an orbit response" if response else "several measurements or a stored beam's"
+            _refuse(what, network=network, radiation=options.pop("radiation"))
+        if response:
             options["missing"] = missing
-            if reference is not None:
+            if before:
                 _refuse(
                     "a change since a reference", missing=missing, lattice_out=lattice_out,
                     repaired_out=repaired_out,
                 )  # fmt: skip
-                options["reference"] = read_measurement(reference)
         else:
-            _refuse("first turns", missing=missing)
-            before = None if reference is None else trajectories(reference, "; give first turns")
-            options |= {"reference": before, "background": dict(background) or None}
+            _refuse("anything but an orbit response alone", missing=missing)
+            options["background"] = dict(background) or None
+        if before:
+            options["reference"] = before
         if options["max_effects"] is None:
             del options["max_effects"]
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
-        ring = open_ring(lattice, sequence, energy)
         if lattice_out and lattice_out == repaired_out:
             raise click.UsageError(f"--lattice-out and --repaired-out are both '{lattice_out}'")
         for option, path in (("lattice", lattice_out), ("repaired", repaired_out)):
             if path:
                 _check_out(ring, f"--{option}-out", path)
         with _progress(quiet) as progress:
-            where = str(measurement) if reference is None else f"{measurement} or {reference}"
+            where = " or ".join(str(path) for path in (*measurements, *references))
             result = _diagnosed(
                 ring, data, where, effects=effects, assume=assumed, progress=progress, **options
             )
             reading = None
             if network:
-                assert isinstance(data, Measurement)
+                assert isinstance(first, Measurement)
                 progress("network")
-                reading = _weights(ring, network, data, assumed)
-            _write(result, str(measurement), folder, extra, progress)
+                reading = _weights(ring, network, first, assumed)
+            source: dict[str, Any] = {"measurement": " ".join(map(str, measurements))}
+            if said:
+                source["assumed_of_files"] = said
+            _write(result, source, folder, extra, progress)
             written = _write_rings(result, lattice_out, repaired_out)
             if folder and reading:
                 _write_weights(reading, folder)
@@ -190,9 +207,24 @@ def diagnose(
             _print_weights(ring, reading)
 
 
+def _read(
+    paths: tuple[Path, ...], ring: "Ring", map_file: Path | None, unit: str | None, quiet: bool
+) -> "tuple[dict[str, Measured], list[str]]":
+    """Measurements by the names of their folders, by the whole path where two have one name; and
+    what was assumed of files that are none."""
+    names = [path.resolve().name for path in paths]
+    twice = len(set(names)) < len(names)
+    found: dict[str, Measured] = {}
+    said: list[str] = []
+    for name, path in zip(names, paths, strict=True):
+        found[str(path) if twice else name], own = read_data(path, ring, map_file, unit, quiet)
+        said += own
+    return found, said
+
+
 def _write(
     result: "Diagnosis",
-    measurement: str,
+    source: dict[str, Any],
     folder: Path | None,
     extra: Path | None,
     progress: Callable[[str], None],
@@ -201,7 +233,7 @@ def _write(
     from tmlattice.files import write_json
 
     document = result.as_json()
-    document["provenance"] = {**document["provenance"], "measurement": measurement}
+    document["provenance"] = {**document["provenance"], **source}
     if folder:
         progress("figures")
         _write_folder(result, folder, document["provenance"])
@@ -221,7 +253,7 @@ def _write_rings(
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
         written[str(lattice_out)] = write_ring(result.as_found, lattice_out)
-        if result.calibration or result.kind != "trajectory":
+        if result.calibration or result.by_steps:
             beside = calibration_beside(lattice_out)
             write_calibration(beside, result.calibration)
             written[str(beside)] = ()
@@ -344,7 +376,9 @@ def _print(
 
     screen = console()
     screen.print(report_text(result, min(screen.width, 120)), soft_wrap=True)
-    if result.kind == "trajectory":
+    if result.parts:
+        what = ", ".join(f"{part.label} ({part.readings} readings)" for part in result.parts)
+    elif result.kind == "trajectory":
         view = result.trajectories
         what = (
             f"{int(view.data.active.sum())} shots in the fit, {len(result.heldout_shots)} held "

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from tmlattice.cli.options import FILE, console, quiet_option
+from tmlattice.cli.options import FILE, Careful, console, quiet_option
 
 if TYPE_CHECKING:
     from tmlattice.importers import Imported
 
 
-@click.command("import")
-@click.argument("files", nargs=-1, required=True, type=FILE)
+@click.command("import", cls=Careful)
+@click.argument("files", nargs=-1, type=FILE)
 @click.option(
     "--out",
     type=FILE,
@@ -44,14 +44,28 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--unit",
-    type=click.Choice(["m", "mm", "um"]),
-    help="Of the readings of first turns [m] or of a turn-by-turn file [mm].",
+    type=click.Choice(["m", "mm", "um", "nm"]),
+    help="Of readings whose file states none (else taken from their size, with a word), or of a "
+    "turn-by-turn file [mm].",
 )
 @click.option(
     "--noise",
     type=click.FloatRange(0, min_open=True),
     metavar="M",
     help="Rms of a reading, or of an orbit change, m, where FILES give none.",
+)
+@click.option(
+    "--map",
+    "map_file",
+    type=FILE,
+    metavar="FILE",
+    help="YAML: names, unit, noise, bad monitors of a file of readings.",
+)
+@click.option(
+    "--example",
+    is_flag=True,
+    help="Write a template of each kind of file into --out, for LATTICE (petra3 where none "
+    "is named), and import nothing.",
 )
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
@@ -64,8 +78,10 @@ def import_files(
     sequence: str | None,
     energy: float | None,
     turns: str | None,
-    unit: Literal["m", "mm", "um"] | None,
+    unit: Literal["m", "mm", "um", "nm"] | None,
     noise: float | None,
+    map_file: Path | None,
+    example: bool,
     keep_bad: bool,
     force: bool,
     quiet: bool,
@@ -74,18 +90,54 @@ def import_files(
 
     FILES are a MATLAB LOCO file (.mat); the Middle Layer's response, dispersion and noise (.mat)
     with the machine's LOCO file; the HDF5 files of a response with name_mapping.json and the
-    lattice (.mat); a table (.csv) with --lattice; or a turn-by-turn file. What was assumed (units,
-    signs, steps) is printed, and what the data contradict: nothing is mended silently.
+    lattice (.mat); a table of readings or of a response (.csv, .txt, .h5, .sdds) with --lattice,
+    its columns taken as they come; or a turn-by-turn file. What was assumed (units, signs, steps)
+    is printed, and what the data contradict: nothing is mended silently.
     """
+    if example:
+        if files:
+            raise click.UsageError("--example writes templates and reads no FILES")
+        _example(lattice or "petra3", sequence, energy, out, quiet)
+        return
+    if not files:
+        raise click.UsageError("name the FILES to import, or --example for a template of each")
     from tmlattice.importers import Options, bring_in, write_imported
     from tmlattice.measurement.write import check_free
 
     check_free(out, force)
-    options = Options(iteration, keep_bad, sequence, lattice, energy, turns, unit, noise)
+    from tmlattice.importers.told import read_told
+
+    told = None if map_file is None else read_told(map_file)
+    options = Options(iteration, keep_bad, sequence, lattice, energy, turns, unit, noise, told)
     brought = bring_in(files, options)
     write_imported(brought, out, force)
     if not quiet:
         _print(brought, out)
+
+
+def _example(
+    lattice: str, sequence: str | None, energy: float | None, out: Path, quiet: bool
+) -> None:
+    from tmlattice.effects import Cause
+    from tmlattice.importers.example import FILES, write_example
+    from tmlattice.lattice import load_ring, middle_of_first_arc
+    from tmlattice.lattice.checks import need_monitors
+    from tmlattice.machine.simulate import simulate
+
+    ring = load_ring(lattice, sequence, energy)
+    need_monitors(ring)
+    fault = Cause("quadrupole_gradient", middle_of_first_arc(ring).name, -0.05)
+    write_example(out, ring, simulate(ring, [fault], shots=6, engine="ocelot").measurement())
+    if quiet:
+        return
+    screen = console()
+    for name, what in FILES.items():
+        screen.print(f"{out / name}: {what}", soft_wrap=True)
+    screen.print(f"the readings are of '{lattice}' with {fault.element} by {fault.amount:+.0%}")
+    screen.print(
+        f"next: tmlattice diagnose {lattice} {out / 'readings_wide.csv'} --map {out / 'map.yaml'}",
+        soft_wrap=True,
+    )
 
 
 def _print(brought: "Imported", out: Path) -> None:

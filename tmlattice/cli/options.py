@@ -1,5 +1,7 @@
 """Options that several commands share."""
 
+import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from tmlattice.lattice import Ring
-    from tmlattice.measurement import Measurement
+    from tmlattice.measurement import AnyMeasurement, Measurement
 
 FILE = click.Path(path_type=Path)
 
@@ -102,31 +104,66 @@ class NameList(click.ParamType):  # type: ignore[type-arg]
         return names
 
 
-INPUTS = ("lattice", "measurement", "reference", "calibration", "settings_file")
+INPUTS = (
+    "lattice", "measurement", "measurements", "references", "calibration", "settings_file",
+    "network", "files", "map_file",
+)  # fmt: skip
 MARKS = ("monitors", "correctors", "particle")
 OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out")
-OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv")
+OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv", "tunes.csv")
+OF_FOLDERS = ("challenge.json", "options.json")
+OF_BATCHES = ("cases", "truth", "results", "oracle", "baselines")
 
 
 class Careful(click.Command):
-    """A command that does not write over what it reads."""
+    """A command that does not write over what it reads, nor twice into one file."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run it, unless an output is an input.
+        """Run it, unless an output is an input or another output.
 
         Raises:
             OutputError: it is.
         """
         from tmlattice.files import OutputError
 
-        given = [Path(str(ctx.params[name])) for name in INPUTS if ctx.params.get(name)]
-        read = {path.resolve() for path in given if path.exists()}
-        read |= {path.resolve() / name for path in given for name in OF_MEASUREMENTS}
+        values = [ctx.params.get(name) for name in INPUTS]
+        given = [v for value in values for v in (value if isinstance(value, tuple) else [value])]
+        folder = ctx.params.get("folder")
+        paths = [Path(str(value)) for value in given if value]
+        read = {key for path in paths for key in _identities(path)}
+        for path in paths:
+            read |= {key for name in OF_MEASUREMENTS for key in _identities(path / name)}
+        if folder or ctx.params.get("out"):
+            own = Path(folder or ctx.params["out"])
+            read |= {key for name in OF_FOLDERS for key in _identities(own / name)}
+        written: set[Any] = set()
         for name in OUTPUTS:
             out = ctx.params.get(name)
-            if out and Path(out).resolve() in read and not Path(out).is_dir():
+            if not out or Path(out).is_dir():
+                continue
+            keys = _identities(Path(out))
+            above = Path(os.path.realpath(out)).parents
+            batch = folder and any(
+                Path(os.path.realpath(folder)) / part in above for part in OF_BATCHES
+            )
+            if keys & read or batch:
                 raise OutputError(f"'{out}' is read, and would be written over; name another file")
+            if keys & written:
+                raise OutputError(f"'{out}' is written twice; name another file for one of them")
+            written |= keys
         return super().invoke(ctx)
+
+
+def _identities(path: Path) -> set[Any]:
+    """What a path is known by, so that links are seen through: nothing of a device."""
+    try:
+        status = path.stat() if path.exists() else None
+    except (OSError, ValueError):
+        return set()
+    if status is not None and not stat.S_ISREG(status.st_mode):
+        return set()
+    names: set[Any] = {os.path.realpath(path)}
+    return names if status is None else names | {(status.st_dev, status.st_ino)}
 
 
 def _remember(context: click.Context, option: click.Parameter, value: Any) -> None:
@@ -190,11 +227,17 @@ def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.argument("lattice", default="petra3")(lattice_options(function))
 
 
+def change_option(
+    default: float | None, text: str
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """--change, of the magnet that an experiment weakens."""
+    return click.option("--change", type=float, default=default, help=text,
+                        show_default=default is not None)  # fmt: skip
+
+
 def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """What `tune-fit` and its study share: the perturbation, the measurement, the fit."""
     for decorate in reversed((
-        click.option("--change", type=float, default=-0.2, show_default=True,
-                     help="Relative change of the magnet's strength."),
         click.option("--launch", type=LAUNCH, default="1e-3,0,1e-3,0", show_default=True,
                      help="State at the start of the ring, m and rad."),
         click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True,
@@ -234,18 +277,58 @@ def quiet_option(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors.")(function)
 
 
-def trajectories(path: Path, refusal: str) -> "Measurement":
-    """The first turns of a measurement folder, or of a table.
+def table_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """--map and --unit, of a file whose columns are taken as they come."""
+    for decorate in (
+        click.option("--unit", type=click.Choice(["m", "mm", "um", "nm"]),
+                     help="Of readings whose file states none; else taken from their size, with a "
+                     "word."),
+        click.option("--map", "map_file", type=FILE, metavar="FILE",
+                     help="YAML: names, unit, noise, bad monitors of a file of readings "
+                     "(`tmlattice import --example` writes one)."),
+    ):  # fmt: skip
+        function = decorate(function)
+    return function
+
+
+def read_data(
+    path: Path, ring: "Ring", map_file: Path | None = None, unit: Any = None, quiet: bool = False
+) -> "tuple[AnyMeasurement, tuple[str, ...]]":
+    """A measurement folder, or a file of readings as they come, and what was assumed of it.
+
+    The assumptions are printed too: nothing is taken for granted silently.
+    """
+    from tmlattice.measurement import read_measurement
+
+    if not path.is_file() or path.name == "measurement.json":
+        return read_measurement(path), ()
+    from tmlattice.importers import Options, bring_in, described
+    from tmlattice.importers.told import read_told
+
+    told = None if map_file is None else read_told(map_file)
+    brought = bring_in([path], Options(ring=ring, unit=unit, told=told))
+    said = (*brought.assumed, *brought.doubts)
+    if not quiet:
+        screen = console()
+        screen.print(f"{path}: {described(brought)}", soft_wrap=True)
+        for sentence in said:
+            screen.print(f"- {sentence}", soft_wrap=True)
+        screen.print()
+    return brought.measurement, said
+
+
+def trajectories(path: Path, refusal: str, ring: "Ring", **given: Any) -> "Measurement":
+    """The first turns of a measurement folder, or of a file of readings; see `read_data`.
 
     Raises:
-        MeasurementError: an orbit response, with what the command says to it.
+        MeasurementError: a measurement of another kind, with what the command says to it.
     """
     from tmlattice.errors import MeasurementError
-    from tmlattice.measurement import Measurement, read_measurement
+    from tmlattice.measurement import Measurement, in_words
 
-    data = read_measurement(path)
+    data, _ = read_data(path, ring, **given)
     if not isinstance(data, Measurement):
-        raise MeasurementError(f"'{path}' is an orbit response{refusal}")
+        raise MeasurementError(f"'{path}' is {in_words(data)}{refusal}")
     return data
 
 

@@ -8,6 +8,8 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
+    Careful,
+    change_option,
     console,
     json_option,
     lattice_argument,
@@ -44,7 +46,7 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
         return number
 
 
-@study.command("tune-fit")
+@study.command("tune-fit", cls=Careful)
 @lattice_argument
 @click.option(
     "--magnets",
@@ -92,6 +94,7 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     metavar="DIR",
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
 )
+@change_option(-0.2, "Relative change of the magnet's strength.")
 @recipe_options
 @json_option
 @quiet_option
@@ -151,7 +154,7 @@ def tune_fit(
         _print(summary)
 
 
-@study.command("localisation")
+@study.command("localisation", cls=Careful)
 @lattice_argument
 @click.option(
     "--cases",

@@ -1,5 +1,6 @@
 """`tmlattice tune-fit`: from one perturbed first-turn orbit to the tunes."""
 
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from tmlattice.cli.options import (
     FILE,
     REGULARIZATIONS,
     Careful,
+    change_option,
     console,
     json_option,
     lattice_argument,
@@ -18,10 +20,15 @@ from tmlattice.cli.options import (
     quiet_option,
     recipe_options,
     table,
+    table_options,
     trajectories,
 )
 
+METHODS = ("adam", "sparse", "map")
+
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from tmlattice.fitting import TuneFit
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
@@ -39,7 +46,8 @@ if TYPE_CHECKING:
     "--measurement",
     type=FILE,
     metavar="DIR",
-    help="Fit these data, a measurement folder, and change no magnet; all shots together.",
+    help="Fit these data, a measurement folder or a file of readings, and change no magnet; all "
+    "shots together.",
 )
 @click.option(
     "--regularization",
@@ -53,9 +61,22 @@ if TYPE_CHECKING:
     default="tune-fit",
     show_default=True,
     metavar="DIR",
-    help="Folder for the three figures, tune-fit.json and network.pt.",
+    help="Folder for the figures, tune-fit.json and network.pt.",
+)
+@click.option(
+    "--method",
+    "methods",
+    type=click.Choice(METHODS),
+    multiple=True,
+    help="Repeat for more; all three where none is named. Figures and JSON have the same ones.",
+)
+@change_option(
+    None,
+    "Relative change of the magnet's strength; else -0.2, or less where that makes "
+    "the ring unstable.",
 )
 @recipe_options
+@table_options
 @json_option
 @quiet_option
 def tune_fit(
@@ -66,14 +87,21 @@ def tune_fit(
     out: Path,
     json_file: Path | None,
     quiet: bool,
+    methods: tuple[str, ...],
+    map_file: Path | None,
+    unit: str | None,
     **options: Any,
 ) -> None:
     """Predict the tunes of a perturbed ring from one first-turn orbit.
 
     One magnet of LATTICE is weakened, the monitors read one noisy first turn, the network of the
-    unperturbed design is fine-tuned on it, and its tunes are held against OCELOT's true ones.
+    unperturbed design is fine-tuned on it, and its tunes are held against OCELOT's true ones. There
+    is a column for each method: adam, the paper's recipe, which frees every weight; sparse, as few
+    changed magnets as the readings ask for; map, the most probable changes of all magnets. Under
+    them stands which one to trust, and why.
 
-    With --measurement the data are a folder's, and the true tunes are not known.
+    With --measurement the data are a folder's, launches are fitted too within what the data say of
+    them, and the true tunes are not known.
     """  # fmt: skip
     if measurement is not None:
         _refuse_own_data(click.get_current_context())
@@ -82,6 +110,7 @@ def tune_fit(
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out))
         extra = files.enter_context(output_file(json_file)) if json_file else None
+        options["methods"] = methods or METHODS
         from tmlattice.fitting import tune_fit as run
         from tmlattice.network import save_network
 
@@ -89,19 +118,22 @@ def tune_fit(
             ring = open_ring(lattice, sequence, energy)
             outcome = run(ring, progress=not quiet, **options)
         else:
-            data = trajectories(
-                measurement, "; tune-fit takes a trajectory, the first turn of a beam"
-            )
             ring = open_ring(lattice, sequence, energy)
+            refusal = "; tune-fit takes a trajectory, the first turn of a beam"
+            data = trajectories(
+                measurement, refusal, ring, map_file=map_file, unit=unit, quiet=quiet
+            )
             outcome = _fit(ring, data, measurement, quiet, options)
-        _draw(outcome, folder)
+        written = _draw(outcome, folder)
         result = outcome.as_json()
-        save_network(outcome.fit.network, folder / "network.pt")
+        best = outcome.best.fit
+        assert best is not None
+        save_network(best.network, folder / "network.pt")
         for path in (folder / "tune-fit.json", extra):
             if path:
                 write_json(path, result)
     if not quiet:
-        _print(outcome, out, json_file)
+        _print(outcome, out, [*written, "tune-fit.json", "network.pt"], json_file)
 
 
 OWN_DATA = ("magnet", "change", "launch", "noise")
@@ -129,7 +161,8 @@ def _fit(
         raise MeasurementError(f"{path}: {error}") from error
 
 
-def _draw(outcome: "TuneFit", folder: Path) -> None:
+def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
+    """The figures, and their names; a loss there is where the recipe was asked for."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -137,33 +170,38 @@ def _draw(outcome: "TuneFit", folder: Path) -> None:
 
     from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum
 
-    orbit = plot_orbit_fit(outcome)
-    spectrum, axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True, layout="constrained")
+    figures = {"orbit": plot_orbit_fit(outcome)}
+    figures["spectrum"], axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True,
+                                             layout="constrained")  # fmt: skip
     plot_tune_fit_spectrum(outcome, tuple(axes))
     axes[0].set_xlabel("")
-    axes[0].set_title(
-        f"{outcome.turns_alive} turns through the fine-tuned network, growth taken out"
-    )
-    loss, ax = plt.subplots(figsize=(8, 5), layout="constrained")
-    monitors = len(outcome.fit.network.monitors)
-    plot_loss(outcome.fit, ax, floor=2 * monitors * (outcome.noise or 0.0) ** 2)
-    orbits = "one orbit" if outcome.shots == 1 else f"{outcome.shots} orbits"
-    ax.set_title(f"Fine-tuning on {orbits} of {monitors} monitors")
-    for figure, name in ((orbit, "orbit"), (spectrum, "spectrum"), (loss, "loss")):
+    axes[0].set_title(f"{outcome.turns} turns through each fitted network, growth taken out")
+    if outcome.methods[0].method == "adam":
+        figures["loss"], ax = plt.subplots(figsize=(8, 5), layout="constrained")
+        monitors = len(outcome.fit.network.monitors)
+        plot_loss(
+            outcome.fit, ax, floor=2 * monitors * (outcome.noise or 0.0) ** 2,
+            others={m.method: m.fit.loss[-1] for m in outcome.methods[1:] if m.fit is not None},
+        )  # fmt: skip
+        orbits = "one orbit" if outcome.shots == 1 else f"{outcome.shots} orbits"
+        ax.set_title(f"Fine-tuning on {orbits} of {monitors} monitors")
+    for name, figure in figures.items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         plt.close(figure)
+    return [f"{name}.png" for name in figures]
 
 
-def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
+def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | None) -> None:
     screen = console()
-    noise = "-" if outcome.noise is None else f"{1e6 * outcome.noise:g}"
+    noise = "-" if outcome.noise is None else f"{1e6 * outcome.noise:.4g}"
+    estimated = " (estimated)" if outcome.noise_estimated else ""
     if outcome.magnet is None or outcome.change is None:
-        what = f"{outcome.shots} shots of {outcome.source}, noise {noise} µm"
+        what = f"{outcome.shots} shots of {outcome.source}, launches fitted beside"
     else:
         magnet = outcome.ring[outcome.magnet]
         what = (
             f"{magnet.kind} {magnet.name} at s = {magnet.s:.2f} m "
-            f"changed by {100 * outcome.change:+g} %, noise {noise} µm"
+            f"changed by {100 * outcome.change:+g} %"
         )
     network = outcome.fit.network
     screen.print(
@@ -172,40 +210,68 @@ def _print(outcome: "TuneFit", out: Path, json_file: Path | None) -> None:
         f"{len(network.monitors)} monitors\n{what}"
     )
     tunes = table("fractional tunes", "Qx", "Qy")
-    rows = [
-        ("design (OCELOT)", outcome.design_tunes, "{:.6f}"),
-        ("true, perturbed (OCELOT)", outcome.true_tunes, "{:.6f}"),
-        ("fine-tuned network", outcome.network_tunes, "{:.6f}"),
-        ("absolute error", outcome.absolute_error, "{:.6f}"),
-        ("error relative to the fraction", outcome.relative_error, "{:.2%}"),
-    ]
-    if outcome.true_tunes is None:
-        rows = [row for row in rows if row[1] is not None]
-    for name, value, form in rows:
-        tunes.add_row(name, *(("-", "-") if value is None else map(form.format, value)))
+    tunes.add_row("design (OCELOT)", *map("{:.6f}".format, outcome.design_tunes))
+    if outcome.true_tunes is not None:
+        tunes.add_row("true, perturbed (OCELOT)", *map("{:.6f}".format, outcome.true_tunes))
     screen.print(tunes)
-    if outcome.growth is not None and abs(outcome.growth - 1) > 1e-3:
+    screen.print(
+        f"readings less the design: rms {1e6 * outcome.rms_before:.2f} µm, "
+        f"noise {noise} µm{estimated}"
+    )
+    screen.print(_columns(outcome))
+    growth = outcome.growth
+    if growth is not None and abs(growth - 1) > 1e-3:
         screen.print(
-            "the fine-tuned network is not symplectic: amplitudes change by up to "
-            f"{100 * abs(outcome.growth - 1):.1f} % a turn; "
-            f"tunes from the first {outcome.turns_alive} turns"
+            f"the network of {outcome.methods[0].method} is not symplectic: amplitudes change by "
+            f"up to {100 * abs(growth - 1):.1f} % a turn; its tunes are from the first "
+            f"{outcome.turns_alive} turns"
         )
-    if outcome.problem:
-        screen.print(f"{outcome.problem}")
-    before, after = outcome.orbit_rms
-    fit = outcome.fit
-    how = "patience ran out" if fit.stopped_early else "all epochs"
-    orbit = table("readings less network", "rms [µm]")
-    for name, rms in (("before", before), ("after", after), ("noise", outcome.noise)):
-        orbit.add_row(name, "-" if rms is None else f"{1e6 * rms:.2f}")
-    screen.print(orbit)
+    for method in outcome.methods:
+        if method.problem:
+            screen.print(f"{method.method}: {method.problem}")
+    screen.print(f"\n{outcome.advice}\n")
     stages = table("stage", *outcome.seconds)
     stages.add_row("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))
     screen.print(stages)
-    screen.print(
-        f"{len(fit.loss)} epochs ({how}), regularization {fit.options['regularization']} x "
-        f"{fit.options['regularization_rate']:g}, learning rate {fit.options['learning_rate']:g}, "
-        f"seed {outcome.seed}"
-    )
-    written = f"{out}/: orbit.png, spectrum.png, loss.png, tune-fit.json, network.pt"
-    screen.print(f"written: {written}" + (f"; {json_file}" if json_file else ""))
+    if outcome.methods[0].method == "adam":
+        fit = outcome.fit
+        how = "patience ran out" if fit.stopped_early else "all epochs"
+        screen.print(
+            f"adam: {len(fit.loss)} epochs ({how}), regularization {fit.options['regularization']} "
+            f"x {fit.options['regularization_rate']:g}, learning rate "
+            f"{fit.options['learning_rate']:g}, seed {outcome.seed}"
+        )
+    files = f"{out}/: {', '.join(written)} (of {outcome.best.method})"
+    screen.print(f"written: {files}" + (f"; {json_file}" if json_file else ""))
+
+
+def _columns(outcome: "TuneFit") -> "Table":
+    """What each method made of the readings."""
+    from tmlattice.fitting.method_fit import errors
+
+    made = table("method", *(method.method for method in outcome.methods))
+
+    def row(name: str, form: str, values: Iterable[float | None]) -> None:
+        made.add_row(name, *("-" if value is None else form.format(value) for value in values))
+
+    away = [errors(method.tunes, outcome.true_tunes) for method in outcome.methods]
+    for i, tune in enumerate(("Qx", "Qy")):
+        row(tune, "{:.6f}", (None if m.tunes is None else m.tunes[i] for m in outcome.methods))
+        if outcome.true_tunes is not None:
+            row("  absolute error", "{:.6f}", (None if a is None else a[i] for a, _ in away))
+            row("  relative to the fraction", "{:.2%}",
+                (None if r is None else r[i] for _, r in away))  # fmt: skip
+        sigmas = (None if m.tune_sigma is None else m.tune_sigma[i] for m in outcome.methods)
+        row("  stated error", "{:.6f}", sigmas)
+    row("rms [µm] left of readings", "{:.2f}",
+        (1e6 * m.rms if m.fit is not None else None for m in outcome.methods))  # fmt: skip
+    shown = max((len(m.named) for m in outcome.methods), default=0)
+    for i in range(shown):
+        named = [list(m.named.items())[i : i + 1] for m in outcome.methods]
+        made.add_row(
+            "changed magnets" if i == 0 else "",
+            *(f"{n[0][0]} {100 * n[0][1][0]:+.2f} ± {100 * n[0][1][1]:.2f} %" if n else ""
+              for n in named),
+        )  # fmt: skip
+    row("seconds", "{:.2f}", (m.seconds for m in outcome.methods))
+    return made

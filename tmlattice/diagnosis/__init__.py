@@ -6,57 +6,88 @@
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 
+from collections.abc import Mapping
 from typing import Any
 
+from tmlattice.diagnosis.kinds import Measured, kind_of
 from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement import Measurement, OrbitResponse, in_words
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"]
 
-_OF_TRAJECTORIES = ("background", "heldout", "radiation")
+_OPTIONS = {
+    "first turns": ("reference", "background", "heldout", "radiation"),
+    "an orbit response": ("reference", "missing"),
+    "several measurements, or those of a stored beam": ("reference", "background"),
+}
+_OWN = {name for names in _OPTIONS.values() for name in names}
 
 
-def diagnose(ring: Ring, measurement: Measurement | OrbitResponse, **options: Any) -> Diagnosis:
+def diagnose(
+    ring: Ring, measurement: Measured | Mapping[str, Measured], **options: Any
+) -> Diagnosis:
     """Where the gap between a ring and its measurement lies, what causes it, how far it shrinks.
 
     Args:
         ring: the design.
-        measurement: first turns (or a few turns) of one or more shots, or an orbit response.
-        options: for both kinds holdout, effects, max_effects, false_alarm, seed and progress; for
-            both too reference, a measurement of the same kind and machine from before; for
-            trajectories also background, heldout and radiation, see
-            `diagnosis.procedure.diagnose`; for an orbit response missing, see
-            `diagnosis.response.diagnose_response`, and with a reference
-            `diagnosis.before_after.diagnose_change`.
+        measurement: of any kind; or several of one machine by name, which are diagnosed together.
+        options: for every kind holdout, effects, max_effects, false_alarm, assume, seed, progress
+            and reference, a measurement of the same kind and machine from before; for first turns
+            also background, heldout and radiation, see `diagnosis.procedure.diagnose`; for an orbit
+            response alone missing, see `diagnosis.response.diagnose_response`, and with a reference
+            `diagnosis.before_after.diagnose_change`; for several, and for those of a stored beam,
+            background, see `diagnosis.joint.diagnose_together`.
 
     Raises:
         MeasurementError: data that cannot be used, or an option without meaning for them.
         UnknownNameError: a monitor or an effect that does not exist.
     """
-    response = isinstance(measurement, OrbitResponse)
-    reference: Measurement | OrbitResponse | None = options.get("reference")
-    if reference is not None and isinstance(reference, OrbitResponse) != response:
-        own, other = ("first turns", "an orbit response")[:: -1 if response else 1]
-        raise MeasurementError(
-            f"the measurement is {own} and the reference {other}: give a reference of the same kind"
-        )
-    for name in _OF_TRAJECTORIES if response else ("missing",):
+    measurement = _alone(measurement)
+    if isinstance(measurement, Measurement):
+        of = "first turns"
+    elif isinstance(measurement, OrbitResponse):
+        of = "an orbit response"
+    else:
+        of = "several measurements, or those of a stored beam"
+    for name in sorted(_OWN - set(_OPTIONS[of])):
         if options.pop(name, None):
-            kind = "an orbit response" if response else "first turns"
-            raise MeasurementError(f"the option '{name}' has no meaning for {kind}; leave it out")
-    if isinstance(measurement, OrbitResponse) and isinstance(reference, OrbitResponse):
+            raise MeasurementError(f"the option '{name}' has no meaning for {of}; leave it out")
+    if isinstance(measurement, Measurement | OrbitResponse) and "reference" in options:
+        before = options["reference"] = _alone(options["reference"])
+        if before is not None and type(before) is not type(measurement):
+            raise MeasurementError(
+                f"the measurement is {of} and the reference {in_words(before)}: give a reference "
+                "of the same kind"
+            )
+    if isinstance(measurement, Measurement):
+        return diagnose_trajectories(ring, measurement, **options)
+    if isinstance(measurement, OrbitResponse) and options.get("reference") is not None:
         from tmlattice.diagnosis.before_after import diagnose_change
 
-        del options["reference"]
+        before = options.pop("reference")
         if options.pop("missing", False):
             raise MeasurementError("the option 'missing' has no meaning beside a reference")
-        return diagnose_change(ring, reference, measurement, **options)
+        return diagnose_change(ring, before, measurement, **options)
     if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response import diagnose_response
 
         options.pop("reference", None)
         return diagnose_response(ring, measurement, **options)
-    return diagnose_trajectories(ring, measurement, **options)
+    from tmlattice.diagnosis.joint import diagnose_together
+
+    if not isinstance(measurement, Mapping):
+        measurement = {kind_of(measurement): measurement}
+    before = options.pop("reference", None)
+    if before is not None and not isinstance(before, Mapping):
+        before = {kind_of(before): before}
+    return diagnose_together(ring, measurement, reference=before, **options)
+
+
+def _alone(measured: Any) -> Any:
+    """One measurement that stands in a mapping, itself."""
+    if isinstance(measured, Mapping) and len(measured) == 1:
+        return next(iter(measured.values()))
+    return measured

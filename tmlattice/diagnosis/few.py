@@ -22,7 +22,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.observe.orbit_response import ResponseData, Split
-from tmlattice.observe.response_problem import NOTHING, Response, single_causes
+from tmlattice.observe.response_problem import Response, single_causes
 
 Flags = NDArray[np.bool_]
 
@@ -90,7 +90,7 @@ def few_causes(
     problem = Response(
         base=design.at.bend(), used=_used(data, split), places=places, judgement=judgement
     )
-    before = fit(problem, (), NOTHING)
+    before = fit(problem, (), problem.first)
     count = int(problem.used.sum())
     if not before.chi2 / count > NOISE and chi2.sf(before.chi2, count) > judgement.false_alarm:
         return None

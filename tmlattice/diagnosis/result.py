@@ -76,6 +76,7 @@ class Finding:
         remedies: what takes it away, then what else might, until they hold the mass of a credible
             set; empty without an effect.
         consequences: what it does to the stored beam, and what is left of that after the repair.
+        seen_by: share of each measurement in what is known of its amount, where there are several.
     """
 
     effect: str | None
@@ -92,6 +93,7 @@ class Finding:
     mass: float
     remedies: tuple[Remedy, ...] = ()
     consequences: Consequences | None = None
+    seen_by: Mapping[str, float] | None = None
 
     @property
     def verdict(self) -> str:
@@ -131,6 +133,7 @@ class Finding:
             "remedy": None if self.remedy is None else self.remedy.as_json(),
             "or_remedies": [remedy.as_json() for remedy in self.remedies[1:]],
             "consequences": None if self.consequences is None else self.consequences.as_json(),
+            **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
         }
 
 
@@ -171,6 +174,51 @@ class ResponseView:
     model: NDArray[np.float64]
     held: NDArray[np.bool_]
     good: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class PartView:
+    """One of several measurements, before and after.
+
+    Attributes:
+        label, kind: what the user calls it, and what it is.
+        readings: their number.
+        before, after: what the design and the result leave.
+        monitors: names.
+        left: rms of what is left at each monitor in units of the noise, before and after,
+            [2, monitor]; NaN where nothing was read.
+    """
+
+    label: str
+    kind: str
+    readings: int
+    before: Misfit
+    after: Misfit
+    monitors: tuple[str, ...]
+    left: NDArray[np.float64] = field(repr=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {
+            "name": self.label,
+            "kind": self.kind,
+            "readings": self.readings,
+            "before": dict(vars(self.before)),
+            "after": dict(vars(self.after)),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class JointView:
+    """What a stored beam's measurements, or several together, have for plots.
+
+    Attributes:
+        explanation: the search.
+        parts: the measurements.
+    """
+
+    explanation: Explanation
+    parts: tuple[PartView, ...]
 
 
 @dataclass(frozen=True)
@@ -228,7 +276,7 @@ class Diagnosis:
     repaired: Ring = field(repr=False)
     causes: tuple[Cause, ...]
     errors: tuple[float, ...]
-    view: TrajectoryView | ResponseView = field(repr=False)
+    view: TrajectoryView | ResponseView | JointView = field(repr=False)
     left_out: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
     refused: "tuple[Step, ...]" = ()
@@ -242,8 +290,20 @@ class Diagnosis:
 
     @property
     def kind(self) -> str:
-        """Of the measurement: "trajectory" or "orbit_response"."""
+        """Of the measurement, as its folder has it; "together" of several."""
+        if isinstance(self.view, JointView):
+            return self.view.parts[0].kind if len(self.view.parts) == 1 else "together"
         return "trajectory" if isinstance(self.view, TrajectoryView) else "orbit_response"
+
+    @property
+    def by_steps(self) -> bool:
+        """Whether families of errors were fitted step by step, as to an orbit response."""
+        return isinstance(self.view, ResponseView)
+
+    @property
+    def parts(self) -> tuple[PartView, ...]:
+        """The measurements, where there are several or a stored beam's."""
+        return self.view.parts if isinstance(self.view, JointView) else ()
 
     @property
     def trajectories(self) -> TrajectoryView:
@@ -261,8 +321,14 @@ class Diagnosis:
 
     @property
     def explanation(self) -> Explanation:
-        """The search, of trajectories."""
-        return self.trajectories.explanation
+        """The search, where there was one.
+
+        Raises:
+            TypeError: families of errors were fitted instead.
+        """
+        if isinstance(self.view, ResponseView):
+            raise TypeError("an orbit response was fitted by families: there was no search")
+        return self.view.explanation
 
     @property
     def calibration(self) -> tuple[Cause, ...]:
@@ -318,7 +384,7 @@ class Diagnosis:
             heldout = {
                 **both(gap.misfits[gap.since], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
-                "monitors": "odd" if self.kind == "trajectory" else "half",
+                "monitors": "half" if self.by_steps else "odd",
                 "steps": [dict(vars(m)) for m in gap.misfits],
             }
         interval = None if gap is None or gap.interval is None else list(gap.interval)
@@ -354,6 +420,7 @@ class Diagnosis:
             ],
             "reasons": None if self.reasons is None else self.reasons.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
+            **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
             "gap": self.gap,
             "suspects": [suspect.as_json() for suspect in self.suspects],
             "unexplained": {"patterns": None, **self.unexplained},

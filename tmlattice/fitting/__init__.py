@@ -6,12 +6,16 @@
 """
 
 from tmlattice.fitting.adam import FitResult, Regularization
-from tmlattice.fitting.experiment import TuneFit, tune_fit, tune_fit_measurement
+from tmlattice.fitting.experiment import tune_fit, tune_fit_measurement
+from tmlattice.fitting.method_fit import METHODS, MethodFit
 from tmlattice.fitting.methods import Method, fine_tune
+from tmlattice.fitting.outcome import TuneFit
 
 __all__ = [
+    "METHODS",
     "FitResult",
     "Method",
+    "MethodFit",
     "Regularization",
     "TuneFit",
     "fine_tune",

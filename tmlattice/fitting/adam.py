@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tmlattice.errors import BeamLostError, MeasurementError
+from tmlattice.errors import BeamLostError, MeasurementError, unknown_choice
+from tmlattice.fitting.launches import FreeLaunches
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork, symplectic_penalty
 from tmlattice.network.symplectic import symplectic_coefficients
@@ -44,6 +45,7 @@ class FitResult:
         tune_sigma: their standard error, [2]; None where the method states none (Adam).
         changes: relative changes of strengths, by magnet, with their standard errors: the causes
             that `sparse` found, or all that `map` moved.
+        launches: as fitted beside them, [shot, n]; None where they were taken as known.
     """
 
     network: TaylorNetwork | SymplecticNetwork
@@ -56,6 +58,7 @@ class FitResult:
     tunes: NDArray[np.float64] | None = None
     tune_sigma: NDArray[np.float64] | None = None
     changes: dict[str, tuple[float, float]] = field(default_factory=dict)
+    launches: NDArray[np.float64] | None = None
 
 
 def fit_adam(
@@ -70,6 +73,7 @@ def fit_adam(
     free: Sequence[str] | None = None,
     clip: float = 1.0,
     patience: int | None = 200,
+    launch_sigma: ArrayLike | None = None,
     progress: bool = True,
 ) -> FitResult:
     """Fit all weights of a network to the first turn of a measurement, by Adam.
@@ -101,6 +105,9 @@ def fit_adam(
             symplectic network, whose penalty is zero whatever they are. None: all but W0.
         clip: largest norm of the gradient, before Adam.
         patience: stop after this many epochs without a loss lower by 0.1 %; None: never.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; inf:
+            unknown; None: known. Launches that are not follow the weights: after every epoch each
+            goes half the way to where the design's slopes have it.
         progress: show a bar where there is a terminal.
 
     Raises:
@@ -108,30 +115,29 @@ def fit_adam(
             network of four coordinates.
         UnknownNameError: a monitor that the network does not have.
         BeamLostError: the fit diverged (the learning rate is too high), or the launch is lost.
-        ValueError: an unknown regularization, or an unknown weight.
+        ChoiceError: an unknown regularization; it is a ValueError too.
+        ValueError: an unknown weight.
 
     Source: A. Ivanov, U. Iben, A. Golovkina, physics-based polynomial neural networks for one-shot
     learning of dynamical systems.
     """
-    regularization = Regularization(regularization)
-    launch = torch.from_numpy(measurement.states(network.dimension))
+    try:
+        regularization = Regularization(regularization)
+    except ValueError:
+        raise unknown_choice("regularization", regularization, Regularization) from None
     weight, target = _target(measurement, network.monitors)
+    beam = _beam(network, measurement, launch_sigma)
+    launch = torch.from_numpy(beam.launches)
     model, free = _freed(network, free)
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
-    design = (
-        symplectic_coefficients(network.W1, network.W2)
-        if relative_to_design
-        and regularization is Regularization.SYMPLECTIC
-        and isinstance(network, TaylorNetwork)
-        else None
-    )
+    design = _defect(network) if relative_to_design else None
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the tensors are small: more threads only wait for each other
     step = _adam(moving, learning_rate)
     losses: list[float] = []
     penalties: list[float] = []
-    best, best_epoch, best_weights = np.inf, 0, start
+    best, best_epoch, best_weights, best_launch = np.inf, 0, start, launch
     milestone, milestone_epoch = np.inf, 0
     stopped = False
     begun = time.perf_counter()
@@ -150,7 +156,7 @@ def fit_adam(
             penalties.append(penalty.item())
             if losses[-1] < best:
                 best, best_epoch = losses[-1], epoch
-                best_weights = [p.detach().clone() for p in model.parameters()]
+                best_weights, best_launch = [p.detach().clone() for p in model.parameters()], launch
             if losses[-1] < 0.999 * milestone:
                 milestone, milestone_epoch = losses[-1], epoch
             elif patience is not None and epoch - milestone_epoch >= patience:
@@ -158,6 +164,7 @@ def fit_adam(
                 break
             torch.nn.utils.clip_grad_norm_(moving, clip)
             step()
+            launch = beam.after(readings, launch)
     finally:
         bar.close()
         torch.set_num_threads(threads)
@@ -182,7 +189,49 @@ def fit_adam(
             "clip": clip,
             "patience": patience,
         },
+        launches=beam.settled(model, best_launch.numpy()),
     )
+
+
+@dataclass(frozen=True)
+class _Beam:
+    """The launches of a fit: where they begin, and how they follow the weights if they do."""
+
+    launches: NDArray[np.float64]
+    free: FreeLaunches | None = None
+    gains: Callable[..., NDArray[np.float64]] | None = None
+
+    def after(self, readings: Tensor, launch: Tensor) -> Tensor:
+        if self.gains is None:
+            return launch
+        now = launch.numpy()
+        return torch.from_numpy(now + 0.5 * self.gains(readings.detach().numpy(), now))
+
+    def settled(
+        self, network: TaylorNetwork | SymplecticNetwork, launch: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        return None if self.free is None else self.free.fitted(network, launch, steps=2)
+
+
+def _beam(
+    network: TaylorNetwork | SymplecticNetwork,
+    measurement: Measurement,
+    launch_sigma: ArrayLike | None,
+) -> _Beam:
+    launches = measurement.states(network.dimension)
+    sigma = np.zeros_like(launches)
+    if launch_sigma is None or not np.any(launch_sigma):
+        return _Beam(launches)
+    sigma[:] = launch_sigma
+    ordered = measurement.in_order_of(network.monitors)
+    if ordered.noise is None and np.isfinite(sigma[sigma > 0]).any():
+        raise MeasurementError(
+            "the launches have an error and the readings state none; give the measurement's noise"
+        )
+    noise = np.full((len(network.monitors), 2), 1.0) if ordered.noise is None else ordered.noise
+    free = FreeLaunches(launches, sigma, ordered.readings[:, 0], noise)
+    launches = free.fitted(network)
+    return _Beam(launches, free, free.gains(network, launches))
 
 
 def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -257,6 +306,13 @@ def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
         )
 
     return step
+
+
+def _defect(network: TaylorNetwork | SymplecticNetwork) -> Any:
+    """How far the design is from symplectic, coefficient by coefficient; None where it is."""
+    if not isinstance(network, TaylorNetwork):
+        return None
+    return symplectic_coefficients(network.W1, network.W2)
 
 
 def _penalty(

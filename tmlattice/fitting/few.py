@@ -68,7 +68,8 @@ def fit_sparse(
         ring: that the network was made from; else the network's own `ring`.
         kinds: of magnets whose strength may have changed.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number or [n]; None: known.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; None:
+            known; inf: unknown.
         fault: prior rms of a relative change.
         largest_number: of causes.
         refined: candidates that are refined after each scan.
@@ -123,7 +124,19 @@ def fit_sparse(
             str(cause.element): (cause.amount, float(error))
             for cause, error in zip(best.causes, errors, strict=True)
         },
+        launches=in_coordinates(best.nuisances, network.dimension)
+        if launch_sigma is not None
+        else None,
     )
+
+
+def in_coordinates(launches: Array, dimension: int) -> Array:
+    """Launches (x, px, y, py, delta), [shot, 5], in the coordinates of a network, [shot, n]."""
+    states = np.zeros((len(launches), dimension))
+    states[:, :4] = launches[:, :4]
+    if dimension == 6:
+        states[:, 5] = launches[:, 4]
+    return states
 
 
 def few_causes(

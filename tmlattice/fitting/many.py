@@ -17,9 +17,11 @@ from scipy.linalg import solve_triangular
 from tmlattice.beam.shifts import Shifts
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.few import few_causes
+from tmlattice.fitting.few import few_causes, in_coordinates
+from tmlattice.fitting.launches import FreeLaunches, launch_slopes
 from tmlattice.inference.dual import MostProbable, best_of, most_probable, posterior_base
 from tmlattice.inference.priors import Student
+from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
@@ -45,6 +47,9 @@ class Prior(StrEnum):
 
 FAULT_SCALE = 0.01
 
+WIDE = 0.01
+"""m and rad: what is said of a launch of which nothing is said; beam pipes are no wider."""
+
 
 @dataclass(frozen=True)
 class TurnReadings:
@@ -53,12 +58,20 @@ class TurnReadings:
     Attributes:
         space: moved by every question.
         data: one turn.
-        launches: of the shots, in the network's coordinates, [shot, n].
+        launches: of the shots, in the network's coordinates, [shot, n]; where they are not known,
+            about which.
+        off: how far they are from the nominal ones where those have an error, [shot, n], or None.
     """
 
     space: Space
     data: Data
     launches: Array
+    off: Array | None = None
+
+    @property
+    def launch_sigma(self) -> Array:
+        """rms of the nominal launches, [shot, n]; 0 where exact."""
+        return in_coordinates(self.data.launch_sigma, self.launches.shape[1])
 
     @property
     def sigma(self) -> Array:
@@ -73,7 +86,12 @@ class TurnReadings:
     def residual(self, amounts: Array) -> Array:
         """Measured less model, m, [row]."""
         readings = self.space.readings(amounts, self.launches)
-        return np.asarray((self.data.readings - readings)[self.data.valid])
+        left = self.data.readings - readings
+        if self.off is not None:  # as if from the nominal ones: those are what has a prior
+            left = left + np.einsum(
+                "smpi,si->smp", launch_slopes(self.space.network, self.launches), self.off
+            )
+        return np.asarray(left[self.data.valid])
 
     def slopes(self, amounts: Array) -> Shifts:
         """As shifts of the launches."""
@@ -88,9 +106,7 @@ class TurnReadings:
 
     def nuisances(self, amounts: Array) -> Array:
         """Errors of the launches."""
-        columns = [0, 1, 2, 3] if self.launches.shape[1] == 4 else [0, 1, 2, 3, 4, 4]
-        sigma = self.data.launch_sigma[0, columns].copy()
-        sigma[4:5] = 0.0  # tau has none of its own
+        sigma = np.minimum(self.launch_sigma, WIDE)
         if not sigma.any():
             return np.zeros((len(self.sigma),) * 2)
         return self.slopes(amounts).launch_kernel(sigma)
@@ -119,7 +135,8 @@ def fit_map(
         kinds: of magnets, for the priors on strengths.
         scale: factor on the prior's rms; None: 0.01 for faults, else that of greatest evidence.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number or [n]; None: known.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; None:
+            known; inf: unknown.
         iterations: of Gauss-Newton at most, at each level of noise on the way to the readings' own.
         progress: there is nothing to show; every method takes it.
 
@@ -147,18 +164,17 @@ def fit_map(
         space = Strengths(network, ring, kinds)
     monitors, dimension = space.network.monitors, space.network.dimension
     data = first_turn(monitors, measurement, noise, launch_sigma, dimension)
-    problem = TurnReadings(space, data, np.ascontiguousarray(measurement.states(dimension)))
     tails = prior is Prior.FAULTS
+    few = few_causes(ring, data, kinds, dimension) if tails and ring is not None else None
+    problem = _readings(space, data, measurement.states(dimension), few)
     width = FAULT_SCALE if tails and scale is None else scale
     student = Student(1.0 if width is None else width, 1.0 if tails else np.inf)
     start = np.zeros(len(space.layer))
     found = most_probable(problem, student, start, choose=width is None, iterations=iterations)
-    if (
-        tails and ring is not None
-    ):  # many maxima: another start is the few magnets that explain most
-        few = _from_few(space, ring, data, kinds)
-        other = most_probable(problem, student, few, wide=False, iterations=iterations)
-        found = best_of(problem, (found, other)) if few.any() else found
+    if few is not None:  # many maxima: another start is the few magnets that explain most
+        amounts = _from_few(space, few)
+        other = most_probable(problem, student, amounts, wide=False, iterations=iterations)
+        found = best_of(problem, (found, other)) if amounts.any() else found
     space.put(found.amounts)
     tunes, sigma, errors = _posterior(problem, found)
     changes = {
@@ -185,12 +201,32 @@ def fit_map(
         tunes=tunes,
         tune_sigma=sigma,
         changes=changes,
+        launches=None
+        if launch_sigma is None
+        else _free(problem).fitted(space.network, problem.launches),
     )
 
 
-def _from_few(space: Space, ring: Ring, data: Data, kinds: Sequence[str]) -> Array:
+def _readings(space: Space, data: Data, nominal: Array, few: Explanation | None) -> TurnReadings:
+    """The problem about the nominal launches, or about those that the few magnets ask for."""
+    nominal = np.ascontiguousarray(nominal)
+    sigma = in_coordinates(data.launch_sigma, nominal.shape[1])
+    if few is None or not sigma.any():
+        return TurnReadings(space, data, nominal)
+    about = in_coordinates(few.fit.nuisances, nominal.shape[1])
+    off = np.where(np.isfinite(sigma), about - nominal, 0.0)
+    return TurnReadings(space, data, about, off)
+
+
+def _free(problem: TurnReadings) -> FreeLaunches:
+    data = problem.data
+    nominal = in_coordinates(data.launches, problem.launches.shape[1])
+    readings = np.where(data.valid, data.readings, np.nan)
+    return FreeLaunches(nominal, problem.launch_sigma, readings, data.sigma[0])
+
+
+def _from_few(space: Space, found: Explanation) -> Array:
     """Amounts of the few magnets that explain most; of the likeliest where none is asked for."""
-    found = few_causes(ring, data, kinds, space.network.dimension)
     best = found.fit if found.named or not found.beyond else found.beyond[0].fit
     start = np.zeros(len(space.layer))
     for cause in best.causes:

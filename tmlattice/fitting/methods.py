@@ -3,6 +3,7 @@
 from enum import StrEnum
 from typing import Any
 
+from tmlattice.errors import unknown_choice
 from tmlattice.fitting.adam import FitResult, fit_adam
 from tmlattice.fitting.few import fit_sparse
 from tmlattice.fitting.many import fit_map
@@ -40,10 +41,14 @@ def fine_tune(
         options: of the method, see there.
 
     Raises:
-        ValueError: an unknown method, or an option's value.
+        ChoiceError: an unknown method; it is a ValueError too.
+        ValueError: an option's value.
         TmlatticeError: a measurement that cannot be fitted, see the methods.
     """
-    chosen = Method(method)
+    try:
+        chosen = Method(method)
+    except ValueError:
+        raise unknown_choice("method", method, Method) from None
     if chosen is Method.ADAM:
         return fit_adam(network, measurement, **options)
     if chosen is Method.MAP:

@@ -8,19 +8,22 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
+from tmlattice.importers.columns import CSV, HDF5, SDDS
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.lattices import Elements, elements_of
 from tmlattice.importers.loco import Iteration, bring_loco, is_loco
 from tmlattice.importers.middle_layer import bring_middle_layer, is_beside, is_response
-from tmlattice.importers.tables import bring_table, bring_turns
+from tmlattice.importers.readings import bring_readings, with_unit
+from tmlattice.importers.tables import bring_plain, bring_table, bring_turns, is_response_table
+from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.tables import Unit
 
-MATLAB, HDF5, TABLE, NAMES = (".mat",), (".h5", ".hdf5", ".hdf"), (".csv",), (".json",)
+MATLAB, NAMES = (".mat",), (".json",)
 Content = Mapping[str, Any]
 
 
@@ -35,7 +38,9 @@ class Options:
         lattice: name or path of the lattice of a table or of turns, see `load_ring`.
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
-        unit: of the readings of first turns or turns.
+        unit: of the readings of first turns or turns; else as the file says, or from their size.
+        told: what a map says of a table of readings.
+        ring: instead of `lattice`, one that is loaded already.
         noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
@@ -47,6 +52,8 @@ class Options:
     turns: str | None = None
     unit: Unit | None = None
     noise: float | None = None
+    told: Told | None = None
+    ring: Ring | None = None
 
 
 def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imported:
@@ -56,7 +63,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         paths: MATLAB LOCO (`.mat`); or the HDF5 files of a response, its dispersion and noise,
             with the table of names (`.json`) and the lattice (`.mat`); or the Middle Layer's
             response, dispersion and noise (`.mat`) with the machine's LOCO file; or a table
-            (`.csv`); or any other file, which the package `turn_by_turn` is asked to read.
+            (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`) of readings or of a response; or any other
+            file, which the package `turn_by_turn` is asked to read.
         options: how they are read.
 
     Raises:
@@ -110,12 +118,14 @@ def _bring(
     hdf5: Sequence[tuple[Path, Content]],
     options: Options,
 ) -> Imported:
-    if options.turns or (len(files) == 1 and not matlab and not hdf5):
-        (path,) = files[:1]
-        if not options.turns and path.suffix.lower() in TABLE:
-            return bring_table(path, _ring(options), options.unit)
-        if options.turns or path.suffix.lower() not in NAMES:
-            return bring_turns(path, _ring(options), options.turns, options.unit)
+    alone = len(files) == 1 and not matlab and all("matrix" not in part for _, part in hdf5)
+    if options.turns or alone:
+        path, ring = files[0], _ring(options)
+        suffix = path.suffix.lower()
+        if not options.turns and suffix in (*CSV, *HDF5):
+            return _table(path, ring, options)
+        if options.turns or suffix not in NAMES:
+            return _turns(path, ring, options)
     loco = [(path, content) for path, content in matlab if is_loco(content)]
     rest = [(path, content) for path, content in matlab if not is_loco(content)]
     if hdf5:
@@ -149,9 +159,33 @@ def _bring(
     )
 
 
+def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
+    """A response by its columns, else readings as they come."""
+    if path.suffix.lower() in CSV and is_response_table(path):
+        return bring_table(path, ring)
+    if ring is None:
+        if path.suffix.lower() in CSV:
+            return bring_plain(path, options.unit)
+        raise MeasurementError(
+            f"'{path}' holds readings: name its lattice with --lattice, which knows the monitors"
+        )
+    return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
+
+
+def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
+    """Turns of a known kind; of SDDS of another, columns as they come."""
+    try:
+        return bring_turns(path, ring, options.turns, options.unit)
+    except MeasurementError:
+        if options.turns or ring is None or path.suffix.lower() not in SDDS:
+            raise
+        told = with_unit(options.told, options.unit, options.noise)
+        return bring_readings(path, ring, told)
+
+
 def _ring(options: Options) -> Ring | None:
-    if options.lattice is None:
-        return None
+    if options.ring is not None or options.lattice is None:
+        return options.ring
     return load_ring(options.lattice, options.sequence, options.energy)
 
 

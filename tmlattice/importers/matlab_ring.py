@@ -17,7 +17,6 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.importers.imported import is_number
 from tmlattice.lattice import Ring
+from tmlattice.lattice.at_child import shipped_methods
 from tmlattice.lattice.at_file import ring_from_at
 
 PLANES = "xy"
@@ -172,18 +172,6 @@ def _family(element: Any) -> str:
     return str(element.FamName).strip().lower()
 
 
-@cache
-def _shipped() -> frozenset[str]:
-    """AT's own pass methods."""
-    from pathlib import Path
-
-    import at
-
-    folder = Path(at.__file__).parent / "integrators"
-    names = {path.name.split(".")[0] for path in folder.iterdir()}
-    return frozenset(name for name in names if name.endswith("Pass"))
-
-
 def _element(fields: Mapping[str, Any], place: int, energy: float, said: Counter[str]) -> Any:
     from at.load.utils import element_from_dict
 
@@ -195,7 +183,7 @@ def _element(fields: Mapping[str, Any], place: int, energy: float, said: Counter
         raise LatticeError(f"element {place + 1} of the lattice has the length {length!r:.40}")
     name, method = kept.get("FamName"), kept.get("PassMethod")
     kept["FamName"] = name if isinstance(name, str) and name else f"element_{place + 1}"
-    if not isinstance(method, str) or method not in _shipped():
+    if not isinstance(method, str) or method not in shipped_methods():
         said[f"'{str(method)[:40]}' is no pass method of AT: a drift"] += 1
         kept = {"FamName": kept["FamName"], "Length": length}
         kept["PassMethod"] = "DriftPass" if length else "IdentityPass"

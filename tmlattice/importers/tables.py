@@ -34,13 +34,24 @@ _HEADER = re.compile(r"^\s*(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*$"
 _PLANES = {"hcorrector": "x", "vcorrector": "y"}
 
 
-def bring_table(path: Path, ring: Ring | None, unit: Unit | None = None) -> Imported:
-    """An orbit response, or first turns, of a CSV table.
+def is_response_table(path: Path) -> bool:
+    """Whether a CSV table is an orbit response, by its header: correctors in a column, or a row for
+    each monitor and plane."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header = next((row for row in csv.reader(file, skipinitialspace=True) if row), [])
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return False
+    names = [m["name"].lower() for name in header if (m := _HEADER.match(name))]
+    return "corrector" in names or (names[:2] == ["monitor", "plane"] and "value" not in names)
+
+
+def bring_table(path: Path, ring: Ring | None) -> Imported:
+    """An orbit response of a CSV table.
 
     Args:
         path: the file.
-        ring: the lattice; an orbit response needs it, for the correctors' planes.
-        unit: of the readings of first turns; None: m.
+        ring: the lattice, which knows the correctors' planes.
 
     Raises:
         MeasurementError: a header that is not known, or a field that is no number: with its line.
@@ -48,8 +59,6 @@ def bring_table(path: Path, ring: Ring | None, unit: Unit | None = None) -> Impo
     """
     header, rows = _read(path)
     names = [name.lower() for name, _ in header]
-    if "corrector" not in names and "plane" not in names:
-        return _first_turns(path, ring, unit)
     if ring is None:
         raise MeasurementError(
             f"'{path}' is an orbit response: name its lattice with --lattice, which knows the "
@@ -126,11 +135,15 @@ def _unlaunched(data: Measurement, ring: Ring | None) -> Measurement:
     )
 
 
-def _first_turns(path: Path, ring: Ring | None, unit: Unit | None) -> Imported:
-    known = None if ring is None else [element.name for element in ring.monitors]
-    data = read_table(path, monitors=known, unit=unit or "m")
+def bring_plain(path: Path, unit: Unit | None = None) -> Imported:
+    """First turns of a table of a known form whose lattice is not named: names as they are.
+
+    Raises:
+        MeasurementError: see `read_table`.
+    """
+    data = read_table(path, unit=unit or "m")
     return Imported(
-        _unlaunched(data, ring), ring,
+        _unlaunched(data, None), None,
         (f"readings are in {unit or 'm'}", "where the beam was launched is not known"),
     )  # fmt: skip
 

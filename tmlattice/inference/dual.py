@@ -5,7 +5,7 @@ amounts are P J^T (J P J^T + C)^-1 target. J is not needed itself, only its prod
 problem knows (`Slopes`). Tails give each amount a variance of its own, found as the fit goes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -43,6 +43,10 @@ class Slopes(Protocol):
 
     def transposed(self, rows: Array) -> Array:
         """J^T rows, [amount]."""
+
+    @property
+    def matrix(self) -> Array:
+        """J itself, [row, amount]: asked for where amounts are fewer than rows."""
 
     def kernel(self, variance: Array) -> Array:
         """J P J^T for variances P [amount], [row, row]."""
@@ -155,16 +159,14 @@ def _iterated(
     if choose:
         unit = slopes.kernel(np.ones(len(now.amounts)))
         now = replace(now, prior=replace(now.prior, width=best_scale(unit, base, target)))
-    wanted = now.amounts
+    wanted, half = now.amounts, cho_factor(base)
+    best = _linear(slopes, base, half, target, len(wanted))
     for _ in range(HALVES if np.isfinite(now.prior.freedom) else 1):  # along one linear model
         wide = replace(now.prior, width=now.prior.width * widening)
-        variance = 1 / wide.precision(wanted)
-        factor = cho_factor(slopes.kernel(variance) + base)
-        wanted = variance * slopes.transposed(cho_solve(factor, target))
+        wanted = best(wide.precision(wanted))
         widening = max(1.0, widening / NARROWING)
     wide = replace(now.prior, width=now.prior.width * widening)
     step = np.clip(wanted, -problem.largest, problem.largest) - now.amounts
-    half = cho_factor(base)
     before = _cost(half, now.residual, wide, now.amounts)
     for _ in range(HALVES):
         try:
@@ -182,6 +184,30 @@ def _iterated(
     chi2 = (*now.chi2, _chi2(problem, residual))
     settled = small and widening == 1.0
     return MostProbable(now.amounts + step, residual, now.prior, chi2, settled), widening
+
+
+def _linear(
+    slopes: Slopes, base: Array, half: tuple[Array, bool], target: Array, amounts: int
+) -> Callable[[Array], Array]:
+    """The best amounts of a linear model as a function of the prior's precisions [amount], in the
+    space of amounts or of readings, whichever is the smaller."""
+    if amounts < len(target):
+        J = slopes.matrix
+        weighed = cho_solve(half, J)
+        inner, gram = weighed.T @ target, J.T @ weighed
+
+        def of_amounts(precision: Array) -> Array:
+            size = np.sqrt(precision)
+            scaled = gram / size / size[:, None] + np.eye(len(size))
+            return np.asarray(cho_solve(cho_factor(scaled), inner / size) / size)
+
+        return of_amounts
+
+    def of_readings(precision: Array) -> Array:
+        factor = cho_factor(slopes.kernel(1 / precision) + base)
+        return slopes.transposed(cho_solve(factor, target)) / precision
+
+    return of_readings
 
 
 def best_scale(kernel: Array, base: Array, target: Array) -> float:

@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 SHRINK = (1.0, 0.5, 0.25, 0.0625)
 """Shares of a step that are tried, until one makes things better."""
 
+UNSEEN = 1e-12
+"""Information about an amount below which these readings do not see it: its error would be a
+million, in any unit."""
+
 
 class Outcome(StrEnum):
     """How a fit ended; all but the first are told to whoever reads the result."""
@@ -168,6 +172,27 @@ def fit(
     return _finished(problem, point, slopes, rows, outcome)
 
 
+SETTLING = 3
+"""Steps of Newton for nuisances alone: they are all but linear."""
+
+
+def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
+    """The point of causes that stay as they are, at the best nuisances.
+
+    Args:
+        problem: model and data.
+        causes: with their amounts.
+        nuisances: first guess.
+    """
+    point = problem.at(causes, nuisances)
+    for _ in range(SETTLING):
+        if point.projection is None:
+            break
+        change = point.projection.coordinates(point.residual)
+        point = problem.at(causes, problem.moved(point.nuisances, change))
+    return point
+
+
 def _cost(problem: Problem, point: Point) -> float:
     """Chi-square, and what the prior adds to it where it pulls."""
     if point.lost:
@@ -234,6 +259,8 @@ def _best_move(
     for shrink in SHRINK:
         trial = _moved(problem, point, shrink * change, shrink * moved)
         cost = _cost(problem, trial)
+        if trial.lost:  # nothing to go on from, even where the start is worth no more
+            continue
         if cost < now or (shrink == 1.0 and cost <= now + 1e-6):
             return trial
     return None
@@ -265,6 +292,8 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         log_evidence += problem.amounts.log_density(cause)
     if named:
         full = gram + np.diag(_pulls(problem, point, len(rows))[0])
+        if (np.diagonal(full)[: len(named)] < UNSEEN).any():
+            return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
         size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
         scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))
         inverse = np.linalg.inv(scaled) / size[:, None] / size

@@ -84,6 +84,29 @@ class Problem(ABC):
         return float(np.log(self.judgement.unknown / 2 / places))
 
     # --- the model ------------------------------------------------------------------------------
+    @property
+    @abstractmethod
+    def first(self) -> Array:
+        """A first guess of the nuisances."""
+
+    @property
+    def free(self) -> int:
+        """Number of coordinates of the projection."""
+        return int(np.size(self.first))
+
+    @property
+    def freedom(self) -> int:
+        """Readings, and what is known of nuisances, less the nuisances."""
+        return int(self.valid.sum()) - self.free
+
+    def sees(self, hypothesis: Hypothesis) -> bool:
+        """Whether the kind knows what such a cause would do: of another one it reads nothing."""
+        return True
+
+    def everywhere(self) -> "Problem":
+        """The same with causes that act in all of its measurements, those of a reference too."""
+        return self
+
     @abstractmethod
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """The model there."""
@@ -133,6 +156,10 @@ class Problem(ABC):
     @abstractmethod
     def owner(self) -> NDArray[np.int64]:
         """The monitor of each reading, of the shape of `valid`."""
+
+    @abstractmethod
+    def as_rows(self, readings: Array) -> Array:
+        """Readings, or changes of them, [..., *shape of `valid`], as whitened rows [..., row]."""
 
     @abstractmethod
     def left(self, point: Point) -> tuple[Array, Array]:

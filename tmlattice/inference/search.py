@@ -192,7 +192,7 @@ def _run(search: Search, before: Fit) -> Explanation:
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
         search.progress(best.name)
         state = _taken(search, state, best, look)
-        if len(state.fit.causes) + len(state.fit.kicks) > 1:
+        if state.count > 1:
             state = _revised(search, state)
         if state.fit.chi2 <= search.enough:
             break

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky
+from scipy.linalg import block_diag, cholesky
 from scipy.linalg.lapack import dtrtri
 
 Array = NDArray[np.float64]
@@ -162,6 +162,10 @@ class Projection:
             part = blocks[:, b]
             kept[:, b] = part - (part @ Q) @ Q.T
         return kept.reshape(rows.shape)
+
+    def matrix(self) -> Array:
+        """The directions themselves, all blocks, [row, coordinate]."""
+        return np.asarray(block_diag(*(Q @ R for Q, R in zip(self.Q, self._R, strict=True))))
 
     def covariance(self) -> Array:
         """Of the launch coordinates, by block, [block, column, column]; 0 for what is not seen."""

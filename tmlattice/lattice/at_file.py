@@ -31,8 +31,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, plain
+from tmlattice.lattice.at_child import Tracker, check_methods
 from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
+from tmlattice.lattice.expressions import nothing_run
+from tmlattice.lattice.mat_file import check_mat
 from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
@@ -62,16 +65,19 @@ def read_at(
         energy: GeV; else the file's.
 
     Raises:
-        LatticeError: AT cannot read it, or it holds no elements.
+        LatticeError: AT cannot read it, or it holds no elements, or one that needs a pass method
+            that AT does not ship.
     """
     import at
 
     options = {"use": sequence} if sequence else {}
+    if path.suffix.lower() == ".mat":
+        check_mat(path)
     try:
-        with quiet_at():
+        with quiet_at(), nothing_run():
             lattice = at.load_lattice(str(path), **options)
     except Exception as error:  # each of AT's readers fails in its own way
-        said = " ".join(str(error).split()) or type(error).__name__
+        said = plain(str(error), 300) or type(error).__name__
         raise LatticeError(
             f"'{path}' cannot be read as an AT lattice ({said}); save it with AT's "
             "save_lattice, or name its variable with sequence="
@@ -113,11 +119,14 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     left_out: Counter[str] = Counter()
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
-    for element in lattice:
-        if id(element) not in known:
-            family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
-            known[id(element)] = _places(element, family, design.map_energy, left_out)
-        converted += known[id(element)]
+    check_methods(lattice)
+    energy_ev = design.map_energy * 1e9
+    with Tracker(energy_ev) as tracker:
+        for element in lattice:
+            if id(element) not in known:
+                family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
+                known[id(element)] = _places(element, family, design.map_energy, left_out, tracker)
+            converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     if left_out:
@@ -146,7 +155,9 @@ def _roll(element: Any, left_out: Counter[str]) -> float:
     return roll
 
 
-def _places(element: Any, family: str, energy: float, left_out: Counter[str]) -> list[Place]:
+def _places(
+    element: Any, family: str, energy: float, left_out: Counter[str], tracker: Tracker
+) -> list[Place]:
     """What one AT element is in the ring: one element, but for correctors of both planes and bends
     with coils."""
     import at
@@ -155,14 +166,14 @@ def _places(element: Any, family: str, energy: float, left_out: Counter[str]) ->
     mad = mad or str(getattr(element, "origin", "")).upper()
     if isinstance(element, at.Corrector):
         return _correctors(element, family, mad)
-    kind, source = _convert(element, family, mad, energy, left_out)
+    kind, source = _convert(element, family, mad, energy, left_out, tracker)
     if kind == "bend":
         return with_coils(element, family, source)
     return [(family, kind, source)]
 
 
 def _convert(
-    element: Any, family: str, mad: str, energy: float, left_out: Counter[str]
+    element: Any, family: str, mad: str, energy: float, left_out: Counter[str], tracker: Tracker
 ) -> tuple[Kind, Any]:
     """Kind and OCELOT element of one AT element."""
     import at
@@ -194,8 +205,7 @@ def _convert(
         if length:
             return "drift", ocelot.Drift(l=length, eid=family)
         return "marker", ocelot.Marker(eid=family)
-    matrix = at.find_elem_m66(element, energy=energy * 1e9, particle=at.Particle("relativistic"))
-    kind, source = _matrix(np.asarray(matrix), family, length, energy)
+    kind, source = _matrix(tracker.matrix(element), family, length, energy)
     left_out[f"what {type(element).__name__} has beyond its first-order matrix"] += 1
     if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"

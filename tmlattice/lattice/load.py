@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice import stored
+from tmlattice.lattice.checks import check_ring, reading
 from tmlattice.lattice.marked import marked
 from tmlattice.lattice.ring import PARTICLES, Ring
 
@@ -69,9 +70,10 @@ def _loaded(name_or_path: str | Path, sequence: str | None, energy: float | None
     kept = stored.load(key, name) if key else None
     if kept is not None:
         return kept
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as told, reading(path):
         warnings.simplefilter("always")
         ring = _read(path, name, sequence, energy)
+        check_ring(ring)
     for w in told:
         warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
     if key and not told:  # what is told is told every time

@@ -7,9 +7,9 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.errors import LatticeError, plain, unknown_name
 from tmlattice.lattice.at_file import quiet_at, ring_from_at
-from tmlattice.lattice.madx_matrix import matrix_command
+from tmlattice.lattice.madx_parsers import parser_of
 from tmlattice.lattice.ring import Ring
 
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
@@ -29,14 +29,8 @@ def read_madx(
     Raises:
         LatticeError: no sequence, several without a choice, no energy, or AT cannot read it.
     """
-    import at
-
     elegant = path.suffix.lower() == ".lte"
-    parser = (
-        at.ElegantParser(verbose=False)
-        if elegant
-        else at.MadxParser(verbose=False, matrix=matrix_command())
-    )
+    parser = parser_of(elegant)
     try:
         with redirect_stdout(StringIO()), quiet_at():
             parser.parse_files(str(path))
@@ -48,7 +42,7 @@ def read_madx(
     else:
         beams = [dict(v) for k, v in parser.items() if str(k).startswith("beam%")]
         text = path.read_text(encoding="utf-8", errors="replace")
-        stated = bool(_BEAM.search(text)) or beams != [dict(at.MadxParser()["beam%"])]
+        stated = bool(_BEAM.search(text)) or beams != [dict(parser_of(False)["beam%"])]
     if energy is None and not stated:
         lacks = "no beam energy" if elegant else "no BEAM with an energy"
         raise LatticeError(f"'{path}' has {lacks}; say energy= (GeV)")
@@ -108,5 +102,5 @@ def read_xsuite(
 
 def _unreadable(path: Path, error: Exception, what: str = "MAD-X") -> LatticeError:
     what = "elegant's lattice" if path.suffix.lower() == ".lte" else what
-    said = "; ".join(" ".join(str(a).split()) for a in error.args) or type(error).__name__
+    said = plain("; ".join(map(str, error.args)), 300) or type(error).__name__
     return LatticeError(f"'{path}' cannot be read as {what} ({said}); mend that statement")

@@ -47,7 +47,7 @@ def read_ocelot(
     Raises:
         LatticeError: the file fails to run, or holds no sequence of elements.
 
-    Source: the naming rule is the measurement format's, version 1 (docs: README, "Names").
+    Source: the naming rule is the measurement format's, version 1 (docs/coordinates.md, "Names").
     """
     module = _run_as_module(path)
     variables = vars(module)

@@ -1,4 +1,4 @@
-"""What the monitors read: trajectories, orbit responses, and the folder that holds them.
+"""What is read of a ring: one record for each kind of measurement, and the folder that holds it.
 
 >>> measurement = read_measurement("day_1", monitors=[m.name for m in ring.monitors])
 >>> fit, held_out = measurement.split(0.2, seed=1)
@@ -7,20 +7,30 @@
 ...     writer.add(0, launch, None, {}, readings)     # readings [turn, monitor, 2]
 """
 
-from tmlattice.measurement.folder import read_measurement
+from tmlattice.measurement.closed_orbit import ClosedOrbit
+from tmlattice.measurement.dispersion import Dispersion
+from tmlattice.measurement.folder import AnyMeasurement, in_words, read_measurement
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.tables import read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import Comparison, Measurement
 from tmlattice.measurement.truth import Truth, read_truth, write_truth
+from tmlattice.measurement.tune_reading import TuneReading
+from tmlattice.measurement.turn_by_turn import TurnByTurn
 from tmlattice.measurement.write import MeasurementWriter, measurement_writer, write_measurement
 
 __all__ = [
+    "AnyMeasurement",
+    "ClosedOrbit",
     "Comparison",
+    "Dispersion",
     "Measurement",
     "MeasurementWriter",
     "OrbitResponse",
     "RfStep",
     "Truth",
+    "TuneReading",
+    "TurnByTurn",
+    "in_words",
     "measurement_writer",
     "read_measurement",
     "read_table",

@@ -1,5 +1,6 @@
 """JSON documents that carry `format` and `version`: read strictly, checked by their schema."""
 
+import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,6 +61,47 @@ def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[
     if wrong is not None:
         raise MeasurementError(f"{path}: {_explain(wrong)}")
     return document
+
+
+class Digest:
+    """What says that a table is the one that its measurement.json was written with.
+
+    Lines may end as any system ends them.
+    """
+
+    def __init__(self) -> None:
+        self._sum = hashlib.sha256()
+
+    def add(self, text: bytes) -> None:
+        """More of the table."""
+        self._sum.update(text.replace(b"\r", b""))
+
+    def told(self) -> str:
+        """64 characters."""
+        return self._sum.hexdigest()
+
+
+def check_table(document: dict[str, Any], table: Path) -> None:
+    """Whether a table is whole, and belongs to the document beside it, where that says so.
+
+    Raises:
+        MeasurementError: it cannot be read, or is another.
+    """
+    if (stated := document.get("table_sha256")) is None:
+        return
+    digest = Digest()
+    try:
+        with table.open("rb") as file:
+            while part := file.read(1 << 20):
+                digest.add(part)
+    except OSError as error:
+        raise MeasurementError(f"cannot read '{table}': {error.strerror or error}") from error
+    if digest.told() != stated:
+        raise MeasurementError(
+            f"{table}: it is not the table that measurement.json was written with: cut off, "
+            'damaged or changed; copy it anew, or, if you changed it, take "table_sha256" out of '
+            "measurement.json"
+        )
 
 
 @contextmanager

@@ -1,10 +1,11 @@
 """The measurement folder, format version 1: `measurement.json` and a table of readings.
 
-The shots, or the columns of an orbit response, stand in `measurement.json`; what was read stands
-in `readings.csv`, or `response.csv`. Numbers are written so that they read back bit by bit.
+The shots, the columns of an orbit response, or the RF's steps stand in `measurement.json`; what was
+read stands in `readings.csv`, `response.csv` or `tunes.csv`. Numbers are written so that they read
+back bit by bit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
-from tmlattice.measurement.documents import located, read_document
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.closed_orbit import ClosedOrbit
+from tmlattice.measurement.dispersion import Dispersion
+from tmlattice.measurement.documents import check_table, located, read_document
+from tmlattice.measurement.header import FORMAT, number, read_noise
+from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.rows import dense, match_names, read_rows
+from tmlattice.measurement.stored_files import KINDS, TURNS, places_of
 from tmlattice.measurement.tables import Unit, read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import (
     COORDINATES,
@@ -24,13 +29,28 @@ from tmlattice.measurement.trajectory import (
     Settings,
     check_settings,
 )
+from tmlattice.measurement.tune_reading import TuneReading
+from tmlattice.measurement.turn_by_turn import TurnByTurn
 
 Array = NDArray[np.float64]
 
-FORMAT = "tmlattice-measurement"
-READINGS = ("shot", "turn", "monitor", "x", "y")
+AnyMeasurement = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion | TuneReading
 RESPONSE = ("corrector", "monitor", "x", "y")
 RF = "rf"
+
+_WORDS = {
+    Measurement: "first turns",
+    OrbitResponse: "an orbit response",
+    TurnByTurn: "a turn-by-turn measurement",
+    ClosedOrbit: "a closed orbit",
+    Dispersion: "a dispersion measurement",
+    TuneReading: "a tune measurement",
+}
+
+
+def in_words(measured: AnyMeasurement) -> str:
+    """What a measurement is, for a sentence."""
+    return _WORDS[type(measured)]
 
 
 def read_measurement(
@@ -38,7 +58,7 @@ def read_measurement(
     monitors: Sequence[str] | None = None,
     turn_by_turn: str | None = None,
     unit: Unit = "m",
-) -> Measurement | OrbitResponse:
+) -> AnyMeasurement:
     """Read a measurement folder, or a plain table of readings (`.csv`, see `read_table`).
 
     Args:
@@ -50,7 +70,7 @@ def read_measurement(
         unit: of the readings of a table or a turn-by-turn file; a folder's are in m.
 
     Returns:
-        A Measurement, or an OrbitResponse, by the folder's kind.
+        A record of the folder's kind.
 
     Raises:
         MeasurementError: one sentence with the file, the line and what would mend it.
@@ -70,13 +90,13 @@ def read_measurement(
     if not file.is_file():
         raise MeasurementError(f"no '{file}'; a measurement folder has one")
     document = read_document(file, "measurement", FORMAT)
-    read = _trajectory if document["kind"] == "trajectory" else _orbit_response
+    kind = document["kind"]
+    if kind in KINDS:
+        measured: AnyMeasurement = KINDS[kind].read(file, document, monitors)
+        check_table(document, file.with_name(KINDS[kind].table))
+        return measured
+    read = _trajectory if kind == "trajectory" else _orbit_response
     return read(file, document, monitors)
-
-
-def _number(value: Any, missing: float) -> float:
-    """A number of the document; null is what is not finite."""
-    return missing if value is None else float(value)
 
 
 def _trajectory(
@@ -84,24 +104,18 @@ def _trajectory(
 ) -> Measurement:
     with located(file):
         shots, launches, sigma, settings = _shots(document["shots"])
-    index = {shot: i for i, shot in enumerate(shots)}
-    rows = read_rows(file.with_name("readings.csv"), READINGS)
+    rows = read_rows(file.with_name("readings.csv"), TURNS)
     rows.check("shot", "turn", "monitor")
-    order = np.array([index.get(s, -1) for s in rows.whole["shot"].tolist()])
-    if (order < 0).any():
-        row = int((order < 0).argmax())
-        raise rows.error(
-            row, f"shot {rows.whole['shot'][row]} is not among the shots of measurement.json; "
-            "add it there, or take the row out",
-        )  # fmt: skip
+    order = places_of(rows, "shot", shots)
     names, place = match_names(rows, "monitor", monitors)
     readings = dense(rows, order, len(shots), place, len(names))
+    check_table(document, rows.path)  # what is wrong in a line is told with the line
     with located(file):
         return Measurement(
             launches=launches,
             readings=readings,
             monitors=names,
-            noise=_read_noise(document.get("noise"), names, monitors),
+            noise=read_noise(document.get("noise"), names, monitors),
             launch_sigma=sigma,
             settings=settings,
             shots=shots,
@@ -118,18 +132,18 @@ def _shots(
     launches = np.zeros((len(listed), 5))
     sigma = np.tile(UNKNOWN_LAUNCH, (len(listed), 1))
     for i, shot in enumerate(listed):
-        number = int(shot["id"])
-        if number in shots:
-            raise MeasurementError(f"shot {number} stands twice; give each shot an id of its own")
+        own = int(shot["id"])
+        if own in shots:
+            raise MeasurementError(f"shot {own} stands twice; give each shot an id of its own")
         for j, name in enumerate(COORDINATES):
             launches[i, j] = shot.get("launch", {}).get(name, 0.0)
             stated = (shot.get("launch_sigma") or {}).get(name, sigma[i, j])
-            sigma[i, j] = _number(stated, np.inf)
+            sigma[i, j] = number(stated, np.inf)
             if not np.isfinite(launches[i, j]):
                 raise MeasurementError(f"shots[{i}].launch.{name} is not finite; give a number")
-        shots[number] = shot.get("settings") or {}
+        shots[own] = shot.get("settings") or {}
         with located(Path(f"shots[{i}].settings")):
-            check_settings(number, shots[number])
+            check_settings(own, shots[own])
     stated = any(shot.get("launch_sigma") is not None for shot in listed)
     return tuple(shots), launches, sigma if stated else None, tuple(shots.values())
 
@@ -165,6 +179,7 @@ def _orbit_response(
     names, place = match_names(rows, "monitor", monitors)
     response = np.full((len(columns) + 1, len(names), 2), np.nan)
     response[column_of[of_row], place] = rows.xy
+    check_table(document, rows.path)
     with located(file):
         if dispersion and len(columns) not in column_of:
             raise MeasurementError(
@@ -176,7 +191,7 @@ def _orbit_response(
             kicks=np.array([column["kick"] for column in columns], dtype=float),
             monitors=names,
             response=response[:-1],
-            noise=_read_noise(document.get("noise"), names, monitors),
+            noise=read_noise(document.get("noise"), names, monitors),
             rf=rf and RfStep(
                 frequency=float(rf["frequency_hz"]),
                 harmonic=int(rf["harmonic"]),
@@ -186,24 +201,3 @@ def _orbit_response(
             lattice=document.get("lattice"),
             energy=document.get("energy_gev"),
         )  # fmt: skip
-
-
-def _read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) -> Array | None:
-    """[monitor, 2] of a pair or a table by monitor. A monitor without rows is passed over."""
-    if noise is None:
-        return None
-    if not any(isinstance(entry, dict) for entry in noise.values()):
-        return noise_table(_pair(noise), read)
-    table = Names("monitor", noise)
-    if known is not None:
-        every = Names("monitor", known)
-        for name in table.names:
-            every[name]  # an UnknownNameError where the ring has no such monitor
-    names = Names("monitor", read)
-    there = {name: _pair(entry) for name, entry in noise.items() if names.find(name) is not None}
-    return noise_table(there, read)
-
-
-def _pair(entry: Mapping[str, Any] | None) -> tuple[float, float]:
-    entry = entry or {}
-    return _number(entry.get("x"), np.nan), _number(entry.get("y"), np.nan)

@@ -31,6 +31,15 @@ class RfStep:
     orbit: Array | None = None
 
 
+def check_rf(rf: RfStep) -> None:
+    """Raises a MeasurementError for a frequency, a harmonic or a step that cannot be."""
+    if not (0 < rf.frequency < np.inf and rf.harmonic > 0 and abs(rf.step) < np.inf):
+        raise MeasurementError(
+            f"an RF of {rf.frequency:g} Hz, harmonic {rf.harmonic}, step {rf.step:g} Hz "
+            "cannot be; frequency and harmonic are above zero, the step is finite"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class OrbitResponse:
     """Measured orbit changes.
@@ -98,11 +107,7 @@ class OrbitResponse:
                 )
         if self.rf is not None:
             rf = self.rf
-            if not (0 < rf.frequency < np.inf and rf.harmonic > 0 and abs(rf.step) < np.inf):
-                raise MeasurementError(
-                    f"an RF of {rf.frequency:g} Hz, harmonic {rf.harmonic}, step {rf.step:g} Hz "
-                    "cannot be; frequency and harmonic are above zero, the step is finite"
-                )
+            check_rf(rf)
             if rf.orbit is not None:
                 orbit = np.asarray(rf.orbit, dtype=float)
                 if orbit.shape != (monitors, 2):

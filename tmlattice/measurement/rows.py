@@ -25,8 +25,8 @@ _MOST_CELLS = 50_000_000
 """Readings that an array may have without having a hundredth of them in the table: 0.8 GB."""
 
 _CHUNK = 50_000  # rows: 20 MB of Python objects, whatever the size of the file
-_WHOLE = frozenset({"shot", "turn"})
-_NAMES = frozenset({"monitor", "corrector"})
+_WHOLE = frozenset({"shot", "turn", "step"})
+_NAMES = frozenset({"monitor", "corrector", "quantity"})
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ class Rows:
         path: of the file.
         whole: columns of whole numbers by name, [row].
         names: columns of names: the names, each once, and their places, [row].
-        xy: m, [row, 2]; NaN where a field is empty.
+        xy: the other two columns: x, y in m, or a value and its error, [row, 2]; NaN where a
+            field is empty.
     """
 
     path: Path
@@ -52,11 +53,12 @@ class Rows:
         """The error for something wrong in a row, counted from 0."""
         return _error(self.path, row, text)
 
-    def check(self, *keys: str) -> None:
+    def check(self, *keys: str, metres: bool = True) -> None:
         """No row stands twice, no turn is negative, no reading is in millimetres.
 
         Args:
             keys: the columns by which a row is known.
+            metres: the numbers are readings.
 
         Raises:
             MeasurementError: with the line.
@@ -66,7 +68,7 @@ class Rows:
                 row = int((column < 0).argmax())
                 raise self.error(row, f"turn {column[row]} is negative; turns count from 0")
         large = np.abs(self.xy) > LARGEST_READING  # false for NaN
-        if large.any():
+        if metres and large.any():
             row, plane = (int(i) for i in np.argwhere(large)[0])
             raise self.error(
                 row,
@@ -88,7 +90,7 @@ class Rows:
 
 
 def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None = None) -> Rows:
-    """Read a table with names in one or two columns and x, y in m.
+    """Read a table with names in one or two columns, and two of numbers.
 
     Args:
         path: a CSV file in UTF-8.
@@ -139,14 +141,16 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
         path=path,
         whole={name: joined[name] for name in place if name in _WHOLE},
         names=names,
-        xy=np.stack([joined["x"], joined["y"]], axis=1),
+        xy=np.stack([joined[name] for name in place if name not in _WHOLE | _NAMES], axis=1),
     )
 
 
 def match_names(
-    rows: Rows, column: str, known: Sequence[str] | None
+    rows: Rows, column: str, known: Sequence[str] | None, all_of_them: bool = False
 ) -> tuple[tuple[str, ...], Integers]:
     """The names of a column and each row's place among them; the known ones' order if given.
+
+    With `all_of_them`, known names without rows stay.
 
     Raises:
         MeasurementError: a name that is not among the known ones, with its line.
@@ -161,7 +165,7 @@ def match_names(
             there[i] = names[name]
         except UnknownNameError as error:
             raise rows.error(int((place == i).argmax()), str(error)) from error
-    kept = np.unique(there)
+    kept = np.arange(len(names.names)) if all_of_them else np.unique(there)
     return tuple(names.names[i] for i in kept), np.searchsorted(kept, there)[place]
 
 
@@ -179,6 +183,21 @@ def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: i
     readings = np.full((shots, turns, monitors, 2), np.nan)
     readings[shot, turn, monitor] = rows.xy
     return readings
+
+
+def check_size(readings: Array, monitors: Sequence[str]) -> None:
+    """Readings [..., monitor, 2] are such that a reader takes them.
+
+    Raises:
+        MeasurementError: one above 0.2 m.
+    """
+    large = ~(np.abs(readings) <= LARGEST_READING) & ~np.isnan(readings)
+    if large.any():
+        *_, monitor, plane = np.argwhere(large)[0]
+        raise MeasurementError(
+            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
+            f"{LARGEST_READING} m, which no reader takes; readings are in metres"
+        )
 
 
 def _columns(
@@ -244,7 +263,8 @@ def _first_wrong(rows: list[list[str]], width: int, place: dict[str, int]) -> tu
             except (ValueError, OverflowError):
                 if name in _NAMES:
                     return number, f"{row[i]!r} is no name of a {name}; name it"
-                kind = "a whole number" if name in _WHOLE else "a number in m, or empty"
+                unit = " in m" if name in ("x", "y") else ""
+                kind = "a whole number" if name in _WHOLE else f"a number{unit}, or empty"
                 return number, f"{name} is {row[i]!r}; it should be {kind}"
     raise AssertionError("a chunk that cannot be read has a row that cannot")
 

@@ -15,9 +15,9 @@ from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read
 from tmlattice.measurement.trajectory import Measurement
 
 Array = NDArray[np.float64]
-Unit = Literal["m", "mm", "um"]
+Unit = Literal["m", "mm", "um", "nm"]
 
-_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
 
 COLUMNS = ("shot", "turn", "monitor", "x", "y")
 

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -12,10 +12,21 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
-from tmlattice.measurement.folder import FORMAT, READINGS, RESPONSE, RF
+from tmlattice.measurement.documents import Digest
+from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
+from tmlattice.measurement.header import finite, header
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse
-from tmlattice.measurement.rows import LARGEST_READING
+from tmlattice.measurement.rows import check_size
+from tmlattice.measurement.stored_files import (
+    KINDS,
+    TURNS,
+    check_readable,
+    fields,
+    plain_settings,
+    quoted,
+    reading_lines,
+)
 from tmlattice.measurement.trajectory import (
     COORDINATES,
     Measurement,
@@ -26,14 +37,12 @@ from tmlattice.measurement.trajectory import (
 Array = NDArray[np.float64]
 
 
-def write_measurement(
-    folder: str | Path, measurement: Measurement | OrbitResponse, force: bool = False
-) -> None:
+def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bool = False) -> None:
     """Write a measurement folder: whole, or not at all. What it reads back is bit-identical.
 
     Args:
         folder: made where it is not there.
-        measurement: of either kind.
+        measurement: of any kind.
         force: a measurement that is there already is replaced.
 
     Raises:
@@ -44,6 +53,16 @@ def write_measurement(
     if isinstance(measurement, OrbitResponse):
         check_free(folder, force)
         _write_response(Path(folder), measurement)
+        return
+    if not isinstance(measurement, Measurement):
+        check_free(folder, force)
+        check_readable(measurement)
+        (kind,) = (kind for kind in KINDS.values() if kind.record is type(measurement))
+        with output_folder(Path(folder)) as temporary:
+            table = temporary / kind.table
+            with table.open("w", encoding="utf-8", newline="") as file:
+                document = kind.write(file, measurement)
+            _write_signed(temporary, document, table)
         return
     m = measurement
     with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy, force) as writer:
@@ -65,7 +84,7 @@ def check_free(folder: str | Path, force: bool = False) -> None:
     """
     if force:
         return
-    for name in ("measurement.json", "readings.csv", "response.csv"):
+    for name in ("measurement.json", "readings.csv", "response.csv", "tunes.csv"):
         if (Path(folder) / name).exists():
             raise MeasurementError(
                 f"'{folder}' holds a measurement already ({name}); name another folder, or replace "
@@ -75,7 +94,7 @@ def check_free(folder: str | Path, force: bool = False) -> None:
 
 def _write_response(folder: Path, response: OrbitResponse) -> None:
     orbits = [(name, response.response[i]) for i, name in enumerate(response.correctors)]
-    document = _header("orbit_response", response.monitors, response)
+    document = header("orbit_response", response)
     document["columns"] = [
         {"corrector": name, "plane": plane, "kick": float(kick)}
         for name, plane, kick in zip(
@@ -92,8 +111,18 @@ def _write_response(folder: Path, response: OrbitResponse) -> None:
             document["dispersion"] = True
             orbits.append((RF, response.rf.orbit))
     with output_folder(folder) as temporary:
-        write_json(temporary / "measurement.json", document)
-        write_response_table(temporary / "response.csv", response.monitors, orbits)
+        table = temporary / "response.csv"
+        write_response_table(table, response.monitors, orbits)
+        _write_signed(temporary, document, table)
+
+
+def _write_signed(folder: Path, document: dict[str, Any], table: Path) -> None:
+    """measurement.json beside its table, with what says that they belong together."""
+    digest = Digest()
+    with table.open("rb") as file:
+        while part := file.read(1 << 20):
+            digest.add(part)
+    write_json(folder / "measurement.json", {**document, "table_sha256": digest.told()})
 
 
 def write_response_table(
@@ -113,56 +142,9 @@ def write_response_table(
         write = csv.writer(file, lineterminator="\n").writerow
         write(RESPONSE)
         for name, orbit in orbits:
-            _check_size(orbit, monitors)
+            check_size(orbit, monitors)
             for monitor, xy in zip(monitors, orbit.tolist(), strict=True):
-                write((name, monitor, *_fields(xy)))
-
-
-def _header(kind: str, monitors: Sequence[str], source: Any) -> dict[str, Any]:
-    """What both kinds of document begin with; `source` has noise, lattice and energy."""
-    from tmlattice import __version__
-
-    header: dict[str, Any] = {
-        "format": FORMAT,
-        "version": 1,
-        "package": __version__,
-        "kind": kind,
-        "lattice": source.lattice,
-        "energy_gev": None if source.energy is None else float(source.energy),
-        "noise": _write_noise(source.noise, monitors),
-    }
-    return {key: value for key, value in header.items() if value is not None}
-
-
-def _write_noise(noise: Array | None, monitors: Sequence[str]) -> dict[str, Any] | None:
-    if noise is None:
-        return None
-
-    def pair(row: Array) -> dict[str, float | None]:
-        return {plane: _finite(v) for plane, v in zip("xy", row.tolist(), strict=True)}
-
-    if np.array_equal(noise, np.tile(noise[0], (len(noise), 1)), equal_nan=True):
-        return pair(noise[0])
-    return {monitor: pair(row) for monitor, row in zip(monitors, noise, strict=True)}
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _fields(xy: Sequence[float]) -> list[str]:
-    """repr is the shortest text that reads back as the same number; a missing one is empty."""
-    return [repr(v) if v == v else "" for v in xy]  # noqa: PLR0124  (NaN)
-
-
-def _check_size(readings: Array, monitors: Sequence[str]) -> None:
-    large = ~(np.abs(readings) <= LARGEST_READING) & ~np.isnan(readings)
-    if large.any():
-        *_, monitor, plane = np.argwhere(large)[0]
-        raise MeasurementError(
-            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
-            f"{LARGEST_READING} m, which no reader takes; readings are in metres"
-        )
+                write((name, monitor, *fields(xy)))
 
 
 class MeasurementWriter:
@@ -188,14 +170,14 @@ class MeasurementWriter:
         self._shots: set[int] = set()
         self._some = False
         self._document, self._table = document, table
-        header = json.dumps(
-            _header("trajectory", self.monitors, self),
+        start = json.dumps(
+            header("trajectory", self),
             indent=2, ensure_ascii=False, allow_nan=False,
         )  # fmt: skip
-        document.write(header.removesuffix("\n}") + ',\n  "shots": [')
-        table.write(",".join(READINGS) + "\n")
-        # a name with a comma or a quote is quoted as CSV has it
-        self._names = [_quoted(name) for name in self.monitors]
+        document.write(start.removesuffix("\n}") + ',\n  "shots": [')
+        self._digest = Digest()
+        self._write([",".join(TURNS) + "\n"])
+        self._names = quoted(self.monitors)
 
     def add(
         self,
@@ -225,7 +207,7 @@ class MeasurementWriter:
                 f"shot {shot} has readings of the shape {readings.shape}; it should be "
                 f"[turns, {len(self.monitors)}, 2]"
             )
-        _check_size(readings, self.monitors)
+        check_size(readings, self.monitors)
         entry: dict[str, Any] = {"id": int(shot), "launch": _coordinates(launch, "launch")}
         if None in entry["launch"].values():
             raise MeasurementError(f"the launch of shot {shot} is not finite")
@@ -235,20 +217,18 @@ class MeasurementWriter:
             entry["launch_sigma"] = _coordinates(launch_sigma, "launch_sigma")
         if settings:
             check_settings(shot, settings)
-            entry["settings"] = {
-                name: {key: float(amount) for key, amount in changed.items()}
-                for name, changed in settings.items()
-            }
+            entry["settings"] = plain_settings(settings)
         separator = ",\n    " if self._shots else "\n    "
         self._document.write(separator + json.dumps(entry, ensure_ascii=False, allow_nan=False))
         for turn, row in enumerate(readings.tolist()):
-            start = f"{int(shot)},{turn},"
-            self._table.writelines(
-                f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
-                for name, (x, y) in zip(self._names, row, strict=True)
-            )
+            self._write(reading_lines(f"{int(shot)},{turn},", self._names, row))
         self._shots.add(shot)
         self._some |= bool(np.isfinite(readings).any())
+
+    def _write(self, lines: Iterable[str]) -> None:
+        text = "".join(lines)
+        self._digest.add(text.encode())
+        self._table.write(text)
 
     def close(self) -> None:
         """End the document.
@@ -258,11 +238,7 @@ class MeasurementWriter:
         """
         if not self._some:
             raise MeasurementError("no reading was written; a measurement has one at least")
-        self._document.write("\n  ]\n}\n")
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"' if set(name) & {",", '"'} else name
+        self._document.write(f'\n  ],\n  "table_sha256": "{self._digest.told()}"\n}}\n')
 
 
 def _coordinates(values: Any, what: str) -> dict[str, float | None]:
@@ -270,7 +246,7 @@ def _coordinates(values: Any, what: str) -> dict[str, float | None]:
     if array.shape not in ((4,), (5,)):
         raise MeasurementError(f"a {what} is x, px, y, py and delta, not {array.shape} numbers")
     padded = np.pad(array, (0, 5 - len(array))).tolist()
-    return {name: _finite(v) for name, v in zip(COORDINATES, padded, strict=True)}
+    return {name: finite(v) for name, v in zip(COORDINATES, padded, strict=True)}
 
 
 @contextmanager

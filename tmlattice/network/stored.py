@@ -1,5 +1,6 @@
 """A network's weights as a file."""
 
+from io import BytesIO
 from pathlib import Path
 
 import torch
@@ -11,7 +12,9 @@ from tmlattice.network.network import TaylorNetwork
 
 def save_network(network: torch.nn.Module, path: Path) -> None:
     """Write the parameters (W0, W1, W2) with torch; the lattice is not among them."""
-    torch.save(network.state_dict(), path)
+    content = BytesIO()
+    torch.save(network.state_dict(), content)  # into a file, torch ends a full disk in its own way
+    path.write_bytes(content.getvalue())
 
 
 def load_network(ring: Ring, path: Path) -> TaylorNetwork:

@@ -126,7 +126,8 @@ def first_turn(
         monitors: names, in the order of the readings.
         measurement: at least one shot.
         noise: rms of one reading, m; None: the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number or [n]; None: known.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; None:
+            known; inf: unknown.
         dimension: n, of the network.
 
     Raises:
@@ -147,13 +148,13 @@ def first_turn(
         )
     sigma = np.empty_like(readings)
     sigma[:] = np.maximum(np.nan_to_num(stated, nan=1.0), NOISE_FLOOR)
-    width = np.zeros(dimension)
+    width = np.zeros((len(readings), dimension))
     if launch_sigma is not None:
         width[:] = launch_sigma
     known = np.zeros((len(readings), 5))
-    known[:, :4] = width[:4]
+    known[:, :4] = width[:, :4]
     if dimension == 6:
-        known[:, 4] = width[5]
+        known[:, 4] = width[:, 5]
     return Data(
         np.where(valid, readings, 0.0),
         valid,

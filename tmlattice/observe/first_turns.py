@@ -59,6 +59,16 @@ class FirstTurns(Problem):
         return self.white
 
     # --- the model ------------------------------------------------------------------------------
+    @property
+    def first(self) -> Array:
+        """The nominal launches."""
+        return self.data.launches
+
+    @property
+    def free(self) -> int:
+        """Coordinates that are not known exactly."""
+        return self.data.shots * len(self.whitening.columns)
+
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Trajectories and what they leave; `view` is their `Paths`."""
         paths = self.model.paths(nuisances, (*self.fixed, *causes), self._of_shots(kicks))
@@ -170,6 +180,17 @@ class FirstTurns(Problem):
         """The monitor of each reading."""
         one = np.tile(np.arange(len(self.monitors)), self.data.turns)
         return np.broadcast_to(one[None, :, None], self.valid.shape)
+
+    @property
+    def freedom(self) -> int:
+        """What is known of a launch counts as readings of it."""
+        free = self.data.launch_sigma > 0
+        priors = int((free & np.isfinite(self.data.launch_sigma)).sum())
+        return int(self.valid.sum()) + priors - int(free.sum())
+
+    def as_rows(self, readings: Array) -> Array:
+        """With rows of zeros for what is known of the launches."""
+        return self.whitening.signature(readings)
 
     def left(self, point: Point) -> tuple[Array, Array]:
         """The launch takes some of a reading; among small errors that is not looked at."""

@@ -1,19 +1,28 @@
 """How a fit went."""
 
+from collections.abc import Mapping
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
 from tmlattice.fitting.adam import FitResult
+from tmlattice.plots.strip import METHOD_COLOURS
 
 
-def plot_loss(fit: FitResult, ax: Axes | None = None, floor: float | None = None) -> Axes:
+def plot_loss(
+    fit: FitResult,
+    ax: Axes | None = None,
+    floor: float | None = None,
+    others: Mapping[str, float] | None = None,
+) -> Axes:
     """Loss and weighted penalty of every epoch.
 
     Args:
         fit: of `fine_tune`.
         ax: where to draw; else a new one.
         floor: the loss that noise alone would leave, m^2.
+        others: what other methods leave, m^2, by name.
     """
     if ax is None:
         _, ax = plt.subplots()
@@ -25,6 +34,8 @@ def plot_loss(fit: FitResult, ax: Axes | None = None, floor: float | None = None
         ax.semilogy(np.where(penalty > 0, penalty, np.nan), color="C2", label=label)
     if floor:
         ax.axhline(floor, color="k", linestyle="--", linewidth=0.9, label="noise alone")
+    for name, loss in (others or {}).items():
+        ax.axhline(loss, color=METHOD_COLOURS.get(name, "0.3"), linewidth=0.9, label=name)
     ax.axvline(fit.best_epoch, color="0.6", linestyle=":", label="weights kept from here")
     ax.set_xlabel("epoch")
     ax.set_ylabel("loss [m²]")

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import METHOD_COLOURS, lattice_strip
 
 if TYPE_CHECKING:
     from tmlattice.fitting import TuneFit
@@ -33,7 +33,7 @@ def plot_orbit(
 
 
 def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
-    """What the monitors read, the design's and the fitted orbit, their residuals, the lattice.
+    """What the monitors read, the design's orbit and each method's, their residuals, the lattice.
 
     Args:
         outcome: of `tune_fit`.
@@ -48,18 +48,22 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
         measured = outcome.measured[:, plane]
         plot_orbit(outcome.s, measured, orbit, "read by the monitors", "k.")
         plot_orbit(outcome.s, outcome.before[:, plane], orbit, "design network", "C0-")
-        plot_orbit(outcome.s, outcome.after[:, plane], orbit, "fine-tuned network", "C3-")
+        fitted = [m for m in reversed(outcome.methods) if m.fit is not None]  # the first on top
+        for method in fitted:
+            plot_orbit(outcome.s, method.after[:, plane], orbit, method.method)
+            orbit.lines[-1].set_color(METHOD_COLOURS[method.method])
         orbit.set_ylabel(f"{name} [mm]")
         rms = []
-        for model, colour in ((outcome.before, "C0"), (outcome.after, "C3")):
+        models = [("before", outcome.before, "C0")]
+        models += [(m.method, m.after, METHOD_COLOURS[m.method]) for m in fitted]
+        for what, model, colour in models:
             left = measured - model[:, plane]
-            rms.append(
-                f"{1e6 * np.sqrt(np.nanmean(left**2)):.1f}" if np.isfinite(left).any() else "-"
-            )
+            if np.isfinite(left).any():
+                rms.append(f"{what} {1e6 * np.sqrt(np.nanmean(left**2)):.1f} µm")
             residual.plot(outcome.s, 1e3 * left, color=colour, linewidth=0.8)
         residual.set_ylabel(f"residual {name} [mm]")
         residual.annotate(
-            f"rms before {rms[0]} µm, after {rms[1]} µm{noise}",
+            f"rms {', '.join(rms) or '-'}{noise}",
             (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
         )  # fmt: skip
         low, high = residual.get_ylim()
@@ -68,7 +72,7 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
             if magnet is not None:
                 ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
             ax.grid(alpha=0.25)
-    grid[0].legend(loc="upper right", ncols=3, fontsize="small", framealpha=0.9)
+    grid[0].legend(loc="upper right", ncols=5, fontsize="small", framealpha=0.9)
     if magnet is None or outcome.change is None:
         grid[0].set_title(f"First turn of {outcome.source or 'a measurement'}")
     else:

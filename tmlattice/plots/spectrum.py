@@ -1,6 +1,6 @@
 """Spectra of turn-by-turn signals."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 
 from tmlattice.harmonics import levelled, normalised
 from tmlattice.optics import Optics, one_turn_optics
+from tmlattice.plots.strip import METHOD_COLOURS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,17 +48,24 @@ def plot_spectrum(
 
 
 def plot_tune_fit_spectrum(outcome: "TuneFit", axes: "tuple[Axes, Axes]") -> None:
-    """The spectra of the fine-tuned network's tracking, with the design's and the true tunes."""
-    optics = None if outcome.tune_signal is None else one_turn_optics(outcome.fit.network)
+    """The spectra of each method's network, tracked, with the design's and the true tunes."""
+    tunes: list[tuple[Any, str, str, str]] = [
+        (outcome.design_tunes, "design", "C0", ":"),
+        (outcome.true_tunes, "true", "k", "--"),
+    ]
+    for method in reversed(outcome.methods):  # the first on top
+        colour = METHOD_COLOURS[method.method]
+        tunes.append((method.tunes, method.method, colour, "-"))
+        if method.signal is not None and method.fit is not None:
+            optics = one_turn_optics(method.fit.network)
+            for plane, ax in enumerate(axes):
+                plot_spectrum(method.signal[0], plane, ax, optics, colour)
     for plane, ax in enumerate(axes):
-        if outcome.tune_signal is not None:
-            plot_spectrum(outcome.tune_signal[0], plane, ax, optics)
-        for tune, name, colour, style in (
-            (outcome.design_tunes, "design", "C0", ":"),
-            (outcome.true_tunes, "true", "k", "--"),
-            (outcome.network_tunes, "network", "C3", "-"),
-        ):
+        for tune, name, colour, style in tunes:
             if tune is not None:
                 label = f"{name} {tune[plane]:.5f}"
-                ax.axvline(tune[plane], color=colour, linestyle=style, linewidth=1.1, label=label)
+                ax.axvline(
+                    tune[plane], color=colour, linestyle=style, linewidth=1.1, label=label,
+                    zorder=4 if name == "true" else 3,
+                )  # fmt: skip
         ax.legend(loc="upper right", fontsize="small")

@@ -10,6 +10,7 @@ import numpy as np
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, find
+from tmlattice.inference.judge import Misfit
 from tmlattice.report.amounts import amount_text, least_text, probability_text, words
 from tmlattice.report.remedies import (
     consequence_text,
@@ -44,7 +45,7 @@ def closed_text(diagnosis: Diagnosis) -> str:
     gap = diagnosis.heldout
     if gap is None:
         return "No shot was held out: nobody but the fit judges the gap"
-    if diagnosis.kind != "trajectory" and len(diagnosis.steps) < 2:
+    if diagnosis.by_steps and len(diagnosis.steps) < 2:
         return "Nothing was put into the model, so the gap stays"
     if diagnosis.findings and not diagnosis.causes:
         return (
@@ -74,7 +75,7 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Small errors everywhere: (effect, rms and how many times the usual one)."""
     rows = []
     for name, rms in diagnosis.priors.items():
-        if name in CATALOGUE and diagnosis.kind == "trajectory":
+        if name in CATALOGUE and not diagnosis.by_steps:
             usual = CATALOGUE[name].background
             times = f", {rms / usual:.2g} times the usual one" if usual else ""
             error = diagnosis.prior_errors.get(name, 0.0)
@@ -174,12 +175,17 @@ def _open(finding: Finding) -> str:
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
-    if diagnosis.verdict == "distributed" and diagnosis.priors and not diagnosis.steps:
+    if diagnosis.verdict == "distributed" and diagnosis.steps:
+        return (
+            "Look at what stands out of its kind, set the gradients that --repaired-out writes, "
+            "and measure again."
+        )
+    if diagnosis.verdict == "distributed" and diagnosis.priors:
         return (
             "A measurement of this machine from before the fault (--reference) shows a fault that "
             "small errors hide."
         )
-    if diagnosis.verdict == "distributed" and not diagnosis.steps:
+    if diagnosis.verdict == "distributed":
         return (
             "Small errors everywhere look like this: state them (--background all), or give a "
             "measurement of this machine from before the fault (--reference)."
@@ -190,6 +196,38 @@ def advice(diagnosis: Diagnosis) -> str:
             "tell whether it is constant, linear or not, or changes from shot to shot."
         )
     return ""
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """What was found, short where the findings are listed below."""
+    found = diagnosis.findings
+    if len(found) < 2:
+        return verdict_sentence(diagnosis)
+    several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "equivalent"]
+    unnamed = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "located"]
+    text = f"{len(found)} findings."
+    if several:
+        text += f" More than one explanation fits: {', '.join(several)}."
+    if unnamed:
+        text += f" No effect of the catalogue explains {', '.join(unnamed)}."
+    return text
+
+
+def to_do(diagnosis: Diagnosis) -> list[str]:
+    """What to do next, the first first: repairs, then what would tell more."""
+    remedies = [finding.remedy for finding in diagnosis.findings if finding.remedy is not None]
+    done = [f"{remedy.action[0].upper()}{remedy.action[1:]}." for remedy in remedies]
+    if len(diagnosis.findings) == 1 and remedies:
+        done = [f"{done[0]} First: {find(remedies[0].effect).to_check}"]
+    more = next_text(diagnosis) or advice(diagnosis)
+    return [*done, more] if more else done
+
+
+def gap_sentence(diagnosis: Diagnosis) -> str:
+    """How far the gap falls, on the readings that judge."""
+    rows = gap_rows(diagnosis)
+    name, before, after = rows[-1]
+    return f"{name}: from {before} to {after}"
 
 
 def next_text(diagnosis: Diagnosis) -> str:
@@ -264,6 +302,10 @@ def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     if remedy is not None:
         rows.append(("probability", probability_text(finding.probability)))
     rows.append(("seen", _seen_text(finding)))
+    if finding.seen_by is not None and len(finding.seen_by) > 1:
+        by = sorted(finding.seen_by.items(), key=lambda pair: -pair[1])
+        told = ", ".join(f"{100 * share:.0f} % {name}" for name, share in by if share > 0.005)
+        rows.append(("seen by", told))
     if remedy is not None:
         rows.append(("mechanism", mechanism_text(remedy)))
     if len(finding.remedies) > 1:
@@ -289,23 +331,32 @@ MOST = 6
 
 def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """The gap: (which readings, before, after), rms in µm and chi-square per reading."""
-    what = "shots" if diagnosis.kind == "trajectory" else "correctors"
+    what = "correctors" if diagnosis.by_steps else "readings" if diagnosis.parts else "shots"
     rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
+    if len(diagnosis.parts) > 1:
+        rows = [(part.label, part.before, part.after) for part in diagnosis.parts]
     gap = diagnosis.heldout
     if gap is not None:
         rows.append(
             (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.since], gap.misfits[-1])
         )
     return [
-        (name, *(f"{1e6 * m.rms:.1f} µm, chi² {_chi2(m.chi2_per_dof)}" for m in (before, after)))  # type: ignore[misc]
+        (name, *(_misfit_text(m) for m in (before, after)))  # type: ignore[misc]
         for name, before, after in rows
     ]
+
+
+def _misfit_text(misfit: Misfit) -> str:
+    size = f"{1e6 * misfit.rms:.1f} µm, " if np.isfinite(misfit.rms) else ""
+    return f"{size}chi² {_chi2(misfit.chi2_per_dof)}"
 
 
 def heldout_text(diagnosis: Diagnosis) -> str:
     """Who judges."""
     if diagnosis.kind == "trajectory":
         return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
+    if not diagnosis.by_steps:
+        return "at half of the monitors"
     return f"{int(diagnosis.response.held.sum())} correctors"
 
 

@@ -1,0 +1,170 @@
+"""Files that would run something: each carries a harmless mark, which must not appear."""
+
+import contextlib
+import json
+import os
+import shutil
+from pathlib import Path
+
+import at
+import numpy as np
+import pytest
+from at_ring import at_lattice
+from command import tmlattice
+from test_lattice_files import madx, write
+from test_other_codes import ELEGANT
+
+from tmlattice import load_ring
+from tmlattice.challenge import make, run
+from tmlattice.errors import LatticeError, TmlatticeError
+
+BEAM = "beam, particle=electron, energy=3.0;"
+
+MADX = {
+    "reaches the interpreter": 'x = sin.__self__.__loader__.load_module("os").mkdir("MARK");',
+    "reaches names of a function": "x := sinc.__globals__; qq: quadrupole, l=x, k1=0;",
+    "calls a class": "x = qf->update; qf2: qf, l=x;",
+    "leaves a bracket open": "x = (1+2;",
+    "loops": "while (1==1) { x = 1; };",
+    "branches": "if (1==1) { x = 1; };",
+    "has a tower of powers": "x = 9^9^9;",
+    "repeats without end": "l1: line=(999999999*(qf));",
+    "has a line of lines": "a0: line=(qf,qf);"
+    + " ".join(f"a{i}: line=(a{i - 1},a{i - 1});" for i in range(1, 60)),
+    "calls itself": 'call, file="ring.seq";',
+    "calls a device": 'call, file="/dev/zero";',
+    "calls a pipe": 'call, file="pipe";',
+    "has a number of 5000 digits": f"x = {'9' * 5000};",
+    "is nested": f"x = {'(' * 300}1{')' * 300};",
+    "has no end of a statement": "x\n" * 20_000,
+}
+
+
+@pytest.mark.parametrize("what", MADX)
+def test_madx_text_that_runs_or_never_ends(tmp_path, monkeypatch, what):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    path = write(tmp_path, "ring.seq", MADX[what] + "\n" + madx(BEAM))
+    sequence = "a59" if "a59" in MADX[what] else "ring"
+    if what == "reaches names of a function":  # what nothing asks for is not looked at
+        assert load_ring(path).counts()["quadrupole"] == 16
+    else:
+        with pytest.raises(LatticeError) as told:
+            load_ring(path, sequence=sequence)
+        assert len(str(told.value)) < 600
+    assert not Path("MARK").exists()
+
+
+def test_called_files_are_read_like_the_first(tmp_path):
+    path = write(tmp_path, "ring.seq", 'call, file="beam.seq";\n' + madx())
+    write(tmp_path, "beam.seq", BEAM)
+    assert load_ring(path).energy == pytest.approx(3.0)
+    write(tmp_path, "beam.seq", f"{BEAM} x = 9^9^9;")
+    with pytest.raises(LatticeError, match="x = 9"):
+        load_ring(path)
+
+
+def test_expressions_are_what_madx_makes_of_them(tmp_path):
+    text = """
+    l0 := 2*a + 1; a = 0.25; k.one := -2^2 * sqrt(k2^2) / 2e0; k2 = -(3 - 1);
+    q: quadrupole, l:=l0, k1:=k.one; q2: quadrupole, l=q->l, k1=-0.5; m: monitor;
+    half: line=(q, m); ring: line=(2*half, -half, q2);
+    """
+    ring = load_ring(write(tmp_path, "ring.seq", text + BEAM))
+    assert [e.kind for e in ring.elements] == [*("quadrupole", "monitor") * 2, "monitor",
+                                               "quadrupole", "quadrupole"]  # fmt: skip
+    assert ring.elements[0].length == pytest.approx(1.5)
+    assert ring.elements[0].k1 == pytest.approx(-4.0)  # -(2^2) * 2 / 2
+    assert ring.elements[-1].length == pytest.approx(1.5)
+
+
+def test_numbers_of_elegant_do_not_grow_without_end(tmp_path):
+    text = "% 1e300 sto x\n" + "% x x * sto x\n" * 60 + ELEGANT
+    load_ring(write(tmp_path, "ring.lte", text), energy=3.0)
+    with pytest.raises(LatticeError, match="cannot be read"):
+        load_ring(write(tmp_path, "bad.lte", ELEGANT + "Q: KQUAD, L=().__class__\n"), energy=3.0)
+
+
+def small_at(small_ring):
+    cell = [*at_lattice(small_ring)]
+    return at.Lattice(cell, energy=3e9, periodicity=1, name="ring")
+
+
+@pytest.mark.parametrize("suffix", [".json", ".mat", ".m", ".repr"])
+@pytest.mark.parametrize("method", ["../evilPass", "evilPass", "x" * 100_000])
+def test_pass_methods_are_at_s_own(tmp_path, monkeypatch, small_ring, suffix, method):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, "evilPass.py", "open('MARK', 'w')\ndef trackFunction(*a, **k): pass\n")
+    lattice = small_at(small_ring)
+    lattice.append(at.Element("evil", Length=0.0, PassMethod=method))
+    path = tmp_path / f"ring{suffix}"
+    at.save_lattice(lattice, path)
+    with pytest.raises(LatticeError) as told:
+        load_ring(path)
+    assert len(str(told.value)) < 600
+    assert not Path("MARK").exists()
+
+
+def test_counts_that_do_not_fit_end_no_process(tmp_path, small_ring):
+    lattice = small_at(small_ring)
+    lattice.append(at.Element("solenoid", Length=0.5, K=0.2, PassMethod="SolenoidLinearPass"))
+    path = tmp_path / "ring.json"
+    at.save_lattice(lattice, path)
+    assert "solenoid" in load_ring(path).counts()
+    content = json.loads(path.read_text())
+    content["elements"][-1] |= {
+        "PassMethod": "GWigSymplecticPass", "Class": "Element", "Energy": 3e9, "Lw": 0.1,
+        "Bmax": 1.0, "Nstep": 5, "Nmeth": 4, "NHharm": 1000000, "NVharm": 3, "By": [1.0], "Bx": [],
+    }  # fmt: skip
+    path.write_text(json.dumps(content))
+    with pytest.raises(LatticeError, match="AT cannot track the element 'solenoid'"):
+        load_ring(path)
+
+
+@pytest.mark.parametrize(
+    "line", ["__import__('os').system('touch MARK')", "Drift('d', (lambda: 1)())"]
+)
+def test_at_s_texts_are_not_evaluated(tmp_path, monkeypatch, small_ring, line):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "ring.repr"
+    at.save_lattice(small_at(small_ring), path)
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
+        load_ring(path)
+    at.save_lattice(small_at(small_ring), tmp_path / "ring.m")
+    text = (tmp_path / "ring.m").read_text().replace("'bpm_start'", line, 1)
+    write(tmp_path, "ring.m", text)
+    with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
+        load_ring(tmp_path / "ring.m")
+    assert not Path("MARK").exists()
+
+
+def test_damaged_matlab_files_end_no_process(tmp_path, small_ring):
+    path = tmp_path / "ring.mat"
+    at.save_lattice(small_at(small_ring), path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(19)
+    for _ in range(6):
+        damaged = bytearray(whole)
+        for place in rng.integers(128, len(whole), 40):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(damaged)
+        with contextlib.suppress(LatticeError):  # any other exception, or a crash, fails
+            load_ring(path)
+
+
+def test_a_case_runs_no_lattice_that_is_not_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ring = Path(__file__).parent / "lattices" / "small_ring.py"
+    shutil.copy(ring, "small_ring.py")
+    make("A", 1, 1, Path("set"), lattice="small_ring.py", shots=2, progress=False)
+    Path("evil.py").write_text(Path("small_ring.py").read_text() + "\nopen('MARK', 'w')\n")
+    case = Path("set/cases/0000/case.json")
+    case.write_text(case.read_text().replace("small_ring.py", "evil.py"))
+    told = run(Path("set"), jobs=1, progress=False, lattice="small_ring.py")
+    assert "say --lattice evil.py" in told["0000"]["error"]
+    with pytest.raises(TmlatticeError, match="is Python code, which would be run"):
+        run(Path("set"), jobs=1, progress=False)
+    done = tmlattice("challenge", "run", "set", "-q", cwd=tmp_path, check=2)
+    assert "say --lattice small_ring.py" in done.stderr
+    assert not Path("MARK").exists()

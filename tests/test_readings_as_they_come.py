@@ -1,0 +1,258 @@
+"""Files of a control room: whatever their columns, the readings come out, or a sentence."""
+
+import csv
+import json
+
+import h5py
+import numpy as np
+import pytest
+from command import tmlattice
+from conftest import SMALL
+
+from tmlattice import Cause, simulate
+from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.importers import Options, bring_in
+from tmlattice.importers.readings import place_of
+from tmlattice.importers.told import Told, read_told
+
+
+@pytest.fixture(scope="module")
+def data(small_ring):
+    """Three shots; one reading is missing."""
+    made = simulate(
+        small_ring, [Cause("quadrupole_gradient", "QD::5", -0.05)], shots=3, amplitude=3e-4,
+        noise=2e-6, engine="ocelot", seed=4,
+    ).measurement()  # fmt: skip
+    made.readings[1, 0, 4, 0] = np.nan
+    return made
+
+
+def wide(path, data, header, scale=1e3, separator=","):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, delimiter=separator)
+        writer.writerow(["shot", *(header(m, p) for m in data.monitors for p in "xy")])
+        for shot, values in enumerate(data.readings[:, 0]):
+            row = ["" if np.isnan(v) else repr(float(scale * v)) for v in values.ravel()]
+            if separator == ";":
+                row = [v.replace(".", ",") for v in row]
+            writer.writerow([str(shot), *row])
+    return path
+
+
+def same(brought, data):
+    own = brought.measurement
+    readings = own.select(monitors=data.monitors).readings
+    np.testing.assert_allclose(readings, data.readings, rtol=1e-6, atol=1e-12)
+    assert np.isinf(own.launch_sigma[:, :4]).all()
+    return brought
+
+
+@pytest.mark.parametrize(
+    ("header", "scale", "told"),
+    [
+        (lambda m, p: f"{m} {p} [mm]", 1e3, "in mm, as the file says"),
+        (lambda m, p: f"{m}_{p}_um", 1e6, "in um, as the file says"),
+        (lambda m, p: f"{p}_{m}", 1e3, "no unit is given: readings are taken in mm"),
+        (lambda m, p: f"SR:{m.upper()}:SA:{p.upper()}", 1e9, "readings are taken in nm"),
+        (lambda m, p: f"{m}.Pos{p.upper()} (µm)", 1e6, "in um, as the file says"),
+        (lambda m, p: f"{m}/{'H' if p == 'x' else 'V'}", 1.0, "readings are taken in m"),
+    ],
+)
+def test_a_row_a_shot_and_a_column_a_monitor_and_plane(
+    small_ring, data, tmp_path, header, scale, told
+):
+    path = wide(tmp_path / "a.csv", data, header, scale)
+    brought = same(bring_in([path], Options(ring=small_ring)), data)
+    assert any(told in sentence for sentence in brought.assumed), brought.assumed
+    assert brought.measurement.noise is None
+    assert any("estimates it" in sentence for sentence in brought.assumed)
+
+
+def test_semicolons_and_decimal_commas(small_ring, data, tmp_path):
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m}:{p} [mm]", separator=";")
+    same(bring_in([path], Options(ring=small_ring)), data)
+
+
+LONG = {
+    "x and y": (["shot", "BPM", "x [mm]", "y [mm]"], lambda s, m, x, y: [[s, m, x, y]]),
+    "plane and value": (
+        ["time", "monitor", "plane", "value (mm)"],
+        lambda s, m, x, y: [[f"t{s}", m, "H", x], [f"t{s}", m, "V", y]],
+    ),
+    "channels": (
+        ["cycle", "pv", "value [mm]"],
+        lambda s, m, x, y: [[s, f"R1:{m}:X", x], [s, f"R1:{m}:Y", y]],
+    ),
+}
+
+
+@pytest.mark.parametrize("form", LONG)
+def test_a_row_a_monitor(small_ring, data, tmp_path, form):
+    header, rows = LONG[form]
+    lines = [header]
+    for shot, values in enumerate(1e3 * data.readings[:, 0]):
+        for monitor, xy in zip(data.monitors, values, strict=True):
+            x, y = ("" if np.isnan(v) else repr(float(v)) for v in xy)
+            lines += rows(str(shot), monitor, x, y)
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(",".join(line) for line in lines))
+    same(bring_in([path], Options(ring=small_ring)), data)
+
+
+def test_blanks_under_a_header_that_is_a_comment(small_ring, data, tmp_path):
+    lines = ["# orbit of 3 May", "# name x_mm y_mm"]
+    for monitor, xy in zip(data.monitors, 1e3 * data.readings[0, 0], strict=True):
+        lines.append(f"{monitor} {float(xy[0])!r} {float(xy[1])!r}")
+    path = tmp_path / "orbit.txt"
+    path.write_text("\n".join(lines))
+    brought = bring_in([path], Options(ring=small_ring))
+    own = brought.measurement.select(monitors=data.monitors)
+    np.testing.assert_allclose(own.readings[0], data.readings[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["matrix", "columns"])
+def test_hdf5_with_units_as_attributes(small_ring, data, tmp_path, form):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for i, plane in enumerate("xy"):
+            values = 1e6 * data.readings[:, 0, :, i]
+            if form == "matrix":
+                file[plane] = values
+                file[plane].attrs["units"] = "um"
+                continue
+            for monitor, column in zip(data.monitors, values.T, strict=True):
+                file[f"orbit/{monitor}/{plane}"] = column
+                file[f"orbit/{monitor}/{plane}"].attrs["unit"] = "um"
+        if form == "matrix":
+            file["names"] = list(data.monitors)
+    same(bring_in([path], Options(ring=small_ring)), data)
+
+
+def test_sdds_arrays(small_ring, data, tmp_path):
+    """Written byte by byte after the format's definition: one page, an array a monitor."""
+    path = tmp_path / "a.sdds"
+    names = [f"{m}:{p}" for m in data.monitors for p in "XY"]
+    lines = ["SDDS1", "!# little-endian"]
+    lines += [f"&array name={n}, type=double, units=mm, dimensions=1, &end" for n in names]
+    body = np.int32(0).tobytes()
+    for i in range(len(names)):
+        column = 1e3 * data.readings[:, 0].reshape(3, -1)[:, i]
+        body += np.int32(3).tobytes() + column.astype("<f8").tobytes()
+    path.write_bytes("\n".join([*lines, "&data mode=binary, &end", ""]).encode() + body)
+    same(bring_in([path], Options(ring=small_ring)), data)
+
+
+def test_the_map_says_names_unit_noise_and_what_is_bad(small_ring, data, tmp_path):
+    alias = {m: f"P{i:02d}" for i, m in enumerate(data.monitors)}
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{alias[m]}:{p}")
+    with pytest.raises(MeasurementError, match=r"no monitor 'P00'.*--map.*--example"):
+        bring_in([path], Options(ring=small_ring))
+    names = "\n".join(f"  {alias[m]}: {m}" for m in data.monitors)
+    (tmp_path / "map.yaml").write_text(
+        f"unit: mm\nnoise: 2 um\nnames:\n{names}\nbad: [{data.monitors[2]}, 'P03']\n"
+    )
+    told = read_told(tmp_path / "map.yaml")
+    brought = bring_in([path], Options(ring=small_ring, told=told))
+    own = brought.measurement
+    left = [m for i, m in enumerate(data.monitors) if i not in (2, 3)]
+    assert sorted(own.monitors) == sorted(left)
+    kept = data.select(monitors=left)
+    np.testing.assert_allclose(own.select(monitors=left).readings, kept.readings, rtol=1e-6)
+    assert own.noise == pytest.approx(np.full((len(left), 2), 2e-6))
+    assert any("left out as told" in sentence for sentence in brought.assumed)
+
+
+def test_a_map_may_say_that_devices_are_in_beam_order(small_ring, data, tmp_path):
+    ordered = data.in_order_of([m.name for m in small_ring.monitors])
+    alias = {m: f"P{i:02d}" for i, m in enumerate(ordered.monitors)}
+    path = wide(tmp_path / "a.csv", ordered, lambda m, p: f"{alias[m]}:{p} [mm]")
+    same(bring_in([path], Options(ring=small_ring, told=Told(in_order=True))), ordered)
+    fewer = ordered.select(monitors=ordered.monitors[1:])
+    path = wide(tmp_path / "b.csv", fewer, lambda m, p: f"{alias[m]}:{p} [mm]")
+    with pytest.raises(MeasurementError, match="not the same in order"):
+        bring_in([path], Options(ring=small_ring, told=Told(in_order=True)))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("colour: red", "no key 'colour'; there are unit, noise, names, bad, columns"),
+        ("unit: inch", "no unit 'inch'; there are m, mm, um"),
+        ("noise: loud", "a noise of 'loud' cannot be"),
+        ("- a\n- b", "is no table"),
+        ("a: [1", "is no YAML"),
+        ("columns: {bpm: x}", "no column 'bpm'; there are monitor, plane"),
+    ],
+)
+def test_a_wrong_map_is_a_sentence(tmp_path, text, words):
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(MeasurementError, match=words):
+        read_told(tmp_path / "map.yaml")
+
+
+def test_a_map_with_a_monitor_that_is_not_there(small_ring, data, tmp_path):
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p}")
+    with pytest.raises(UnknownNameError, match="no monitor 'end_99'; did you mean"):
+        bring_in([path], Options(ring=small_ring, told=Told(names={"a": "end_99"})))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a b\n1 2\n", "no column holds readings"),
+        ("shot,end_1 x [mm]\n0,wet\n", "'wet' of 'end_1 x' is no number"),
+        ("shot,end_1 x [inch]\n0,1\n", "no unit 'inch'"),
+        ("monitor,x,y\nend_1,0.1,0.1\nend_1,0.2,0.2\n", "stands twice in one shot"),
+        ("shot,end_1 x\n0,1,2\n", "line 2: 3 fields where the header has 2"),
+        ("monitor,s\nend_1,0.1\n", "names without readings"),
+        ("", "empty"),
+    ],
+)
+def test_a_table_that_says_too_little_is_a_sentence(small_ring, tmp_path, text, words):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(MeasurementError, match=words):
+        bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
+
+
+def test_a_plane_is_a_word_of_its_own():
+    assert place_of("SR:C01-BPM:1:X-I").plane == 0
+    assert place_of("bpm_3_ver").plane == 1
+    assert place_of("x_bpm7").device == "bpm7"
+    for name in ("yBPM", "x", "temperature", "phy_3"):
+        assert place_of(name) is None, name
+
+
+def test_spellings_are_matched_and_a_part_of_a_name_is_not(small_ring, data, tmp_path):
+    """'bpm::1' is 'BPM 1'; 'end_1' is not in 'end_11'."""
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m.replace('::', ' ').upper()} {p} [mm]")
+    same(bring_in([path], Options(ring=small_ring)), data)
+    part = data.select(monitors=["end_1", "end_2"])
+    path = wide(tmp_path / "b.csv", part, lambda m, p: f"{m}7 {p} [mm]")
+    with pytest.raises(MeasurementError, match="no monitor 'end_17'"):
+        bring_in([path], Options(ring=small_ring))
+
+
+def test_from_templates_to_a_name(tmp_path):
+    """`import --example`, and each of its readings diagnosed as it stands."""
+    tmlattice("import", "--example", "--lattice", SMALL, "--out", "ex", cwd=tmp_path, check=0)
+    named = set()
+    for name, more in (
+        ("readings_wide.csv", ["--map", "ex/map.yaml"]),
+        ("readings_long.csv", []),
+        ("readings.h5", []),
+    ):
+        words = ["diagnose", SMALL, f"ex/{name}", *more, "--json", "a.json"]
+        done = tmlattice(*words, cwd=tmp_path, check=0)
+        document = json.loads((tmp_path / "a.json").read_text())
+        assert "readings are in mm" in done.stdout
+        assert document["provenance"]["assumed_of_files"]
+        assert document["verdict"] == "named"
+        named.add(tuple(finding["element"] for finding in document["findings"]))
+    assert len(named) == 1
+    words = ["import", "ex/response.csv", "--lattice", SMALL, "--out", "r"]
+    assert "orbit response" in tmlattice(*words, cwd=tmp_path, check=0).stdout
+    assert "readings are in mm" in tmlattice(
+        "check", SMALL, "ex/readings_long.csv", cwd=tmp_path
+    ).stdout  # fmt: skip
+    done = tmlattice("import", "--out", "x", cwd=tmp_path, check=2)
+    assert "--example" in done.stderr

@@ -1,0 +1,70 @@
+"""The README is short, its links lead somewhere, and its commands do what it says, as written."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from command import tmlattice
+
+from tmlattice.lattice import save_ring
+
+ROOT = Path(__file__).parent.parent
+SMALL = ROOT / "tests" / "lattices" / "small_ring.py"
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+LONGEST = 160  # lines
+HEAVIEST = 150_000  # bytes of a picture
+BLOCKS = [block.strip().splitlines() for block in re.findall(r"```sh\n(.*?)```", README, re.S)]
+
+
+@pytest.fixture(scope="module")
+def reader(small_ring, tmp_path_factory):
+    """A folder with the files that the README calls the reader's own."""
+    place = tmp_path_factory.mktemp("reader")
+    save_ring(small_ring, place / "my_ring.json")
+    fault = ("--effect", "quadrupole_gradient QD::5 -0.05")
+    for words in (
+        ("--out", "yesterday"),
+        ("--out", "today", "--seed", 1, *fault),
+        ("--kind", "orbit-response", "--engine", "ocelot", "--out", "my_response", *fault),
+    ):
+        tmlattice("simulate", SMALL, *words, cwd=place, check=0)
+    (place / "my_readings.csv").write_bytes((place / "today" / "readings.csv").read_bytes())
+    return place
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: " ".join(block[0].split()[1:3]))
+def test_commands_run_as_written_and_write_what_they_name(reader, block):
+    for line in block:
+        program, *words = shlex.split(line)
+        assert program == "tmlattice"
+        tmlattice(*words, cwd=reader, check=0)
+        for option in ("--out", "--lattice-out", "--repaired-out"):
+            if option in words:
+                assert (reader / words[words.index(option) + 1]).exists(), line
+
+
+def test_what_it_shows_of_a_report_is_what_the_command_says(reader):
+    (shown,) = re.findall(r"```text\n(.*?)\n```", README)
+    assert (reader / "diagnosis_1" / "report.txt").read_text().startswith(shown)
+
+
+def test_there_are_five_examples_and_the_page_is_short():
+    assert len(BLOCKS) == 5
+    assert len(README.splitlines()) <= LONGEST
+
+
+def test_its_python_is_of_this_package(reader, monkeypatch):
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    monkeypatch.chdir(reader)
+    exec(code, {})
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_links_and_pictures_are_there(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for picture, link in re.findall(r"(!?)\[[^\]]*\]\(([^)#]+)", text):
+        if not link.startswith("http"):
+            path = (ROOT / page).parent / link
+            assert path.exists(), link
+            assert not picture or path.stat().st_size < HEAVIEST, link

@@ -1,0 +1,290 @@
+"""Folders of turns, closed orbits, dispersion and tunes: round trips, damage, order, parts."""
+
+import json
+import math
+from importlib.resources import files
+
+import jsonschema
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from tmlattice import read_measurement, write_measurement
+from tmlattice.cli.command import tmlattice
+from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
+
+VALID = jsonschema.Draft202012Validator(
+    json.loads((files("tmlattice") / "schemas" / "measurement.schema.json").read_text())
+)
+SETTINGS = ({"q": {"k1_relative": 0.01}}, {})
+MONITORS = ("a", 'b,"', "C")
+reading = st.one_of(st.just(math.nan), st.floats(-0.2, 0.2), st.just(-0.0))
+known = st.one_of(st.just(math.nan), st.floats(1e-9, 1e-3))
+noises = st.none() | arrays(float, (3, 2), elements=known)
+hints = {"lattice": "petra3", "energy": 6.0}
+
+
+def turns_of(shape=(2, 16, 3, 2), **more):
+    readings = np.arange(np.prod(shape), dtype=float).reshape(shape) * 1e-6
+    return TurnByTurn(readings, ("a", "b", "c"), **more)
+
+
+def same(one, other):
+    assert type(one) is type(other)
+    for field in one.__dataclass_fields__:
+        a, b = getattr(one, field), getattr(other, field)
+        if field == "steps":
+            for s, t in zip(a, b, strict=True):
+                assert (s.frequency, s.harmonic, s.step) == (t.frequency, t.harmonic, t.step)
+                np.testing.assert_array_equal(s.orbit, t.orbit)
+        elif isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)  # to the last bit, NaN for NaN
+        else:
+            assert a == b, field
+
+
+def round_trip(tmp_path, measured):
+    write_measurement(tmp_path / "m", measured, force=True)
+    same(measured, read_measurement(tmp_path / "m"))
+    VALID.validate(json.loads((tmp_path / "m" / "measurement.json").read_text(encoding="utf-8")))
+
+
+quick = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+@quick
+@given(arrays(float, (2, 16, 3, 2), elements=reading), noises)
+def test_turns_read_back_bit_by_bit(tmp_path, readings, noise):
+    readings[1, 15, 0, 0] = 1e-3
+    round_trip(tmp_path, TurnByTurn(readings, MONITORS, noise, SETTINGS, (3, 1), **hints))
+
+
+@quick
+@given(arrays(float, (2, 3, 2), elements=reading), noises)
+def test_closed_orbits_read_back_bit_by_bit(tmp_path, orbit, noise):
+    orbit[1, 2, 1] = 1e-3
+    round_trip(tmp_path, ClosedOrbit(orbit, MONITORS, noise, SETTINGS, (3, 1), **hints))
+
+
+@quick
+@given(arrays(float, (2, 3, 2), elements=reading), noises)
+def test_dispersion_reads_back_bit_by_bit(tmp_path, orbits, noise):
+    orbits[1, 2, 1] = 1e-3
+    steps = [RfStep(499664399.423, 3840, s, o) for s, o in zip((-300.0, 250.0), orbits)]  # noqa: B905
+    round_trip(tmp_path, Dispersion(tuple(steps), MONITORS, noise, **hints))
+
+
+@pytest.mark.parametrize("chromaticity", [None, [[1.5, -2.0], [math.nan, 3.0]]])
+@pytest.mark.parametrize("error", [None, [[1e-4, math.nan], [1e-5, 1e-3]]])
+def test_tunes_read_back_bit_by_bit(tmp_path, chromaticity, error):
+    of_chromaticity = None if chromaticity is None else error
+    tune = [[0.1234567890123456, 0.0], [math.nan, 0.9]]
+    round_trip(
+        tmp_path,
+        TuneReading(tune, error, chromaticity, of_chromaticity, SETTINGS, (0, 4), **hints),
+    )
+
+
+def test_ring_gives_names_and_order(tmp_path):
+    write_measurement(tmp_path / "m", turns_of(noise={"a": (1e-6, 2e-6)}))
+    read = read_measurement(tmp_path / "m", ["C", "other", "A", "b"])
+    assert read.monitors == ("C", "A", "b")
+    np.testing.assert_array_equal(read.readings, turns_of().readings[:, :, [2, 0, 1]])
+    np.testing.assert_array_equal(read.noise[1], [1e-6, 2e-6])
+    with pytest.raises(MeasurementError, match=r"line 2: no monitor 'a'"):
+        read_measurement(tmp_path / "m", ["b", "c", "d"])
+
+
+def stored():
+    orbit = np.arange(12, dtype=float).reshape(2, 3, 2) * 1e-6
+    names = ("a", "b", "c")
+    steps = tuple(RfStep(5e8, 100, 200.0, o) for o in orbit)
+    return [
+        (turns_of(noise=(1e-6, 2e-6)), lambda m: np.moveaxis(m.readings, 2, 0)),
+        (ClosedOrbit(orbit, names, (1e-6, 2e-6)), lambda m: np.moveaxis(m.orbit, 1, 0)),
+        (Dispersion(steps, names, (1e-6, 2e-6)), lambda m: np.moveaxis(m.orbits, 1, 0)),
+    ]
+
+
+@pytest.mark.parametrize(("measured", "values"), stored())
+def test_monitors_in_another_order_keep_their_own_readings(measured, values):
+    ring = ("x", "c", "b", "y", "a")
+    spread = measured.in_order_of(ring)
+    assert spread.monitors == ring
+    for name in ring:
+        own = values(spread)[ring.index(name)]
+        if name in "xy":
+            assert np.isnan(own).all()
+            assert np.isnan(spread.noise[ring.index(name)]).all()
+        else:
+            np.testing.assert_array_equal(own, values(measured)["abc".index(name)])
+    part = spread.select(monitors=["b", "c"])
+    np.testing.assert_array_equal(values(part), values(measured)[1:][[0, 1]])
+    np.testing.assert_array_equal(part.noise, [[1e-6, 2e-6]] * 2)
+    with pytest.raises(UnknownNameError, match="no monitor 'a'"):
+        part.select(monitors=["a"])
+    with pytest.raises(UnknownNameError, match="no monitor 'c'"):
+        part.in_order_of(["b"])
+
+
+def test_shots_in_another_order_keep_their_settings():
+    measured = turns_of(settings=SETTINGS, shots=(7, 2))
+    part = measured.select(shots=[2, 7])
+    assert part.shots == (2, 7)
+    assert part.settings == SETTINGS[::-1]
+    np.testing.assert_array_equal(part.readings, measured.readings[::-1])
+    with pytest.raises(MeasurementError, match="no shot 3; there are 7, 2"):
+        measured.select(shots=[3])
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: turns_of((1, 15, 3, 2)), "15 turns are no turn-by-turn .* 'trajectory'"),
+        (lambda: turns_of((1, 16, 2, 2)), "turns at 3 monitors need"),
+        (lambda: turns_of(shots=(1, 1)), "2 shots need 2 shot ids"),
+        (lambda: turns_of(settings=({},)), "1 settings for 2 shots"),
+        (lambda: turns_of(settings=({"q": {"k3": 1.0}}, {})), "no setting 'k3'"),
+        (lambda: turns_of(energy=-1.0), "above zero"),
+        (lambda: turns_of(noise=(0.0, 1.0)), "it is an rms"),
+        (lambda: TurnByTurn(np.full((1, 10_001, 1, 2), 0.0), ("a",)), "16 to 10000; give fewer"),
+        (lambda: TurnByTurn(np.full((1, 16, 1, 2), NAN), ("a",)), "every reading is missing"),
+        (lambda: TurnByTurn(np.full((1, 16, 1, 2), math.inf), ("a",)), "a reading is infinite"),
+        (lambda: ClosedOrbit(np.zeros((1, 2)), ("a",)), r"need \[shots, 1, 2\]"),
+        (lambda: ClosedOrbit(np.full((1, 1, 2), NAN), ("a",)), "every reading is missing"),
+        (lambda: Dispersion((), ("a",)), "no step of the RF"),
+        (lambda: Dispersion((RfStep(5e8, 10, 0.0, [[0, 0]]),), ("a",)), "step of 0 Hz"),
+        (lambda: Dispersion((RfStep(-5e8, 10, 1.0, [[0, 0]]),), ("a",)), "cannot be"),
+        (lambda: Dispersion((RfStep(5e8, 10, 1.0),), ("a",)), r"orbit has the shape \(\)"),
+        (
+            lambda: Dispersion((RfStep(5e8, 10, 1.0, [[math.inf, 0]]),), ("a",)),
+            "an orbit change is infinite",
+        ),
+        (lambda: TuneReading([0.1, 0.2]), r"it should be \[shots, 2\]"),
+        (lambda: TuneReading([[37.12, 0.2]]), r"37.12 is no fraction of the full tune"),
+        (lambda: TuneReading([[0.1, 0.2]], [[0.0, 1e-3]]), "error of the tune is 0"),
+        (lambda: TuneReading([[NAN, NAN]]), "every tune is missing"),
+        (lambda: TuneReading([[0.1, 0.2]], None, [[1.0]]), "chromaticities have the shape"),
+        (lambda: TuneReading([[0.1, 0.2]], None, [[math.inf, 1]]), "chromaticity is infinite"),
+        (lambda: TuneReading([[0.1, 0.2]], None, None, [[0.1, 0.1]]), "need chromaticities"),
+    ],
+)
+def test_records_that_cannot_be_say_why(make, words):
+    with pytest.raises((MeasurementError, UnknownNameError), match=words):
+        make()
+
+
+def folder_of(tmp_path, document, table, name="readings.csv"):
+    there = tmp_path / "m"
+    there.mkdir()
+    stated = {"format": "tmlattice-measurement", "version": 1, **document}
+    (there / "measurement.json").write_text(json.dumps(stated))
+    (there / name).write_text("\n".join(table) + "\n")
+    return there
+
+
+SHOT = [{"id": 0}]
+STEP = {"frequency_hz": 5e8, "harmonic": 100, "step_hz": 100.0}
+
+
+@pytest.mark.parametrize(
+    ("document", "table", "words"),
+    [
+        ({"kind": "turn_by_turn"}, ["shot"], 'it has no "shots"'),
+        (
+            {"kind": "turn_by_turn", "shots": [{"id": 0, "launch": {"x": 0.0}}]}, ["shot"],
+            r'shots\[0\] has a key "launch"; known are id, settings',
+        ),
+        (
+            {"kind": "turn_by_turn", "shots": SHOT},
+            ["shot,turn,monitor,x,y", "0,0,a,0,0", "1,0,a,0,0"],
+            "line 3: shot 1 is not among the shots",
+        ),
+        (
+            {"kind": "turn_by_turn", "shots": SHOT}, ["shot,turn,monitor,x,y", "0,0,a,0,0"],
+            "measurement.json: 1 turns are no turn-by-turn measurement",
+        ),
+        (
+            {"kind": "closed_orbit", "shots": SHOT}, ["shot,turn,monitor,x,y", "0,0,a,0,0"],
+            "its first line is shot,monitor,x,y",
+        ),
+        (
+            {"kind": "closed_orbit", "shots": SHOT}, ["shot,monitor,x,y", "0,a,1.5,0"],
+            "line 2: x = 1.5 m is above 0.2 m",
+        ),
+        (
+            {"kind": "closed_orbit", "shots": SHOT}, ["shot,monitor,x,y", "0,a,0,0", "0,A,0,0"],
+            "line 3: shot 0, monitor a stands in the table already",
+        ),
+        ({"kind": "closed_orbit", "shots": [*SHOT, *SHOT]}, ["shot"], "shot 0 stands twice"),
+        (
+            {"kind": "dispersion", "steps": [STEP]}, ["step,monitor,x,y", "1,a,0,0"],
+            "line 2: step 1 is not among the steps",
+        ),
+        ({"kind": "dispersion"}, ["step"], 'it has no "steps"'),
+        (
+            {"kind": "dispersion", "steps": [{**STEP, "step_hz": 0.0}]},
+            ["step,monitor,x,y", "0,a,0,0"], "measurement.json: an RF step of 0 Hz",
+        ),
+        (
+            {"kind": "tunes", "shots": SHOT}, ["shot,quantity,value,error", "0,tune_z,0.1,"],
+            "line 2: no quantity 'tune_z'; did you mean 'tune_",
+        ),
+        (
+            {"kind": "tunes", "shots": SHOT}, ["shot,quantity,value,error", "0,tune_x,a,"],
+            "line 2: value is 'a'; it should be a number, or empty",
+        ),
+        (
+            {"kind": "tunes", "shots": SHOT}, ["shot,quantity,value,error", "0,tune_x,1.1,"],
+            "measurement.json: a tune of 1.1 is no fraction",
+        ),
+    ],
+)  # fmt: skip
+def test_damaged_folder_names_its_place(tmp_path, document, table, words):
+    name = "tunes.csv" if document["kind"] == "tunes" else "readings.csv"
+    with pytest.raises(MeasurementError, match=words):
+        read_measurement(folder_of(tmp_path, document, table, name))
+
+
+def test_chromaticity_may_be_larger_than_any_reading(tmp_path):
+    table = ["shot,quantity,value,error", "0,tune_x,0.25,1e-4", "0,chromaticity_y,-80,0.5"]
+    read = read_measurement(
+        folder_of(tmp_path, {"kind": "tunes", "shots": SHOT}, table, "tunes.csv")
+    )
+    np.testing.assert_array_equal(read.tune, [[0.25, np.nan]])
+    np.testing.assert_array_equal(read.chromaticity, [[np.nan, -80.0]])
+    np.testing.assert_array_equal(read.chromaticity_error, [[np.nan, 0.5]])
+
+
+def test_old_data_are_kept_without_force(tmp_path):
+    write_measurement(tmp_path / "m", TuneReading([[0.1, 0.2]]))
+    (tmp_path / "m" / "measurement.json").unlink()
+    with pytest.raises(MeasurementError, match=r"holds a measurement already \(tunes.csv\)"):
+        write_measurement(tmp_path / "m", turns_of())
+    write_measurement(tmp_path / "m", turns_of(), force=True)
+
+
+def test_too_large_readings_are_not_written(tmp_path):
+    for measured in (
+        TurnByTurn(np.full((1, 16, 1, 2), 0.3), ("a",)),
+        ClosedOrbit(np.full((1, 1, 2), 0.3), ("a",)),
+        Dispersion((RfStep(5e8, 100, 1.0, np.full((1, 2), 0.3)),), ("a",)),
+    ):
+        with pytest.raises(MeasurementError, match=r"monitor 'a' reads 0.3 m in x"):
+            write_measurement(tmp_path / "m", measured)
+    assert not (tmp_path / "m").exists()
+
+
+def test_command_that_cannot_use_tunes_says_so(tmp_path):
+    write_measurement(tmp_path / "m", TuneReading([[0.1, 0.2]]))
+    with pytest.raises(MeasurementError, match="is a tune measurement; the check knows"):
+        CliRunner().invoke(
+            tmlattice, ["check", "petra3", str(tmp_path / "m")], catch_exceptions=False
+        )

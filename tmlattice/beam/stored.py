@@ -1,0 +1,224 @@
+"""The stored beam about its closed orbit, and how every effect moves it: orbit, tunes, modes.
+
+Small oscillations about the closed orbit are two modes. With the one-turn matrix M, M U = U Lambda
+for the modes' vectors U and Lambda = exp(2 pi i Q); where the ring reads with the slope G of its
+launch, a mode is seen as E = G U. All matrices are carried back to the start of the ring: a change
+D of the layer k's matrix is the source S = C^-1 D C there (C from the start to the layer), and with
+the sum T of the sources before a place
+
+    d (matrix to there) = C T,    d M = M T_end,    d E = G T U + G dU,
+
+dU and d Q by perturbation of the eigenvalues. An effect that kicks moves the closed orbit, which
+bends every map behind: with P_j the sum over the curved layers of C^-1 B (C e) C per unit e of the
+launch, its sources are contractions of P. So every effect costs some products of small matrices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.effects.directions import Directions, directions_nearby
+from tmlattice.errors import UnstableRingError
+from tmlattice.maps.taylor import second_derivatives
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Hypothesis = tuple[str, str | None]
+
+TRANSVERSE = 4
+"""Coordinates of the betatron motion: energy and path length stay what the closed orbit has."""
+
+NEAR = 1e-9
+"""Distance of two eigenvalues below which modes mix freely and have no derivative."""
+
+GROWTH = 1e-2
+"""Distance of an eigenvalue from the unit circle at which the motion counts as unstable: off the
+axis second-order maps are symplectic to their own order only (1e-5 for an orbit of 6 mm)."""
+
+
+STILL = 1e-12
+"""m and rad per unit: effects that kick less leave the closed orbit where it is."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a stored beam shows at the monitors; or what effects change of that, per unit of their
+    amounts, in the order of the hypotheses.
+
+    Attributes:
+        orbit: closed orbit at the monitors, m, [hypothesis, monitor, 2].
+        tunes: Q of both modes, [hypothesis, 2].
+        modes: their vectors as the beam shows them at the monitors, [hypothesis, monitor, 2, mode];
+            up to one complex factor a mode, which the launch has free.
+    """
+
+    orbit: Array
+    tunes: Array
+    modes: ComplexArray
+
+
+class StoredBeam:
+    """A stored beam in a ring with its errors and settings.
+
+    Args:
+        model: closed orbit and matrices; monitors without errors.
+
+    Attributes:
+        tunes: Q of the modes that are nearer to x and to y, in [0, 1).
+        modes: their vectors at the monitors, [monitor, 2, mode]: the beam is at
+            Re(sum_mode a E exp(2 pi i Q turn)), a any complex number.
+
+    Raises:
+        UnstableRingError: the beam does not oscillate.
+    """
+
+    def __init__(self, model: ResponseModel) -> None:
+        self.model = model
+        turn = model.tangents[-1][:TRANSVERSE, :TRANSVERSE]
+        self._values, self._vectors = _modes(turn)
+        self.tunes = np.angle(self._values[:2]) / (2 * np.pi) % 1.0
+        self._U = np.zeros((model.dimension, 2), dtype=complex)
+        self._U[:TRANSVERSE] = self._vectors[:, :2]
+        self.modes: ComplexArray = model.reading_slopes @ self._U
+
+    @property
+    def shown(self) -> Moved:
+        """Closed orbit, tunes and modes themselves, without the axis of hypotheses."""
+        return Moved(self.model.readings, self.tunes, self.modes)
+
+    def moved(self, hypotheses: Sequence[Hypothesis]) -> Moved:
+        """How effects on the ring change all of this.
+
+        Args:
+            hypotheses: (effect, place), of effects on the ring.
+        """
+        model, count = self.model, len(hypotheses)
+        monitors = len(model.maps.at)
+        moved = Moved(
+            np.zeros((count, monitors, 2)), np.zeros((count, 2)),
+            np.zeros((count, monitors, 2, 2), dtype=complex),
+        )  # fmt: skip
+        d = directions_nearby(model.layers, hypotheses)
+        if len(d.owner):
+            orbit, total, seen = self._sources(d)
+            tunes, mixed = self._perturbed(total)
+            G = model.reading_slopes.reshape(-1, model.dimension)
+            there = (G @ mixed.transpose(1, 2, 0).reshape(model.dimension, -1)).T
+            seen = seen + there.reshape(2, -1, monitors, 2).transpose(1, 2, 3, 0)
+            for out, rows in ((moved.orbit, orbit), (moved.tunes, tunes), (moved.modes, seen)):
+                if len(np.unique(d.owner)) == len(rows):
+                    out[d.owner] = rows
+                else:  # families have a row a member
+                    np.add.at(out, d.owner, rows)
+        for row, (owner, m) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
+            at = model.maps.at[m]
+            x = model.path[at]
+            bent = second_derivatives(d.E2[row][None])[0] @ x
+            moved.orbit[owner, m] += d.E0[row] + (d.E1[row] + bent / 2) @ x
+            moved.modes[owner, m] += (d.E1[row] + bent) @ model.tangents[at] @ self._U
+        return moved
+
+    def _sources(self, d: Directions) -> tuple[Array, Array, ComplexArray]:
+        """Of each row of the directions: the closed orbit's change at the monitors, the sources of
+        the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2, mode]."""
+        model, at, U, n = self.model, self.model.maps.at, self._U, self.model.dimension
+        k, rows = d.layer, len(d.layer)
+        x, C, back = model.path[k][..., None], model.tangents[k], model.inverse[k + 1]
+        bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
+        S = back @ (d.D1 + bent) @ C
+        w = (back @ (d.D0[..., None] + (d.D1 + bent / 2) @ x))[..., 0]
+        z = w @ model.closing.T
+        behind = at[None] > k[:, None]  # the monitor reads behind the layer
+        G = model.reading_slopes.reshape(-1, n)
+        shape = (rows, len(at), 2)
+        orbit = (z @ G.T).reshape(shape) + behind[..., None] * (w @ G.T).reshape(shape)
+        bends = self._bends
+        first = (bends[k + 1] @ w[:, None, :, None])[..., 0]
+        whole = S - first + ((z + w) @ bends[-1].reshape(-1, n).T).reshape(rows, n, n)
+        late = G @ ((S - first) @ U).transpose(1, 2, 0).reshape(n, -1)  # [monitor 2, mode row]
+        seen = late.reshape(len(at), 2, 2, rows).transpose(3, 0, 1, 2)
+        if np.abs(w).max(initial=0.0) > STILL:
+            moves = self._seen_bends
+            seen = seen + (w @ moves).view(complex).reshape(*shape, 2)
+            seen = behind[..., None, None] * seen + (z @ moves).view(complex).reshape(*shape, 2)
+        else:
+            seen = behind[..., None, None] * seen
+        return orbit, whole, seen
+
+    @cached_property
+    def _seen_bends(self) -> Array:
+        """What a launch of the closed orbit adds to the modes at the monitors: through the maps
+        before, and where read-outs bend, [n, monitor * 2 * mode * (re, im)]."""
+        model, maps = self.model, self.model.maps
+        C = model.tangents[maps.at]
+        through = np.einsum(
+            "mja,mabc,bp->cmjp", model.reading_slopes, self._bends[maps.at], self._U, optimize=True
+        )
+        read = np.einsum(
+            "majk,mkc,mjb,bp->cmap", second_derivatives(maps.R2), C, C, self._U, optimize=True
+        )
+        whole = np.ascontiguousarray(through + read).reshape(model.dimension, -1)
+        return np.asarray(whole.view(float))
+
+    @cached_property
+    def _bends(self) -> Array:
+        """P: sources that a change of the closed orbit's launch makes before each exit, summed,
+        [layer + 2, n, n, n]."""
+        model, maps = self.model, self.model.maps
+        W2 = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])
+        j = np.flatnonzero(W2.any(axis=(1, 2)))
+        C, back, n = model.tangents[j], model.inverse[j + 1], model.dimension
+        each = np.einsum(
+            "kai,kijl,klc,kjb->kabc", back, second_derivatives(W2[j]), C, C, optimize=True
+        )
+        summed = np.zeros((len(W2) + 1, n, n, n))
+        summed[j + 1] = each
+        return np.cumsum(summed, axis=0)
+
+    def _perturbed(self, whole: Array) -> tuple[Array, ComplexArray]:
+        """d tunes and d U at the start, [row, n, mode], for sources of the whole turn."""
+        model, V = self.model, self._vectors
+        turn = (model.tangents[-1] @ whole)[:, :TRANSVERSE, :TRANSVERSE]
+        D = np.linalg.inv(V) @ turn @ V  # [row, 4, 4]
+        values = self._values
+        own = np.einsum("rii->ri", D)[:, :2]
+        tunes = (own / values[:2]).imag / (2 * np.pi)
+        apart = values[None, :2] - values[:, None]  # [into, of mode]
+        mixes = np.abs(apart) > NEAR
+        weights = np.where(mixes, 1 / np.where(mixes, apart, 1.0), 0.0)
+        mixed = np.zeros((len(whole), model.dimension, 2), dtype=complex)
+        mixed[:, :TRANSVERSE] = V @ (D[:, :, :2] * weights)
+        return tunes, mixed
+
+
+def _modes(turn: Array) -> tuple[ComplexArray, ComplexArray]:
+    """Eigenvalues and vectors of a transverse one-turn matrix: of the mode nearer to x, of the one
+    nearer to y, and their conjugates.
+
+    A mode turns as its action has it: Im(conj(x) px + conj(y) py) is positive, which gives Q and
+    not 1 - Q.
+
+    Raises:
+        UnstableRingError: an eigenvalue off the unit circle.
+    """
+    values, vectors = np.linalg.eig(turn)
+    if np.abs(np.abs(values) - 1).max() > GROWTH or np.abs(values.imag).min() < 1e-9:
+        raise UnstableRingError("the beam is not stable: its modes grow")
+    action = (vectors[0::2].conj() * vectors[1::2]).imag.sum(axis=0)
+    forward = np.flatnonzero(action > 0)
+    if len(forward) != 2:
+        raise UnstableRingError("the beam is not stable: its modes are no oscillations")
+    in_x = (vectors[0].conj() * vectors[1]).imag / action
+    order = forward[np.argsort(-in_x[forward])]
+    chosen = vectors[:, order] / np.sqrt(2 * action[order])
+    # a phase that does not jump with the ring's errors: its own coordinate is real at the start
+    largest = np.array([chosen[0, 0], chosen[2, 1]])
+    chosen = chosen * (np.abs(largest) / largest)
+    return (
+        np.concatenate([values[order], values[order].conj()]),
+        np.concatenate([chosen, chosen.conj()], axis=1),
+    )

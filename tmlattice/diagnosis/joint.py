@@ -1,0 +1,442 @@
+"""The diagnosis of what a stored beam shows, and of several measurements of one machine together.
+
+>>> diagnose_together(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
+
+Rows are stacked; causes are shared, nuisances are each measurement's own. Few causes are tried
+first; where they leave more than noise, small errors are there too, their sizes are learnt, and the
+cause is sought among them. A reference of each kind holds what was there before.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
+from tmlattice.diagnosis.kinds import How, Measured, Part, part_of
+from tmlattice.diagnosis.result import Diagnosis, Finding, JointView, PartView, ring_tunes
+from tmlattice.diagnosis.strategy import CLEAR, DOUBT, FEW, freedom
+from tmlattice.diagnosis.suspects import suspects
+from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
+from tmlattice.errors import EffectError, MeasurementError
+from tmlattice.inference import chi2
+from tmlattice.inference.among import MOST, Among, Learnt, small_errors_of
+from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.newton import Outcome, fit, settled
+from tmlattice.inference.problem import Hypothesis, Point, Problem
+from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.inference.together import Blocks, Together
+from tmlattice.lattice import Ring
+from tmlattice.observe.stored import Kept, Stored
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+CROWDED = 1.5
+"""What half of the monitors leave at least of their noise where a few causes with names were tried,
+from which on nothing without a name is: errors are everywhere."""
+
+GAP = 0.05
+"""Chi-square per reading beyond the noise below which there is no gap to close."""
+
+
+def diagnose_together(
+    ring: Ring,
+    measured: Mapping[str, Measured],
+    *,
+    reference: Mapping[str, Measured] | None = None,
+    background: Mapping[str, float | None] | None = None,
+    holdout: float = 0.33,
+    effects: Sequence[str] | None = None,
+    max_effects: int = 8,
+    false_alarm: float = DEFAULT.false_alarm,
+    assume: Sequence[str] = (),
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Where the gap between a ring and its measurements lies, what causes it, how far it shrinks.
+
+    Args:
+        ring: the design.
+        measured: by the names that the result calls them.
+        reference: of the same machine before the fault, of any kinds: static errors cancel.
+        background: small errors, as of `diagnose`.
+        holdout: share of shots, or of correctors, that judge.
+        effects: names of those that may be the cause; else all usual ones.
+        max_effects: findings at most.
+        false_alarm: share of faultless data sets in which something may be found.
+        assume: what was written down wrongly everywhere, see `measurement.assume`.
+        seed: of the split and of the threshold's simulation.
+        progress: told what is being done.
+
+    Raises:
+        MeasurementError: data that cannot be used; the sentence says which.
+        EffectError: none of the effects can be looked for.
+        UnknownNameError: a monitor or an effect that does not exist.
+        UnstableRingError: the design has no stored beam.
+    """
+    begun = time.perf_counter()
+    judgement = Judgement(false_alarm=false_alarm)
+    chosen = _chosen(ring, effects)
+    places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
+    how = How(ring, places, judgement, holdout, assume, seed)
+    progress("data")
+    parts = [_named(label, one, how) for label, one in measured.items()]
+    plain = replace(how, holdout=0.0)
+    before = [_named(label, one, plain) for label, one in (reference or {}).items()]
+    kept = Kept()
+    first, then = (
+        [
+            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            for part in some
+        ]
+        for some in (parts, before)
+    )
+    problem = replace(
+        Together.of(first, then),
+        places=places, judgement=judgement, fixed=(),
+    )  # fmt: skip
+    hypotheses = [
+        (name, place) for name in chosen for place in find(name).places(ring)
+        if any(part.problem.sees((name, place)) for part in parts)
+    ]  # fmt: skip
+    search = Search(
+        problem, hypotheses, max_effects, seed=seed, progress=progress,
+        unnamed=all(part.kind != "orbit_response" for part in parts),
+    )  # fmt: skip
+    rms = None if background is None else background_rms(background)
+    everywhere = [
+        (name, place) for name in (rms or background_rms({"all": None}))
+        for place in find(name).places(ring)
+    ]  # fmt: skip
+    found, small = _sought(search, everywhere, rms)
+    progress("report")
+    return _told(
+        ring, parts, problem, found, small, judgement,
+        {
+            "seconds": time.perf_counter() - begun, "seed": seed,
+            "options": {
+                "reference": reference is not None,
+                "background": None if background is None else dict(background),
+                "holdout": holdout, "effects": None if effects is None else list(effects),
+                "max_effects": max_effects, "false_alarm": false_alarm, "radiation": False,
+                **({"assume": list(assume)} if assume else {}),
+            },
+        },
+    )  # fmt: skip
+
+
+def _named(label: str, measured: Measured, how: How) -> Part:
+    try:
+        return part_of(label, measured, how)
+    except MeasurementError as error:
+        raise MeasurementError(f"{label}: {error}") from error
+
+
+def _chosen(ring: Ring, effects: Sequence[str] | None) -> list[str]:
+    chosen = [name for name in modelled(effects) if find(name).places(ring)]
+    launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
+    chosen = [name for name in chosen if name not in launch or find(name).responds]
+    if not chosen:
+        raise EffectError("none of these effects can be looked for here; name another one")
+    return chosen
+
+
+# --- the search ----
+def _sought(
+    search: Search, everywhere: Sequence[Hypothesis], told: Mapping[str, float] | None
+) -> tuple[Explanation, Learnt | None]:
+    """Few causes alone, or a few among small errors everywhere: what the data speak for."""
+    problem = search.problem
+    search.progress("scan")
+    start = fit(problem, (), problem.first)
+    if start.point.lost:
+        raise MeasurementError(f"{start.point.lost} in the design: is it this machine's lattice?")
+    few = None
+    if not told:
+        narrow = replace(search, most=min(FEW, search.most))
+        few = explain(replace(narrow, unnamed=False), start)
+        if search.unnamed and not _explained(few) and not _crowded(few):
+            few = explain(narrow, start)
+        if told is not None or _explained(few) or len(start.residual) > MOST:
+            if few.full and not _explained(few) and search.most > FEW:
+                few = explain(search, start)
+            return few, None
+    search.progress("small errors")
+    usual = background_rms({"all": None}) if told is None else told
+
+    def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
+        return small_errors_of(problem, everywhere, usual, nuisances, causes, learn=told is None)
+
+    small = learnt((), start.nuisances)
+    if told is None and small.log_evidence < CLEAR:
+        assert few is not None
+        return (explain(search, start) if few.full else few), None
+    # two findings say already whether the sizes have to be learnt again beside them
+    narrow = replace(search, unnamed=False, most=min(2, search.most))
+    found = explain(replace(narrow, problem=small.problem), small.before)
+    for _ in range(problem.judgement.retaken):
+        beside = (*found.fit.causes, *_doubted(found))
+        if not beside:
+            break
+        about = learnt(beside, found.fit.nuisances)
+        again = explain(replace(narrow, problem=about.problem), about.before)
+        if not found.named and not again.named:
+            break  # it was a small error after all
+        same = again.names == found.names
+        small, found = about, again
+        if same:
+            break
+    if found.full and search.most > narrow.most:
+        whole = replace(search, unnamed=False, problem=small.problem)
+        found = explain(whole, small.before)
+    return found, small
+
+
+def _explained(found: Explanation) -> bool:
+    """Whether few causes leave nothing but noise."""
+    more, _ = found.problem.judgement.noise
+    return bool(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)) >= more)
+
+
+def _crowded(found: Explanation) -> bool:
+    """Whether most monitors still read something else."""
+    problem = found.problem
+    left, _ = problem.left(found.fit.point)
+    owner = problem.owner()[problem.valid]
+    own, squares = owner[owner >= 0], left[problem.valid][owner >= 0] ** 2
+    if not len(own):
+        return False
+    count = np.bincount(own, minlength=len(problem.monitors))
+    mean = np.bincount(own, squares, len(problem.monitors)) / np.maximum(count, 1)
+    return float(np.median(np.sqrt(mean[count > 0]))) > CROWDED
+
+
+def _doubted(found: Explanation) -> tuple[Cause, ...]:
+    """The likeliest cause that was not taken: sizes that were learnt with a fault among them are
+    too large, and it passes for a small error; it has to be weighed with sizes learnt without."""
+    top = int(np.argmax(found.scan.statistic)) if len(found.scan.statistic) else -1
+    if top < 0 or found.scan.statistic[top] < DOUBT:
+        return ()
+    name, place = found.scan.hypotheses[top]
+    if find(name).discrete:
+        return ()
+    amount = found.scan.amount[top]
+    root = abs(amount) ** (1 / find(name).power)
+    return (Cause(name, place, float(np.copysign(root, amount))),)
+
+
+# --- what is told ----
+@dataclass(frozen=True)
+class _Stage:
+    """One model of the ring: small errors, which a reference has too, causes, what it leaves."""
+
+    static: tuple[Cause, ...]
+    causes: tuple[Cause, ...]
+    point: Point
+
+
+def _told(
+    ring: Ring,
+    parts: Sequence[Part],
+    problem: Together,
+    found: Explanation,
+    small: Learnt | None,
+    judgement: Judgement,
+    made: Mapping[str, Any],
+) -> Diagnosis:
+    found = _by_ring(ring, problem, found)
+    result = found.fit
+    dead = tuple(dict.fromkeys(one for part in parts for one in part.dead))
+    estimated = any(part.estimated for part in parts)
+    findings = findings_of(ring, found, dead, judgement)
+    p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
+    verdict, findings, said = verdict_of(found, findings, p_value, estimated, judgement)
+    if verdict == "nothing" and small is not None and small.errors:
+        verdict = "distributed"  # the gap has a cause: many small ones
+    elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
+        said = (*said, f"the amounts are not settled: {result.outcome.value}")
+    causes = () if verdict == "distributed" else result.causes
+    kept = problem.without(found.dropped)
+    stages = _stages(kept, found, small, causes)
+    views = _views(parts, kept, stages)
+    aside = {ring.monitors[m].name for m in found.monitors}
+    since = 0 if small is None else max(len(stages) - 2, 0)
+    heldout = _held_out(parts, stages, aside, since)
+    if heldout is None:
+        said = (*said, "nothing is held out, so nobody but the fit judges the gap")
+    warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
+    repaired = apply(ring, causes)
+    errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
+    return Diagnosis(
+        verdict=verdict,
+        findings=tuple(
+            replace(one, seen_by=_seen_by(parts, kept, stages[-1].point, one))
+            for one in with_consequences(ring, findings, causes)
+        ),
+        fit_before=_misfit(_pairs(parts, kept, stages[0])),
+        fit_after=_misfit(_pairs(parts, kept, stages[-1])),
+        heldout=heldout,
+        heldout_shots=(),
+        unexplained={"p_value": p_value, "places": []},
+        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
+        next=None,
+        sensitivity=sensitivity(found.first, judgement),
+        warnings=tuple(dict.fromkeys(warnings)),
+        suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
+        noise=_noise(parts),
+        noise_estimated=estimated,
+        provenance={"package": _version(), "lattice": ring.name, "measurement": None, **made},
+        ring=ring,
+        repaired=repaired,
+        causes=causes,
+        errors=tuple(errors.tolist()),
+        priors={} if small is None else dict(small.sizes),
+        prior_errors={} if small is None else dict(small.errors),
+        view=JointView(found, views),
+    )
+
+
+def _version() -> str:
+    from tmlattice import __version__
+
+    return __version__
+
+
+def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:
+    """Monitors that were set aside, by their place in the ring."""
+    at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
+    aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
+    return replace(found, monitors=aside)
+
+
+def _stages(
+    problem: Together, found: Explanation, small: Learnt | None, causes: tuple[Cause, ...]
+) -> list[_Stage]:
+    """The design; then with small errors and with the causes among them, or with one cause after
+    the other."""
+    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...]]] = [((), ())]
+    if small is not None:
+        inner = found.problem
+        assert isinstance(inner, Among)
+        for one in (found.before, found.fit)[: 1 + bool(causes)]:
+            amounts = zip(inner.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
+            models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
+        if causes:
+            models[-1] = (models[-1][0], causes)
+    else:
+        models += [((), causes[: i + 1]) for i in range(len(causes))]
+    return [
+        _Stage(static, own, settled(replace(problem, fixed=static), own, problem.first))
+        for static, own in models
+    ]
+
+
+def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
+    """Residuals in units of the noise, and the noise, of the readings of a problem (of some)."""
+    there = problem.valid if among is None else problem.valid & among
+    rows = problem.as_rows(there.astype(float))
+    own = rows > 0
+    return point.residual[own], 1 / rows[own]
+
+
+def _views(
+    parts: Sequence[Part], problem: Together, stages: Sequence[_Stage]
+) -> tuple[PartView, ...]:
+    """What each measurement leaves before and after."""
+    views = []
+    for i, (part, own) in enumerate(zip(parts, problem.parts, strict=False)):
+        points = [stage.point.view[i] for stage in (stages[0], stages[-1])]
+        owner = own.owner()[own.valid]
+        by_monitor = np.full((2, len(own.monitors)), np.nan)
+        for row, point in zip(by_monitor, points, strict=True):
+            left, _ = _left(own, point)
+            for m in np.unique(owner[owner >= 0]):
+                row[m] = np.sqrt(np.mean(left[owner == m] ** 2))
+        before, after = (_misfit([(own, point)]) for point in points)
+        count = int(own.valid.sum())
+        views.append(
+            PartView(part.label, part.kind, count, before, after, tuple(own.monitors), by_monitor)
+        )
+    return tuple(views)
+
+
+def _misfit(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = ()) -> Misfit:
+    """Of all readings, those in metres for the rms."""
+    left, sizes = [], []
+    for i, (problem, point) in enumerate(pairs):
+        some = among[i] if among else problem.valid
+        own, noise = _left(problem, point, some)
+        left.append(own)
+        metres = (problem.owner() >= 0)[problem.valid & some]
+        sizes.append((own * noise)[metres])
+    every, size = np.concatenate(left), np.concatenate(sizes)
+    rms = float(np.sqrt(np.mean(size**2))) if len(size) else float("nan")
+    return Misfit(rms, float(np.mean(every**2)) if len(every) else float("nan"))
+
+
+def _pairs(parts: Sequence[Part], problem: Together, stage: _Stage) -> list[tuple[Problem, Point]]:
+    """Of the measurements themselves, not of their reference."""
+    if stage.point.lost:
+        raise MeasurementError(f"{stage.point.lost}, with what was found: too much to be explained")
+    return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
+
+
+def _held_out(
+    parts: Sequence[Part], stages: Sequence[_Stage], aside: set[str], since: int
+) -> Gap | None:
+    """Half of the monitors gives a held-out shot its nuisances, the other half judges; monitors
+    that were set aside do neither."""
+    judges = []
+    for part in parts:
+        if (judge := part.heldout) is not None:
+            lost = [i for i, name in enumerate(judge.monitors) if name in aside]
+            judges.append(judge.without(np.isin(judge.owner(), lost)))
+    if not judges:
+        return None
+    misfits = []
+    for stage in stages:
+        pairs, among = [], []
+        for judge in judges:
+            seen = [c for c in (*stage.static, *stage.causes) if judge.sees((c.effect, c.element))]
+            there = replace(judge, fixed=tuple(seen))
+            scored = there.owner() % 2 == 1
+            gives = settled(there.without(scored), (), there.first)
+            pairs.append((there, there.at((), gives.nuisances)))
+            among.append(scored)
+        misfits.append(_misfit(pairs, among))
+    before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
+    there_is = before > GAP and since < len(misfits) - 1
+    return Gap(
+        tuple(misfits), np.zeros((0, 0, 0)), 1 - after / before if there_is else None, None, since
+    )
+
+
+def _seen_by(
+    parts: Sequence[Part], problem: Together, point: Point, finding: Finding
+) -> dict[str, float] | None:
+    """Share of each measurement in what is known of a finding's amount."""
+    own = [i for i, c in enumerate(point.causes)
+           if (c.effect, c.element) == (finding.effect, finding.element)]  # fmt: skip
+    if not own or point.projection is None or find(point.causes[own[0]].effect).discrete:
+        return None
+    row = point.projection.out(problem.slope(point, own[0]))
+    assert isinstance(point.projection, Blocks)
+    squares = [float(mine @ mine) for mine in point.projection.split(row)][: len(parts)]
+    total = max(sum(squares), 1e-300)
+    return {part.label: square / total for part, square in zip(parts, squares, strict=True)}
+
+
+def _noise(parts: Sequence[Part]) -> tuple[float, float]:
+    """rms noise of a reading, m, of the first measurement that has monitors."""
+    for part in parts:
+        own = part.problem.valid & (part.problem.owner() >= 0)
+        if own.any():
+            sigma = 1 / part.problem.as_rows(np.ones(own.shape))
+            rms = float(np.sqrt(np.mean(sigma[np.isfinite(sigma)] ** 2)))
+            return rms, rms
+    return float("nan"), float("nan")

@@ -1,0 +1,180 @@
+"""Every kind of measurement as a part of one diagnosis: its problem, and who judges.
+
+A new kind is a record in `measurement`, a problem in `observe`, and a line in `KINDS`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.prepare import prepare
+from tmlattice.errors import MeasurementError
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.problem import Problem
+from tmlattice.lattice import Ring
+from tmlattice.measurement import (
+    ClosedOrbit,
+    Dispersion,
+    Measurement,
+    OrbitResponse,
+    TuneReading,
+    TurnByTurn,
+)
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
+from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_problem import Response
+from tmlattice.observe.tune_readings import tune_readings
+from tmlattice.observe.turn_by_turn import many_turns
+
+Array = NDArray[np.float64]
+Measured = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion | TuneReading
+
+
+@dataclass(frozen=True)
+class How:
+    """What a part has to know of the diagnosis.
+
+    Attributes:
+        ring: the design.
+        places: number of places of each effect, for the prior.
+        judgement: thresholds.
+        holdout: share of shots, or of correctors, that the fit does not see.
+        assume: what was written down wrongly everywhere.
+        seed: of the split.
+        effects: names of those that may be the cause; None: all usual ones.
+    """
+
+    ring: Ring
+    places: Mapping[str, float]
+    judgement: Judgement
+    holdout: float = 0.0
+    assume: Sequence[str] = ()
+    seed: int = 0
+    effects: Sequence[str] | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """One measurement of several.
+
+    Attributes:
+        label: what the user calls it.
+        kind: as its folder has it.
+        problem: what is fitted.
+        heldout: what judges; None where nothing is held out.
+        estimated: whether its noise comes from the data.
+        dead: monitors without a signal (1) or with a frozen one (2), (index, which).
+        said: what a reader should know.
+    """
+
+    label: str
+    kind: str
+    problem: Problem = field(repr=False)
+    heldout: Problem | None = field(default=None, repr=False)
+    estimated: bool = False
+    dead: tuple[tuple[int, float], ...] = ()
+    said: tuple[str, ...] = ()
+
+
+def part_of(label: str, measured: Measured, how: How) -> Part:
+    """A measurement as a part of a diagnosis.
+
+    Raises:
+        MeasurementError: data that cannot be used; the sentence names the label.
+        UnknownNameError: a monitor that the ring does not have.
+    """
+    for kind, (record, made) in KINDS.items():
+        if isinstance(measured, record):
+            return made(label, kind, measured, how)
+    raise TypeError(f"{type(measured).__name__} is no measurement")
+
+
+def kind_of(measured: Measured) -> str:
+    """The kind of a measurement, as its folder has it."""
+    return next(kind for kind, (record, _) in KINDS.items() if isinstance(measured, record))
+
+
+# --- the kinds ----
+def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
+    ring = how.ring
+    measured = mended(ring, measured, how.assume)
+    said = consulted(ring, measured, False)
+    fitted, held = measured.split(how.holdout, how.seed) if how.holdout else (measured, None)
+    ready = prepare(ring, fitted, None, False, how.effects, how.judgement)
+    other = None
+    if held is not None:
+        data = of_measurement(ring, held).with_sigma(np.array(ready.noise))
+        model = ready.problem.model.__class__(ring, data.settings, data.turns, active=data.active)
+        other = FirstTurns(model=model, data=data, places=how.places)
+    return Part(
+        label, kind, ready.problem, other, ready.estimated, ready.dead, (*said, *ready.said)
+    )
+
+
+def _response(label: str, kind: str, measured: Any, how: How) -> Part:
+    ring = how.ring
+    measured = mended(ring, measured, how.assume)
+    said = tuple(consulted(ring, measured))
+    data = response_data(ring, measured)
+    there = np.isfinite(data.orbits)
+    base = Predicted(data, Errors.none(data)).bend()
+    if not how.holdout:
+        whole = Response(base=base, used=there, places=how.places, judgement=how.judgement)
+        return Part(label, kind, whole, said=said)
+    split = split_columns(data, min(how.holdout, 0.2), np.random.default_rng(how.seed))
+    held = np.append(split.held[:-1], False)
+    fitted, judges = (
+        Response(base=base, used=there & which[:, None, None], places=how.places,
+                 judgement=how.judgement)
+        for which in (~held, held)
+    )  # fmt: skip
+    return Part(label, kind, fitted, judges, said=said)
+
+
+def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
+    """A kind whose shots are held out where there are enough of them."""
+
+    def made(label: str, kind: str, measured: Any, how: How) -> Part:
+        shots = list(measured.shots)
+        count = round(how.holdout * len(shots))
+        if how.assume:
+            raise MeasurementError(
+                f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
+                "mend the data themselves"
+            )
+        held = None
+        if len(shots) > 2 and count:
+            drawn = np.random.default_rng(how.seed).permutation(shots).tolist()
+            held, measured = (
+                measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
+            )
+        problem = make(how.ring, measured, how.places)
+        return Part(label, kind, problem, held and make(how.ring, held, how.places))
+
+    return made
+
+
+def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
+    """A kind of which nothing is held out."""
+
+    def made(label: str, kind: str, measured: Any, how: How) -> Part:
+        return Part(label, kind, make(how.ring, measured, how.places))
+
+    return made
+
+
+KINDS: Mapping[str, tuple[type, Callable[[str, str, Any, How], Part]]] = {
+    "trajectory": (Measurement, _first_turns),
+    "orbit_response": (OrbitResponse, _response),
+    "turn_by_turn": (TurnByTurn, _with_shots(many_turns)),
+    "closed_orbit": (ClosedOrbit, _with_shots(closed_orbits)),
+    "dispersion": (Dispersion, _alone(dispersion)),
+    "tunes": (TuneReading, _alone(tune_readings)),
+}
+"""Records and what makes a part of them, by the kind that a folder states."""

@@ -1,0 +1,94 @@
+"""Which of the methods of `tune_fit` to trust, and why: sentences for a person."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tmlattice.fitting.method_fit import MethodFit, trusted
+from tmlattice.network.network import TaylorNetwork
+
+ALIKE = 3.0
+"""Joint standard errors within which two methods' tunes are the same."""
+
+
+def advice(methods: Sequence[MethodFit]) -> str:
+    """A few sentences: what to trust, how the others stand to it, why the recipe cannot do it."""
+    best = trusted(methods)
+    told = [_trust(methods, best)]
+    for method in methods:
+        if method.method != "adam" and method is not best and best is not None:
+            told.append(_beside(method, best))
+        elif method.method == "adam":
+            told.append(_recipe(method))
+    return " ".join(sentence for sentence in told if sentence)
+
+
+def _trust(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
+    if best is not None:
+        why = f"it {_left(best)}"
+        if best.method == "map":
+            return f"Trust map: {why}, most strengths nearly right and a few far off."
+        if not best.named:
+            return (
+                f"Trust sparse: {why} without any changed magnet, so that no fault is seen; what "
+                "one too small to be seen would do to the tunes is not known."
+            )
+        return f"Trust sparse: {why} with {changes(best)} alone, and states the error of its tunes."
+    others = [m for m in methods if m.method != "adam" and m.fit is not None]
+    if not others:
+        return "Nothing here is to be trusted: add --method sparse, which names magnets."
+    least = min(others, key=lambda m: m.rms)
+    return (
+        f"Trust none: {least.method} leaves least, and it {_left(least)}, so something is "
+        "there other than strengths of quadrupoles and sextupoles, or launches and noise are not "
+        "as stated; `tmlattice diagnose` looks for every effect, launches free."
+    )
+
+
+def _beside(method: MethodFit, best: MethodFit) -> str:
+    if method.tunes is None:
+        return f"{method.method.capitalize()} has no tunes."
+    if not method.explains:
+        return f"{method.method.capitalize()} {_left(method)}."
+    if best.tunes is None or best.tune_sigma is None or method.tune_sigma is None:
+        return ""
+    away = np.abs((method.tunes - best.tunes + 0.5) % 1.0 - 0.5)
+    same = bool((away <= ALIKE * np.hypot(method.tune_sigma, best.tune_sigma)).all())
+    name = method.method.capitalize()
+    if same:
+        return f"{name} agrees within the errors."
+    return f"{name} says otherwise by {away.max():.2g}, more than its error."
+
+
+def _recipe(method: MethodFit) -> str:
+    weights = free_weights(method)
+    why = (
+        f"The recipe (adam) cannot do it: {method.readings} readings do not tell {weights:,} "
+        "weights, each of them free, which change is the ring's, and they state no error"
+    )
+    if method.chi2 is None or method.explains:
+        return f"{why}."
+    return f"{why}; it {_left(method)}."
+
+
+def _left(method: MethodFit) -> str:
+    """What a method leaves of the readings, against their noise."""
+    if method.explains:
+        return f"leaves the readings' noise ({1e6 * method.rms:.3g} of {1e6 * method.noise:.3g} µm)"
+    return f"leaves {1e6 * method.rms:.3g} µm, more than the noise of {1e6 * method.noise:.3g} µm"
+
+
+def changes(method: MethodFit) -> str:
+    """The magnets that a method names, each with its change and its error."""
+    return ", ".join(
+        f"{name} by {100 * amount:+.2f} ± {100 * error:.2f} %"
+        for name, (amount, error) in method.named.items()
+    )
+
+
+def free_weights(method: MethodFit) -> int:
+    """Weights that the recipe moved."""
+    assert method.fit is not None
+    network, free = method.fit.network, set(method.fit.options["free"])
+    assert isinstance(network, TaylorNetwork)
+    return sum(p.numel() for name, p in network.named_parameters() if name in free)

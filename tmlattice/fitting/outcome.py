@@ -1,0 +1,188 @@
+"""What `tune_fit` found: a column for each method, and which of them to trust."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.fitting.adam import FitResult
+from tmlattice.fitting.advice import advice
+from tmlattice.fitting.method_fit import MethodFit, errors, pair, trusted
+from tmlattice.lattice import Ring
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TuneFit:
+    """What `tune_fit` found. Tunes are fractions (x, y); None where there is no tune.
+
+    `fit`, `network_tunes`, `tune_signal`, `growth`, `after`, `orbit_rms` and `problem` are those of
+    the first of the methods: the paper's recipe where it was asked for.
+
+    Attributes:
+        ring: the design.
+        magnet: name of the perturbed magnet; None for data from elsewhere.
+        change: relative change of its strength; None for data from elsewhere.
+        launch: state at the start of the ring, [n], of the shot shown, as stated.
+        noise: rms of a reading, m, over monitors and planes; None where there is none.
+        design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2]; no
+            truth is known of data from elsewhere.
+        s: of the monitors, m, [monitor].
+        measured, before: readings of one shot, and the design network's, [monitor, 2], m; NaN where
+            nothing was read.
+        rms_before: of what the design leaves of all shots' first turns, m; launches that are not
+            known are fitted, to the design here, by each method beside its weights there.
+        methods: what each method made of it.
+        seconds: of wall clock, by stage; "fit" and "tunes" are of all methods.
+        seed: of the noise.
+        turns: tracked for the tunes.
+        shots: number of shots fitted together.
+        source: where the data are from; None for the experiment's own.
+        noise_estimated: the readings state no noise; it is theirs, from what neighbours leave.
+    """
+
+    ring: Ring
+    magnet: str | None
+    change: float | None
+    launch: Array
+    noise: float | None
+    design_tunes: Array
+    true_tunes: Array | None
+    s: Array
+    measured: Array
+    before: Array
+    rms_before: float
+    methods: tuple[MethodFit, ...]
+    seconds: dict[str, float]
+    seed: int
+    turns: int
+    shots: int = 1
+    source: str | None = None
+    noise_estimated: bool = False
+
+    @property
+    def _first(self) -> MethodFit:
+        return self.methods[0]
+
+    @property
+    def fit(self) -> FitResult:
+        """Of the first method: the network and its history."""
+        assert self._first.fit is not None
+        return self._first.fit
+
+    @property
+    def network_tunes(self) -> Array | None:
+        """Of the first method, [2]."""
+        return self._first.tunes
+
+    @property
+    def tune_signal(self) -> Array | None:
+        """States of the first method's tracking, [1, turns + 1, n]; fewer where motion grew."""
+        return self._first.signal
+
+    @property
+    def growth(self) -> float | None:
+        """Of the amplitude in a turn of the first method's network, 1 where it is symplectic."""
+        return self._first.growth
+
+    @property
+    def after(self) -> Array:
+        """Readings of the shot shown by the first method's network, [monitor, 2], m."""
+        return self._first.after
+
+    @property
+    def orbit_rms(self) -> tuple[float, float]:
+        """Of the first turn's residual, before and after the first method, over all shots, m."""
+        return self.rms_before, self._first.rms
+
+    @property
+    def problem(self) -> str | None:
+        """Why the first method has no tunes, or None."""
+        return self._first.problem
+
+    @property
+    def turns_alive(self) -> int:
+        """Turns that the tunes come from: fewer than asked for where the motion grew."""
+        return 0 if self.tune_signal is None else self.tune_signal.shape[1] - 1
+
+    @property
+    def absolute_error(self) -> Array | None:
+        """|network tune - true tune| of the first method, the short way round the circle, [2]."""
+        return errors(self.network_tunes, self.true_tunes)[0]
+
+    @property
+    def relative_error(self) -> Array | None:
+        """The absolute error over the true fraction, [2]."""
+        return errors(self.network_tunes, self.true_tunes)[1]
+
+    def method(self, name: str) -> MethodFit:
+        """What one method made of it.
+
+        Raises:
+            KeyError: it was not asked for.
+        """
+        return {m.method: m for m in self.methods}[name]
+
+    @property
+    def trusted(self) -> MethodFit | None:
+        """The method whose tunes to take; None where none explains the readings."""
+        return trusted(self.methods)
+
+    @property
+    def best(self) -> MethodFit:
+        """The one that is trusted; else of those with tunes the one that leaves least, a method
+        that keeps a ring a ring before one that does not."""
+        with_tunes = [m for m in self.methods if m.fit is not None]
+        return self.trusted or min(with_tunes, key=lambda m: (m.method == "adam", m.rms))
+
+    @property
+    def advice(self) -> str:
+        """In a few sentences: what to trust, and why."""
+        return advice(self.methods)
+
+    def as_json(self) -> dict[str, Any]:
+        """The result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""
+        from tmlattice import __version__
+
+        before, after = self.orbit_rms
+        return {
+            "format": "tmlattice-tune-fit",
+            "version": 1,
+            "package": __version__,
+            "lattice": self.ring.name,
+            "layers": len(self.fit.network.layers),
+            "monitors": len(self.fit.network.monitors),
+            "magnet": self.magnet,
+            "change": self.change,
+            "launch": [float(v) for v in self.launch],
+            "tunes": {
+                "design": pair(self.design_tunes),
+                "true": pair(self.true_tunes),
+                "network": pair(self.network_tunes),
+            },
+            "error": {
+                "absolute": pair(self.absolute_error),
+                "relative": pair(self.relative_error),
+            },
+            "orbit_rms": {"before": before, "after": after},
+            "noise": self.noise,
+            "noise_estimated": self.noise_estimated,
+            "loss": self.fit.loss,
+            "penalty": self.fit.penalty,
+            "seconds": self.seconds,
+            "regularization": self.fit.options.get("regularization"),
+            "seed": self.seed,
+            "turns": self.turns,
+            "turns_alive": self.turns_alive,
+            "growth": self.growth,
+            "options": self.fit.options,
+            "problem": self.problem,
+            "shots": self.shots,
+            "measurement": self.source,
+            "methods": [method.as_json(self.true_tunes) for method in self.methods],
+            "best": self.best.method,
+            "trusted": None if self.trusted is None else self.trusted.method,
+            "advice": self.advice,
+        }

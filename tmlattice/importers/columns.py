@@ -1,0 +1,184 @@
+"""Columns of a file as they stand: CSV of any separator, HDF5, SDDS. What they mean is not known.
+
+>>> for column in read_columns(Path("orbits.csv")):
+...     column.name, column.unit, column.values
+"""
+
+import csv
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.errors import MeasurementError
+
+CSV, HDF5, SDDS = (".csv", ".tsv", ".txt", ".dat"), (".h5", ".hdf5", ".hdf"), (".sdds",)
+
+_BRACKETS = re.compile(r"^\s*(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+_TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_](?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column.
+
+    Attributes:
+        name: without its unit.
+        unit: as it stands in the header; empty where there is none.
+        values: texts, one a row; empty where nothing stands.
+    """
+
+    name: str
+    unit: str
+    values: list[str]
+
+
+def read_columns(path: Path) -> list[Column]:
+    """All columns of a file, of the same length.
+
+    Raises:
+        MeasurementError: no such file, or no table in it.
+    """
+    if not path.is_file():
+        raise MeasurementError(f"no file '{path}'; check the path")
+    suffix = path.suffix.lower()
+    if suffix in HDF5:
+        found = _hdf5(path)
+    elif suffix in SDDS:
+        found = _sdds(path)
+    else:
+        found = _csv(path)
+    if not found or not found[0].values:
+        raise MeasurementError(f"{path}: no rows below the header; nothing was read")
+    return found
+
+
+def named(text: str) -> tuple[str, str]:
+    """Name and unit of a header: `x [mm]`, `x (mm)`, `bpm1_x_mm`, `x mm`."""
+    match = _BRACKETS.match(text) or _TAIL.match(text)
+    return (match["name"].strip(), match["unit"].strip()) if match else (text.strip(), "")
+
+
+def _csv(path: Path) -> list[Column]:
+    """Comma, semicolon, tab or blanks; lines that begin with # are passed over, but for the last
+    one above the numbers where there is no other header."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise MeasurementError(f"'{path}' cannot be read ({error}); save it as UTF-8") from error
+    numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = [(i, line) for i, line in numbered if not line.lstrip().startswith("#")]
+    if not lines:
+        raise MeasurementError(f"{path}: the file is empty; write its header first")
+    above = [line.lstrip("# \t") for i, line in numbered if i < lines[0][0]]
+    separator = max(";\t,", key=lines[0][1].count)
+    blanks = separator not in lines[0][1]
+    cut = (lambda line: line.split()) if blanks else (
+        lambda line: next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    )  # fmt: skip
+    rows = [(i, [field.strip() for field in cut(line)]) for i, line in lines]
+    header = rows.pop(0)[1]
+    if above and any(_is_number(field) for field in header):
+        rows.insert(0, (lines[0][0], header))
+        header = [field.strip() for field in cut(above[-1])]
+    for line, row in rows:
+        if len(row) != len(header):
+            raise MeasurementError(
+                f"{path}, line {line}: {len(row)} fields where the header has {len(header)}"
+            )
+    if not blanks and separator != ",":  # a decimal comma
+        rows = [(i, [re.sub(r"^([+-]?\d*),(\d+)", r"\1.\2", f) for f in row]) for i, row in rows]
+    return [Column(*named(name), [row[i] for _, row in rows]) for i, name in enumerate(header)]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _hdf5(path: Path) -> list[Column]:
+    """A column for each array [row]; `x`, `y` [row, monitor] beside a list of names are taken apart
+    into a column a monitor. The unit is an attribute `unit` or `units`, or stands in the name."""
+    import h5py
+
+    arrays: dict[str, tuple[Any, str]] = {}
+
+    def take(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            unit = item.attrs.get("units", item.attrs.get("unit", ""))
+            arrays[name] = item[()], unit.decode() if isinstance(unit, bytes) else str(unit)
+
+    try:
+        with h5py.File(path) as file:
+            file.visititems(take)
+    except (OSError, RuntimeError, TypeError, ValueError, KeyError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise MeasurementError(f"'{path}' cannot be read as HDF5 ({said})") from error
+    return _apart(path, arrays)
+
+
+def _sdds(path: Path) -> list[Column]:
+    """Columns and arrays; by the package `sdds`."""
+    import sdds
+
+    try:
+        content = sdds.read(path)
+        arrays = {
+            name: (content.values[name], str(getattr(definition, "units", None) or ""))
+            for name, definition in content.definitions.items()
+        }
+    except Exception as error:  # whatever a reader meets in a file of another kind
+        raise MeasurementError(
+            f"'{path}' cannot be read as SDDS ({type(error).__name__}: {error}); a turn-by-turn "
+            "file is read by `tmlattice import --turns KIND`"
+        ) from error
+    return _apart(path, arrays)
+
+
+def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
+    """Arrays of numbers and names as columns of one length."""
+    texts = {name: _texts(value) for name, (value, _) in arrays.items() if _is_text(value)}
+    flat: list[Column] = []
+    for name, (value, unit) in arrays.items():
+        if name in texts:
+            continue
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu" or array.ndim not in (1, 2):
+            continue
+        short = name.rsplit("/", 1)[-1]
+        if array.ndim == 1:
+            plain, own = named(name)
+            flat.append(Column(plain, unit or own, [str(v) for v in array.tolist()]))
+            continue
+        fits = [list_ for list_ in texts.values() if len(list_) == array.shape[1]]
+        if not fits:
+            continue
+        plain, own = named(short)
+        flat += [
+            Column(f"{monitor} {plain}", unit or own, [str(v) for v in array[:, i].tolist()])
+            for i, monitor in enumerate(fits[0])
+        ]
+    lengths = [len(column.values) for column in flat]
+    if not lengths:
+        raise MeasurementError(
+            f"'{path}' holds no readings: an array for each monitor and plane, or x and y [shot, "
+            "monitor] with the monitors' names"
+        )
+    most = max(set(lengths), key=lengths.count)
+    names = [Column(name, "", list_) for name, list_ in texts.items() if len(list_) == most]
+    return [*names, *(column for column in flat if len(column.values) == most)]
+
+
+def _is_text(value: Any) -> bool:
+    array = np.asarray(value)
+    return array.ndim == 1 and array.dtype.kind in "OSU"
+
+
+def _texts(value: Iterable[Any]) -> list[str]:
+    return [item.decode() if isinstance(item, bytes) else str(item) for item in value]

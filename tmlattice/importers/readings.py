@@ -1,0 +1,393 @@
+"""First turns or orbits of a control room's file, its columns taken as they come.
+
+Wide: a row a shot, and a column a monitor and plane (`SR:BPM_07:X [mm]`, `bpm_7_x`, `x_bpm7`).
+Long: a row a monitor (and shot, and turn), with columns `monitor`, `x`, `y`, or a `value` with a
+`plane`, or with the plane in the device's name (`SR:BPM_07:X 0.13`). What the file does not prove,
+units above all, is said.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError, unknown_name
+from tmlattice.importers.columns import Column, read_columns
+from tmlattice.importers.imported import Imported, counted
+from tmlattice.importers.told import METRES, Told
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement
+from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
+
+Array = NDArray[np.float64]
+
+SIZES = ((0.02, "m"), (30.0, "mm"), (3e4, "um"), (np.inf, "nm"))
+"""Readings below the first are in the second, where nothing says their unit: orbits of 20 mm and
+more have no room in a beam pipe, and those of a micrometre are noise."""
+
+SHOTS = ("shot", "shots", "shot_id", "cycle", "time", "timestamp", "date", "datetime")
+TURNS = ("turn", "turns", "turn_number")
+MONITORS = ("monitor", "bpm", "device", "name", "element", "pv", "channel")
+VALUES = ("value", "val", "reading", "position")
+PLANES = ("plane", "axis")
+_PLANE = re.compile(
+    r"(?:pos|position|orbit)?(?P<p>x|y|h|v|hor|ver|horizontal|vertical)(?:pos|position|mean|avg)?",
+    re.IGNORECASE,
+)
+_TOKEN = re.compile(r"[A-Za-z0-9]+")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where one number of the file belongs.
+
+    Attributes:
+        device: as the file has it, without the plane.
+        plane: 0 for x, 1 for y.
+    """
+
+    device: str
+    plane: int
+
+
+def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported:
+    """The measurement of a file whose columns are not known.
+
+    Args:
+        path: CSV of any separator, HDF5 or SDDS.
+        ring: the lattice, whose monitors are looked for.
+        told: names, unit, noise, bad monitors.
+
+    Raises:
+        MeasurementError: no table, no monitor of the ring, or a field that is no number.
+        UnknownNameError: the map names a monitor that the ring does not have.
+    """
+    told = told or Told()
+    columns = read_columns(path)
+    finder = _Finder(ring, told)
+    found = _long(path, columns, told) or _wide(path, columns, told)
+    shots, turns, places, values, units = found
+    devices = list(dict.fromkeys(place.device for place in places))
+    monitor = finder.all(path, devices)
+    scale, of_unit = _scale(values, units, told)
+    names = [element.name for element in ring.monitors]
+    readings = np.full((len(set(shots)), max(turns) + 1, len(names), 2), np.nan)
+    order = {shot: i for i, shot in enumerate(dict.fromkeys(shots))}
+    taken = np.zeros(readings.shape, dtype=bool)
+    for shot, turn, place, value in zip(shots, turns, places, values * scale, strict=True):
+        at = monitor.get(place.device)
+        if at is None:
+            continue
+        where = order[shot], turn, at, place.plane
+        if taken[where]:
+            raise MeasurementError(
+                f"{path}: monitor '{names[at]}' stands twice in one shot; give a column 'shot' or "
+                "'turn' that tells them apart"
+            )
+        taken[where] = True
+        readings[where] = value
+    left = [device for device in devices if monitor.get(device) is None]
+    bad = sorted({names[at] for at in finder.bad if np.isfinite(readings[:, :, at]).any()})
+    taken[:, :, sorted(finder.bad)] = False
+    read = np.flatnonzero(taken.any(axis=(0, 1, 3)))
+    noise = None if told.noise is None else np.full((len(read), 2), told.noise)
+    data = Measurement(
+        launches=np.zeros((len(order), 5)),
+        readings=readings[:, :, read],
+        monitors=tuple(names[i] for i in read),
+        noise=noise,
+        launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(order), 1)),
+        lattice=ring.name,
+        energy=ring.energy,
+    )
+    of_noise = (
+        "no noise is given: a diagnosis estimates it from the readings"
+        if told.noise is None
+        else f"the noise is {1e6 * told.noise:g} µm, as told"
+    )
+    said = [of_unit, "where the beam was launched is not known", of_noise, *finder.said]
+    if bad:
+        said.append(f"bad monitors, left out as told: {counted(bad)}")
+    doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
+    return Imported(data, ring, tuple(said), doubts)
+
+
+Found = tuple[list[str], list[int], list[Place], Array, list[str]]
+"""Of every number: its shot, turn, place, value, and unit."""
+
+
+def _long(path: Path, columns: Sequence[Column], told: Told) -> Found | None:
+    """A row a monitor; None where no column holds names."""
+    names = _called(columns, "monitor", MONITORS, told)
+    if names is None or all(_is_number(text) for text in names.values):
+        return None
+    value = _called(columns, "value", VALUES, told)
+    plane = _called(columns, "plane", PLANES, told)
+    shots = _labels(columns, "shot", SHOTS, told) or ["0"] * len(names.values)
+    turns = _turns(path, columns, told) or [0] * len(names.values)
+    parts: list[tuple[list[Place | None], Column]] = []
+    if value is not None and plane is not None:
+        planes = [_plane(text) for text in plane.values]
+        parts.append(([None if p is None else Place(n, p) for n, p in
+                       zip(names.values, planes, strict=True)], value))  # fmt: skip
+    elif value is not None:
+        parts.append(([place_of(text) for text in names.values], value))
+    else:
+        for column in columns:
+            own = _plane(column.name)
+            if own is not None:
+                parts.append(([Place(name, own) for name in names.values], column))
+    if not parts:
+        raise MeasurementError(
+            f"{path}: monitors' names without readings; give columns x and y, or a value with "
+            "the plane in its name"
+        )
+    return _joined(path, [(shots, turns, places, column) for places, column in parts])
+
+
+def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
+    """A row a shot, a column a monitor and plane."""
+    rows = len(columns[0].values)
+    turns = _turns(path, columns, told)
+    shots = _labels(columns, "shot", SHOTS, told)
+    if shots is None:
+        shots = ["0"] * rows if turns is not None else [str(i) for i in range(rows)]
+    used = [column for column in columns if place_of(column.name, told) is not None]
+    if not used:
+        raise MeasurementError(
+            f"{path}: no column holds readings that are known; name columns such as "
+            "'bpm_1 x [mm]', a monitor and a plane (`tmlattice import --example` writes some)"
+        )
+    turns = turns or [0] * rows
+    return _joined(
+        path,
+        [(shots, turns, [place_of(column.name, told)] * rows, column) for column in used],
+    )
+
+
+def _joined(
+    path: Path, parts: Iterable[tuple[list[str], list[int], list[Place | None], Column]]
+) -> Found:
+    shots: list[str] = []
+    turns: list[int] = []
+    places: list[Place] = []
+    values: list[float] = []
+    units: list[str] = []
+    for of_shot, of_turn, of_place, column in parts:
+        for row, (shot, turn, place, text) in enumerate(
+            zip(of_shot, of_turn, of_place, column.values, strict=True)
+        ):
+            if place is None:
+                continue
+            shots.append(shot)
+            turns.append(turn)
+            places.append(place)
+            values.append(_number(path, row, column.name, text))
+            units.append(column.unit)
+    return shots, turns, places, np.array(values), units
+
+
+def _number(path: Path, row: int, name: str, text: str) -> float:
+    if text.casefold() in ("", "nan", "na", "null", "none", "-", "invalid", "disconnected"):
+        return float("nan")
+    try:
+        return float(text)
+    except ValueError:
+        raise MeasurementError(
+            f"{path}, row {row + 1} below the header: '{text}' of '{name}' is no number"
+        ) from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return not text
+    return True
+
+
+def _called(columns: Sequence[Column], key: str, usual: Sequence[str], told: Told) -> Column | None:
+    """The column of this meaning, as told or by its usual names."""
+    wanted = [told.columns[key].casefold()] if key in told.columns else usual
+    for name in wanted:
+        for column in columns:
+            if column.name.casefold().replace(" ", "_") == name.replace(" ", "_"):
+                return column
+    if key in told.columns:
+        raise unknown_name("column", told.columns[key], [column.name for column in columns])
+    return None
+
+
+def _labels(
+    columns: Sequence[Column], key: str, usual: Sequence[str], told: Told
+) -> list[str] | None:
+    column = _called(columns, key, usual, told)
+    return None if column is None else column.values
+
+
+def _turns(path: Path, columns: Sequence[Column], told: Told) -> list[int] | None:
+    column = _called(columns, "turn", TURNS, told)
+    if column is None:
+        return None
+    numbers = [_number(path, i, column.name, text) for i, text in enumerate(column.values)]
+    if not all(number == int(number) and 0 <= number < 1e6 for number in numbers):
+        raise MeasurementError(f"{path}: turns are whole numbers from 0 in column '{column.name}'")
+    return [int(number) for number in numbers]
+
+
+def _plane(text: str) -> int | None:
+    match = _PLANE.fullmatch(text.strip())
+    return None if match is None else int(match["p"][0].casefold() in "yv")
+
+
+def place_of(name: str, told: Told | None = None) -> Place | None:
+    """Device and plane of a column's or channel's name; None where it names no plane.
+
+    >>> place_of("SR:C01-BPM:1:X-I"), place_of("x_bpm7"), place_of("temperature")
+    (Place(device='SR:C01-BPM:1:I', plane=0), Place(device='bpm7', plane=0), None)
+    """
+    if told is not None and name in told.names:  # the whole column: 'bpm_1 x'
+        device, _, last = told.names[name].rpartition(" ")
+        plane = _plane(last)
+        if device and plane is not None:
+            return Place(device, plane)
+    tokens = list(_TOKEN.finditer(name))
+    for token in reversed(tokens):
+        plane = _plane(token[0])
+        if plane is None or len(tokens) < 2:
+            continue
+        before, after = name[: token.start()].rstrip("_:.-/ "), name[token.end() :]
+        rest = before + after if before else after.lstrip("_:.-/ ")
+        return Place(rest.strip(), plane)
+    return None
+
+
+def _norm(text: str) -> str:
+    return "".join(_TOKEN.findall(text)).casefold()
+
+
+class _Finder:
+    """The lattice's monitor of a device."""
+
+    def __init__(self, ring: Ring, told: Told) -> None:
+        self._names = [element.name for element in ring.monitors]
+        self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
+        self._plain = _unique(_norm, self._names)
+        self._told: dict[str, int] = {}
+        self._in_order = told.in_order
+        self._bad = tuple(pattern.casefold() for pattern in told.bad)
+        self.bad: set[int] = set()
+        self.said: list[str] = []
+        for device, name in told.names.items():
+            plain = name if name.casefold() in self._exact else name.rpartition(" ")[0]
+            if plain.casefold() not in self._exact:
+                raise unknown_name("monitor", name, self._names)
+            self._told[_norm(device)] = self._exact[plain.casefold()]
+
+    def all(self, path: Path, devices: Sequence[str]) -> dict[str, int | None]:
+        """Place among the ring's monitors of each device; None: not found.
+
+        Raises:
+            UnknownNameError: none is.
+        """
+        if self._in_order:
+            if len(devices) != len(self._names):
+                raise MeasurementError(
+                    f"{path}: {len(devices)} devices, and the lattice has {len(self._names)} "
+                    "monitors; name them in the map, they are not the same in order"
+                )
+            self.said.append("devices are the lattice's monitors in beam order, as told")
+            found: dict[str, int | None] = {device: i for i, device in enumerate(devices)}
+        else:
+            found = {device: self._find(device) for device in devices}
+        if all(at is None for at in found.values()):
+            error = unknown_name("monitor", devices[0], self._names)
+            raise MeasurementError(
+                f"{path}: {error}; say which is which in a map (--map, `names:`; "
+                "`tmlattice import --example` writes one)"
+            )
+        loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
+        if loose and not self._in_order:
+            at = found[loose[0]]
+            assert at is not None
+            self.said.append(
+                f"names are matched: '{loose[0]}' is '{self._names[at]}'"
+                + (f", and so on for {len(loose)}" if len(loose) > 1 else "")
+            )
+        for device, at in found.items():
+            if at is None:
+                continue
+            both = device.casefold(), self._names[at].casefold()
+            if any(fnmatchcase(name, pattern) for name in both for pattern in self._bad):
+                self.bad.add(at)
+        return found
+
+    def _same(self, device: str, at: int) -> bool:
+        return _norm(device) in (_norm(self._names[at]), *self._told)
+
+    def _find(self, device: str) -> int | None:
+        plain = _norm(device)
+        for table, key in ((self._told, plain), (self._exact, device.casefold()),
+                           (self._plain, plain)):  # fmt: skip
+            if key in table:
+                return table[key]
+        tokens = [token.casefold() for token in _TOKEN.findall(device)]
+        for count in range(len(tokens), 0, -1):  # the longest run that is a monitor's name
+            runs = ["".join(tokens[i : i + count]) for i in range(len(tokens) - count + 1)]
+            hits = {
+                table[run] for run in runs for table in (self._told, self._plain) if run in table
+            }
+            if len(hits) == 1:
+                return hits.pop()
+        return None
+
+
+def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
+    table: dict[str, int] = {}
+    twice = set()
+    for i, name in enumerate(names):
+        twice |= {key(name)} & table.keys()
+        table[key(name)] = i
+    return {name: i for name, i in table.items() if name not in twice}
+
+
+def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str]:
+    """Metres per unit of each number, and what is to be said of it."""
+    known = {"µm": "um", "μm": "um", "micron": "um", "metre": "m", "meter": "m"}
+    plain = [known.get(unit.strip().casefold(), unit.strip().casefold()) for unit in units]
+    strange = [unit for unit in plain if unit and unit not in METRES]
+    if strange:
+        raise MeasurementError(
+            f"no unit '{strange[0]}' of a reading; there are {', '.join(METRES)}"
+        )
+    silent = np.array([not unit for unit in plain])
+    scale = np.array([METRES[unit] if unit else 1.0 for unit in plain])
+    stated = sorted(set(plain) - {""})
+    if not silent.any():
+        return scale, f"readings are in {' and '.join(stated)}, as the file says"
+    if told.unit is not None:
+        scale[silent] = METRES[told.unit]
+        return scale, f"readings are in {told.unit}, as told"
+    own = np.abs(values[silent])
+    own = own[np.isfinite(own)]
+    size = float(np.percentile(own, 95)) if len(own) else 0.0
+    unit = next(unit for below, unit in SIZES if size < below)
+    scale[silent] = METRES[unit]
+    return scale, (
+        f"no unit is given: readings are taken in {unit}, for most are below {size:.3g} "
+        "(--unit says otherwise)"
+    )
+
+
+def with_unit(told: Told | None, unit: str | None, noise: float | None) -> Told:
+    """What is told, with what options of the command say beside it."""
+    told = told or Told()
+    return replace(
+        told,
+        unit=told.unit if unit is None else unit,
+        noise=told.noise if noise is None else noise,
+    )

@@ -1,0 +1,140 @@
+"""AT's tracking of an element out of a file, in a process of its own.
+
+AT's compiled pass methods check little of what an element holds: a table of another size, or a
+count that does not fit, ends the process that tracks it. That process is a child of ours, and its
+death becomes a sentence. Which pass methods are loaded at all is a fixed list: `shipped_methods`.
+"""
+
+import pickle
+import struct
+import subprocess
+import sys
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import LatticeError
+
+SECONDS = 60
+"""For one element; a long wiggler takes less than one."""
+
+
+@cache
+def shipped_methods() -> frozenset[str]:
+    """The pass methods that AT comes with; AT loads any other by its path, whatever it is."""
+    import at
+
+    folder = Path(at.__file__).parent / "integrators"
+    names = {path.name.split(".")[0] for path in folder.iterdir()}
+    return frozenset(name for name in names if name.endswith("Pass"))
+
+
+def check_methods(elements: Iterable[Any]) -> None:
+    """Names from a file choose nothing that is loaded.
+
+    Raises:
+        LatticeError: a pass method that AT does not ship.
+    """
+    for element in elements:
+        method = getattr(element, "PassMethod", None)
+        if type(method) is not str or method not in shipped_methods():
+            raise LatticeError(
+                f"the element '{element.FamName!s:.40}' has the pass method {str(method)!r:.60}, "
+                "which AT does not ship and which is not loaded; give it one of AT's"
+            )
+
+
+class Tracker:
+    """A child that tells first-order matrices; it is started by the first element.
+
+    >>> with Tracker(3e9) as tracker:
+    ...     matrix = tracker.matrix(element)                # [6, 6], AT's coordinates
+    """
+
+    def __init__(self, energy: float) -> None:
+        self._energy = energy
+        self._child: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> "Tracker":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._child is not None:
+            self._child.kill()
+            self._child.communicate()
+
+    def matrix(self, element: Any) -> NDArray[np.float64]:
+        """The 6 x 6 matrix of an AT element, in AT's coordinates, (.., delta, ct).
+
+        Raises:
+            LatticeError: AT cannot track it, dies over it, or does not come back.
+        """
+        check_methods([element])
+        said = self._asked(pickle.dumps((element, self._energy)))
+        if len(said) == 36 * 8:
+            return np.frombuffer(said, "<f8").reshape(6, 6)
+        why = said.decode("utf-8", "replace") or "its tracking does not come back"
+        raise LatticeError(
+            f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); mend it"
+        )
+
+    def _asked(self, message: bytes) -> bytes:
+        """The child's answer; nothing where it is dead or silent."""
+        import threading
+
+        if self._child is None:
+            self._child = subprocess.Popen(
+                [sys.executable, "-c", _CHILD],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
+        child = self._child
+        assert child.stdin is not None
+        assert child.stdout is not None
+        late = threading.Timer(SECONDS, child.kill)
+        late.start()
+        try:
+            child.stdin.write(struct.pack("<q", len(message)) + message)
+            child.stdin.flush()
+            head = child.stdout.read(8)
+            said = child.stdout.read(struct.unpack("<q", head)[0]) if len(head) == 8 else b""
+        except BrokenPipeError:
+            said = b""
+        finally:
+            late.cancel()
+        if not said:
+            self._child = None
+            child.kill()
+            child.communicate()
+        return said
+
+
+_CHILD = """
+import sys
+sys.path = [place for place in sys.path if place]  # not the working directory
+import os, pickle, struct, warnings
+source, sink = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+os.dup2(2, 1)  # what AT prints is no answer
+warnings.simplefilter("ignore")
+while len(head := source.read(8)) == 8:
+    try:
+        import at
+        element, energy = pickle.loads(source.read(struct.unpack("<q", head)[0]))
+        matrix = at.find_elem_m66(element, energy=energy, particle=at.Particle("relativistic"))
+        said = matrix.astype("<f8").tobytes()
+    except Exception as error:
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200].encode()
+    sink.write(struct.pack("<q", len(said)) + said)
+    sink.flush()
+"""

@@ -1,0 +1,93 @@
+"""What records of a stored beam's measurements have in common: checks, and monitors in order."""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement.monitors import Names
+from tmlattice.measurement.trajectory import Settings, check_settings
+
+Array = NDArray[np.float64]
+Values = TypeVar("Values", Array, None, Array | None)
+
+
+def keep(record: Any, **values: Any) -> None:
+    """Set fields of a frozen record, while it is being made."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
+def check_values(values: Array, one: str) -> None:
+    """None is infinite, one at least is there.
+
+    Raises:
+        MeasurementError: "a reading is infinite", where `one` is "reading".
+    """
+    if np.isinf(values).any():
+        article = "an" if one[0] in "aeiou" else "a"
+        raise MeasurementError(f"{article} {one} is infinite; a missing one is NaN")
+    if not np.isfinite(values).any():
+        raise MeasurementError(f"every {one} is missing; nothing can be fitted")
+
+
+def check_energy(energy: float | None) -> None:
+    """Raises a MeasurementError for an energy that is not above zero, GeV."""
+    if energy is not None and not 0 < energy < np.inf:
+        raise MeasurementError(f"an energy of {energy:g} GeV cannot be; it is above zero")
+
+
+def checked_shots(
+    shots: Sequence[int], settings: Sequence[Settings], number: int, what: str
+) -> tuple[tuple[int, ...], tuple[Settings, ...]]:
+    """Ids and settings of `number` shots of readings: 0, 1, ... where there are none; () for none.
+
+    Raises:
+        MeasurementError: not as many, an id twice, or settings that cannot be.
+        UnknownNameError: a setting that no element has.
+    """
+    ids = tuple(int(i) for i in shots) or tuple(range(number))
+    if len(ids) != number or len(set(ids)) != number:
+        raise MeasurementError(f"{what} of {number} shots need {number} shot ids, each once")
+    settings = tuple(settings)
+    if settings and len(settings) != number:
+        raise MeasurementError(f"{len(settings)} settings for {number} shots; one a shot")
+    for shot, changed in zip(ids, settings, strict=False):
+        check_settings(shot, changed)
+    return ids, settings if any(settings) else ()
+
+
+def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
+    """Where the wanted ids stand.
+
+    Raises:
+        MeasurementError: one that is not there.
+    """
+    index = {shot: i for i, shot in enumerate(shots)}
+    missing = [shot for shot in wanted if shot not in index]
+    if missing:
+        known = ", ".join(str(s) for s in shots[:5])
+        more = ", ..." if len(shots) > 5 else ""
+        raise MeasurementError(f"no shot {missing[0]}; there are {known}{more}")
+    return [index[shot] for shot in wanted]
+
+
+def monitor_places(monitors: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Where the wanted monitors stand.
+
+    Raises:
+        UnknownNameError: one that is not there.
+    """
+    names = Names("monitor", monitors)
+    return [names[name] for name in wanted]
+
+
+def spread(values: Values, places: Sequence[int], number: int) -> Values:
+    """[..., monitor, 2] among `number` monitors: NaN where there was none; None stays None."""
+    if values is None:
+        return values
+    full = np.full((*values.shape[:-2], number, 2), np.nan)
+    full[..., places, :] = values
+    return full

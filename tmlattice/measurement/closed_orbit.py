@@ -1,0 +1,102 @@
+"""The closed orbit of the stored beam, as it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement.checks import (
+    check_energy,
+    check_values,
+    checked_shots,
+    keep,
+    monitor_places,
+    shot_places,
+    spread,
+)
+from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.trajectory import Settings
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedOrbit:
+    """Closed orbits, absolute: what the monitors read, offsets and all.
+
+    Attributes:
+        orbit: (x, y) in m, [shot, monitor, 2]; NaN where missing.
+        monitors: names, in the order of the readings.
+        noise: rms of one (averaged) reading, m, [monitor, 2], NaN where not known; None: unknown.
+            A pair (x, y), or a mapping of pairs by monitor, is taken too.
+        settings: of each shot, see `Measurement`; () for the design's in every shot.
+        shots: their ids; () for 0, 1, ...
+        lattice, energy: what the data say of them (GeV); hints.
+
+    Raises:
+        MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
+    """
+
+    orbit: Array
+    monitors: tuple[str, ...]
+    noise: Array | None = None
+    settings: tuple[Settings, ...] = ()
+    shots: tuple[int, ...] = ()
+    lattice: str | None = None
+    energy: float | None = None
+
+    def __post_init__(self) -> None:
+        orbit, monitors = np.asarray(self.orbit, dtype=float), tuple(self.monitors)
+        Names("monitor", monitors)
+        if orbit.ndim != 3 or orbit.shape[1:] != (len(monitors), 2):
+            raise MeasurementError(
+                f"the closed orbit has the shape {orbit.shape}; {len(monitors)} monitors need "
+                f"[shots, {len(monitors)}, 2]"
+            )
+        check_values(orbit, "reading")
+        check_energy(self.energy)
+        shots, settings = checked_shots(self.shots, self.settings, len(orbit), "orbits")
+        keep(
+            self,
+            orbit=orbit,
+            monitors=monitors,
+            noise=noise_table(self.noise, monitors),
+            settings=settings,
+            shots=shots,
+        )
+
+    def in_order_of(self, monitors: Sequence[str]) -> "ClosedOrbit":
+        """The same with other monitors, such as a ring's: NaN where one was not read.
+
+        Raises:
+            UnknownNameError: this measurement has a monitor that is not among them.
+        """
+        places, number = monitor_places(monitors, self.monitors), len(monitors)
+        return replace(
+            self,
+            orbit=spread(self.orbit, places, number),
+            monitors=tuple(monitors),
+            noise=spread(self.noise, places, number),
+        )
+
+    def select(
+        self, shots: Sequence[int] | None = None, monitors: Sequence[str] | None = None
+    ) -> "ClosedOrbit":
+        """A part of the shots and monitors, in the order asked for; None: all.
+
+        Raises:
+            UnknownNameError: a monitor that is not there.
+            MeasurementError: a shot that is not there, or nothing is left.
+        """
+        at = shot_places(self.shots, self.shots if shots is None else shots)
+        here = monitor_places(self.monitors, self.monitors if monitors is None else monitors)
+        return replace(
+            self,
+            orbit=self.orbit[at][:, here],
+            monitors=tuple(self.monitors[i] for i in here),
+            noise=None if self.noise is None else self.noise[here],
+            settings=tuple(self.settings[i] for i in at) if self.settings else (),
+            shots=tuple(self.shots[i] for i in at),
+        )

@@ -1,0 +1,100 @@
+"""The change of the closed orbit for steps of the RF frequency."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement.checks import check_energy, check_values, keep, monitor_places, spread
+from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.orbit_response import RfStep, check_rf
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Dispersion:
+    """Orbit changes for one or more steps of the RF.
+
+    Attributes:
+        steps: each with its orbit change, m (not m per relative energy), [monitor, 2], NaN where
+            missing.
+        monitors: names, in the order of the orbits.
+        noise: rms of one orbit change, m, [monitor, 2], NaN where not known; None: unknown. A pair
+            (x, y), or a mapping of pairs by monitor, is taken too.
+        lattice, energy: what the data say of them (GeV); hints.
+
+    Raises:
+        MeasurementError: shapes that do not fit, numbers that cannot be, a step of 0 Hz, or no
+            orbit at all.
+    """
+
+    steps: tuple[RfStep, ...]
+    monitors: tuple[str, ...]
+    noise: Array | None = None
+    lattice: str | None = None
+    energy: float | None = None
+
+    def __post_init__(self) -> None:
+        monitors = tuple(self.monitors)
+        Names("monitor", monitors)
+        steps = []
+        for step in self.steps:
+            check_rf(step)
+            if step.step == 0:
+                raise MeasurementError("an RF step of 0 Hz shows no dispersion; give its size")
+            orbit = np.asarray(np.nan if step.orbit is None else step.orbit, dtype=float)
+            if orbit.shape != (len(monitors), 2):
+                raise MeasurementError(
+                    f"an RF step's orbit has the shape {orbit.shape}, not [{len(monitors)}, 2]"
+                )
+            steps.append(replace(step, orbit=orbit))
+        if not steps:
+            raise MeasurementError("no step of the RF; dispersion is the orbit change for one")
+        check_energy(self.energy)
+        keep(
+            self,
+            steps=tuple(steps),
+            monitors=monitors,
+            noise=noise_table(self.noise, monitors),
+        )
+        check_values(self.orbits, "orbit change")
+
+    @property
+    def orbits(self) -> Array:
+        """The orbit changes of all steps, m, [step, monitor, 2], NaN where missing."""
+        return np.stack([np.asarray(step.orbit) for step in self.steps])
+
+    def in_order_of(self, monitors: Sequence[str]) -> "Dispersion":
+        """The same with other monitors, such as a ring's: NaN where one was not read.
+
+        Raises:
+            UnknownNameError: this measurement has a monitor that is not among them.
+        """
+        places, number = monitor_places(monitors, self.monitors), len(monitors)
+        return replace(
+            self,
+            steps=tuple(replace(s, orbit=spread(s.orbit, places, number)) for s in self.steps),
+            monitors=tuple(monitors),
+            noise=spread(self.noise, places, number),
+        )
+
+    def select(self, monitors: Sequence[str]) -> "Dispersion":
+        """A part of the monitors, in the order asked for.
+
+        Raises:
+            UnknownNameError: one that is not there.
+            MeasurementError: nothing is left.
+        """
+        here = monitor_places(self.monitors, monitors)
+        return replace(
+            self,
+            steps=tuple(
+                replace(s, orbit=orbit[here])
+                for s, orbit in zip(self.steps, self.orbits, strict=True)
+            ),
+            monitors=tuple(self.monitors[i] for i in here),
+            noise=None if self.noise is None else self.noise[here],
+        )

@@ -1,0 +1,243 @@
+"""Spectral lines that many signals share: each signal's complex amplitude, one envelope for all.
+
+A signal is read as offset + sum over lines of Re(A g(t) exp(2 pi i f t)). The frequency f and the
+complex envelope g of a line are the same in all signals: what decoherence, chromaticity and
+detuning with amplitude make of a kicked beam is the same for all monitors, so that the ratios of
+the A have no part in it. The fit alternates between two linear least squares: the lines' values of
+each turn, from all signals, and the amplitudes of each signal, from all turns; between them a
+line's values lose what is not near its frequency.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct, idct
+
+from tmlattice.harmonics import frequency as strongest
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Mask = NDArray[np.bool_]
+
+WIDEST = 0.05
+"""Largest half width of a line, in tune: the envelope of a beam that decoheres in 10 turns."""
+NARROW = 0.004
+"""The same of a line that is no betatron line."""
+ROUNDS = 4
+"""Of the alternation; it starts within the noise of its end, and three rounds reach it."""
+QUIETEST = 0.1
+"""Of the typical noise, the least that a signal's is taken to be: none rules over all others."""
+TINY = 1e-30
+_SMALL = 1e-6
+"""Of an eigenvalue: one monitor alone cannot part the quadratures of a turn; the band does."""
+
+
+@dataclass(frozen=True)
+class LineFit:
+    """Lines of one shot.
+
+    Attributes:
+        frequency: in (0, 0.5), [line].
+        frequency_error: rms, from the noise and from how far the line drifts, [line].
+        amplitude: complex, in the signals' unit, [signal, line].
+        variance: of the real and of the imaginary part, for a noise of 1, [signal, line].
+        envelope: complex, mean square 1 and mean phase 0, [line, turn].
+        noise: rms of a reading, from what is left, [signal].
+        residual: what is left, 0 where missing, [signal, turn].
+    """
+
+    frequency: Array
+    frequency_error: Array
+    amplitude: ComplexArray
+    variance: Array
+    envelope: ComplexArray
+    noise: Array
+    residual: Array
+
+
+def fit_lines(
+    data: Array, there: Mask, frequencies: Sequence[float], noise: Array, *,
+    broad: int, span: int, rounds: int = ROUNDS,
+) -> LineFit:  # fmt: skip
+    """Fit lines near these frequencies to all signals at once.
+
+    Args:
+        data: [signal, turn], 0 where missing.
+        there: what was read, [signal, turn].
+        frequencies: of the lines, in (0, 0.5), to within half a bin.
+        noise: rms of a reading, for the weights of the signals, [signal].
+        broad: the first so many lines have an envelope; the others are narrow.
+        span: turns from the first on in which the lines stand out: where the fit starts.
+        rounds: of the alternation.
+    """
+    turns = data.shape[1]
+    turn = np.arange(turns)
+    lines = np.array(frequencies, dtype=float)
+    offset = data.sum(axis=1) / there.sum(axis=1)
+    window = np.pad(np.hanning(span + 2)[1:-1], (0, turns - span))
+    turning = window[:, None] * np.exp(-2j * np.pi * np.outer(turn, lines))
+    amplitude = (data - offset[:, None] * there) @ turning
+    widths = _widths(lines, broad)
+    shared = 2 * _cosines(widths, turns).sum() / len(data)
+    free = np.maximum(there.sum(axis=1) - 1 - 2 * len(lines) - shared, 1)
+    for step in range(rounds):
+        patterns = _quadratures(amplitude)
+        values, cover = least_squares(
+            patterns, (data - offset[:, None] * there).T, there.T, 1 / noise**2, prior=1.0
+        )
+        envelopes = np.empty((len(lines), turns), dtype=complex)
+        for i, width in enumerate(widths):
+            own = values[:, 2 * i] + 1j * values[:, 2 * i + 1]
+            lines[i], envelopes[i] = _line(own, lines[i], width, 0 if step else span)
+        moving = envelopes * np.exp(2j * np.pi * np.outer(lines, turn))
+        basis = np.column_stack([np.ones(turns), _quadratures(moving.T)])
+        found, spread = least_squares(basis, data, there)
+        offset = found[:, 0]
+        amplitude = found[:, 1::2] + 1j * found[:, 2::2]
+        residual = (data - found @ basis.T) * there
+        own_noise = np.sqrt((residual**2).sum(axis=1) / free)
+        least = max(QUIETEST * float(np.median(own_noise)), TINY)
+        noise = np.asarray(np.maximum(own_noise, least))
+    quadrature = 0.5 * (cover[:, 0::2] + cover[:, 1::2]).mean(axis=0)
+    return LineFit(
+        frequency=lines,
+        frequency_error=_frequency_errors(envelopes, quadrature),
+        amplitude=amplitude,
+        variance=0.5 * (spread[:, 1::2] + spread[:, 2::2]),
+        envelope=envelopes,
+        noise=noise,
+        residual=residual,
+    )
+
+
+def least_squares(
+    basis: Array,
+    data: Array,
+    there: Mask,
+    weights: Array | None = None,
+    prior: float = 0.0,
+) -> tuple[Array, Array]:
+    """Coefficients of many signals in one basis, each from what was read of it.
+
+    Args:
+        basis: [sample, function].
+        data: [signal, sample], 0 where missing.
+        there: [signal, sample].
+        weights: of the samples; None: 1.
+        prior: what the coefficients are known to be beforehand, 1 over the square of their size:
+            what no sample shows stays small, instead of being noise.
+
+    Returns:
+        Coefficients and the diagonal of the inverse normal matrix, both [signal, function]; the
+        least of all solutions where functions cannot be told apart.
+    """
+    weighted = basis if weights is None else basis * weights[:, None]
+    size = np.sqrt((basis * weighted).sum(axis=0))
+    size = np.where(size > 0, size, 1.0)
+    right = data @ (weighted / size)
+    whole = there.all(axis=1)
+    inverse = np.empty((len(data), basis.shape[1], basis.shape[1]))
+    known = np.diag(prior / size**2)
+    inverse[whole] = _inverse((basis / size).T @ (weighted / size) + known)
+    if not whole.all():
+        functions = basis.shape[1]
+        products = (basis / size)[:, :, None] * (weighted / size)[:, None, :]
+        normal = there[~whole].astype(float) @ products.reshape(len(basis), -1)
+        inverse[~whole] = _inverse(normal.reshape(-1, functions, functions) + known)
+    found = np.einsum("sfg,sg->sf", inverse, right) / size
+    return np.asarray(found), np.asarray(np.diagonal(inverse, axis1=1, axis2=2) / size**2)
+
+
+def _inverse(normal: Array) -> Array:
+    return np.asarray(np.linalg.pinv(normal, rcond=_SMALL, hermitian=True))
+
+
+def _quadratures(values: ComplexArray) -> Array:
+    """Re v and -Im v of each column, in turn: Re(A v) = Re A Re v - Im A Im v, [row, 2 columns]."""
+    parts = np.empty((len(values), 2 * values.shape[1]))
+    parts[:, 0::2], parts[:, 1::2] = values.real, -values.imag
+    return parts
+
+
+def _widths(lines: Array, broad: int) -> Array:
+    """How far from its frequency a line may reach, in tune: less than half way to the next."""
+    apart = np.abs(lines[:, None] - lines) + np.eye(len(lines))
+    next_one = np.append(apart[:broad, :broad].min(axis=1), apart[broad:].min(axis=1))
+    mirror = np.minimum(2 * lines, 1 - 2 * lines)
+    most = np.append(np.full(broad, WIDEST), np.full(len(lines) - broad, NARROW))
+    return np.asarray(np.minimum(most, 0.45 * np.minimum(next_one, mirror)))
+
+
+def _cosines(width: Array | float, turns: int) -> NDArray[np.int64]:
+    """How many cosines of the turns stay below a width."""
+    return np.maximum(1, np.round(2 * np.asarray(width) * turns)).astype(np.int64)
+
+
+def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[float, ComplexArray]:
+    """Frequency and envelope of a line, of its values turn by turn.
+
+    The envelope is smooth: its slowest cosines, up to the width. The frequency is the peak of the
+    spectrum with the envelope's modulus as window; where a span is given, it is looked for near
+    NAFF's in so many turns.
+    """
+    turns = len(values)
+    turn = np.arange(turns)
+    slow = dct(values * np.exp(-2j * np.pi * near * turn), norm="ortho")
+    slow[_cosines(width, turns) :] = 0
+    envelope = idct(slow, norm="ortho")
+    if span:
+        found, _ = strongest(envelope[:span])
+        found = (found + 0.5) % 1.0 - 0.5
+        if abs(found) < width:
+            near, envelope = near + found, envelope * np.exp(-2j * np.pi * found * turn)
+    shift = _peak(np.abs(envelope) * envelope)
+    if abs(shift) < width:
+        near, envelope = near + shift, envelope * np.exp(-2j * np.pi * shift * turn)
+    size = np.sqrt(np.mean(np.abs(envelope) ** 2))
+    phase = np.angle(np.sum(np.abs(envelope) * envelope))
+    return near, envelope * np.exp(-1j * phase) / (size if size > 0 else 1.0)
+
+
+def _peak(signal: ComplexArray) -> float:
+    """Where the spectrum of a signal with a line near 0 peaks: Newton's method on its square."""
+    turn = np.arange(len(signal)) - (len(signal) - 1) / 2
+    at = 0.0
+    for _ in range(5):
+        turned = signal * np.exp(-2j * np.pi * at * turn)
+        value = turned.sum()
+        slope = -2j * np.pi * (turn * turned).sum()
+        bend = -4 * np.pi**2 * (turn**2 * turned).sum()
+        below = abs(slope) ** 2 + (value.conjugate() * bend).real
+        if below >= 0:  # no peak here: the line has no steady part
+            break
+        at -= float((value.conjugate() * slope).real / below)
+    return at
+
+
+def _frequency_errors(envelopes: ComplexArray, quadrature: Array) -> Array:
+    """Errors of the frequencies, from the noise and from the drift between two halves.
+
+    Args:
+        envelopes: [line, turn].
+        quadrature: variance of a line's real and imaginary part on one turn, [line].
+    """
+    turns = envelopes.shape[1]
+    turn = np.arange(turns)
+
+    def statistical(power: Array, variance: float) -> float:
+        middle = (power * turn[: len(power)]).sum() / max(power.sum(), 1e-300)
+        lever = (power * (turn[: len(power)] - middle) ** 2).sum()
+        return float(np.sqrt(variance / max(lever, 1e-300)) / (2 * np.pi))
+
+    errors = np.empty(len(envelopes))
+    for i, (envelope, variance) in enumerate(zip(envelopes, quadrature, strict=True)):
+        power = np.abs(envelope) ** 2
+        middle = int(np.searchsorted(np.cumsum(power), power.sum() / 2))
+        halves = [slice(0, middle), slice(middle, turns)]  # of the power
+        peaks = [_peak(np.abs(envelope[half]) * envelope[half]) for half in halves]
+        expected = sum(statistical(power[half], variance) ** 2 for half in halves)
+        drift = max((peaks[0] - peaks[1]) ** 2 - 9 * expected, 0.0) / 4
+        errors[i] = np.sqrt(statistical(power, variance) ** 2 + drift)
+    return errors

@@ -1,0 +1,274 @@
+"""The betatron lines of a stored beam's turns: tunes, and each monitor's complex amplitudes.
+
+>>> found = lines(turns, near=optics.tunes % 1)
+>>> found.tune                                          # [shot, mode], fractions
+>>> found.amplitude                                     # [shot, monitor, plane, mode], complex, m
+>>> found.said                                          # what could not be used, and why
+
+The reading of turn t is offset + Re(A1 g1(t) exp(2 pi i Q1 t)) + Re(A2 g2(t) exp(2 pi i Q2 t)) +
+noise, with t counted from turn 0 of the measurement. The complex envelopes g are one for all
+monitors of a shot (see `line_fit`), with mean square 1 and mean phase 0: 1 for a steady line. What
+decoherence does is in g, and the ratios of A between monitors and planes are those of the
+eigenvector; one complex scale of each mode and shot remains, which nobody knows. Other lines
+(synchrotron motion, harmonics) are fitted beside and dropped.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import TooFewTurnsError
+from tmlattice.harmonics import MIN_TURNS
+from tmlattice.measurement import TurnByTurn
+from tmlattice.observe.line_errors import change, growth, noise_at
+from tmlattice.observe.line_fit import LineFit
+from tmlattice.observe.line_search import Modes, Near, Planes, betatron_lines, share, which
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Mask = NDArray[np.bool_]
+
+APART = 2.2
+"""Of a bin of the spectrum (1 / turns): lines that are nearer are not parted."""
+NOT_ONE = 3.0
+"""Times the noise elsewhere, beside a line: more than that is another line."""
+IMPURE = (
+    "what is left beside the line of mode {} is more than noise: it is not one mode, or two tunes "
+    "are nearly equal"
+)
+SPIKE = 8.0
+"""Of the noise: a reading so far off is no reading."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Betatron lines of the turns of a stored beam.
+
+    Modes are (1, 2): the one nearer to x, and to y. Planes are (x, y). Everything is NaN where it
+    could not be had.
+
+    Attributes:
+        monitors: names.
+        shots: ids.
+        tune: fraction in [0, 1) where tunes were given to be near to, else in (0, 0.5), [shot,
+            mode].
+        tune_error: its rms, from noise and drift, [shot, mode].
+        amplitude: A, complex, m, [shot, monitor, plane, mode]. For 1 - Q instead of Q it is the
+            complex conjugate.
+        error: rms of its real and of its imaginary part, but for the scale that all monitors
+            share, m, [shot, monitor, plane, mode]: from the noise where and when the line is, and
+            from how far ratios of monitors change while the beam decoheres.
+        noise: rms of one reading, from what no line explains, m, [monitor, plane].
+        turns: used of each shot, [shot].
+        envelope: g, complex, [shot, mode, turn]; 0 behind the turns that were used.
+        said: a sentence for each thing that could not be used, or is doubtful.
+    """
+
+    monitors: tuple[str, ...]
+    shots: tuple[int, ...]
+    tune: Array
+    tune_error: Array
+    amplitude: ComplexArray
+    error: Array
+    noise: Array
+    turns: NDArray[np.int64]
+    envelope: ComplexArray
+    said: tuple[str, ...]
+
+
+def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Lines:
+    """The betatron lines of every shot.
+
+    Args:
+        turns: the measurement.
+        near: fractional tunes (x, y) in [0, 1) of a model: lines are looked for within 0.12 of
+            them, and they tell Q from 1 - Q, which no spectrum of positions does.
+        at: where in the turn each monitor stands, s / C, [monitor]: the envelope of a later one is
+            later. None: monitors stand evenly, in their order.
+
+    Raises:
+        TooFewTurnsError: no shot has 16 turns with a beam.
+
+    Source: J. Laskar, Physica D 67 (1993) 257, for NAFF; C. Wang et al., Phys. Rev. ST Accel.
+    Beams 6 (2003) 104001, for what all monitors see in common.
+    """
+    shots, _, monitors, _ = turns.readings.shape
+    place = np.arange(monitors) / monitors if at is None else np.asarray(at, dtype=float)
+    signals = np.moveaxis(turns.readings, 1, 3).reshape(shots, 2 * monitors, -1)
+    found = _empty(turns)
+    said: Said = {}
+    noise: list[Array] = []
+    for i, shot in enumerate(turns.shots):
+        own = _shot(signals[i], near, partial(_say, said, shot))
+        if own is None:
+            continue
+        fit, usable, modes = own
+        planes = np.tile([0, 1], monitors)[usable]
+        used = fit.envelope.shape[1]
+        found.turns[i] = used
+        noise.append(np.full(2 * monitors, np.nan))
+        noise[-1][usable] = fit.noise
+        for mode, line in enumerate(modes):
+            if line is None:
+                continue
+            louder = noise_at(fit, line)
+            if louder > NOT_ONE:
+                _say(said, shot, IMPURE.format(mode + 1))
+            mirrored = near is not None and near[mode] % 1 > 0.5
+            turned = np.conj if mirrored else np.asarray
+            found.tune[i, mode] = abs(mirrored - fit.frequency[line])
+            found.tune_error[i, mode] = fit.frequency_error[line]
+            found.envelope[i, mode, :used] = turned(fit.envelope[line])
+            late = 1 + np.repeat(place, 2)[usable] * growth(fit.envelope[line])
+            values = found.amplitude[i].reshape(-1, 2)
+            values[usable, mode] = turned(fit.amplitude[:, line] / late)
+            errors = found.error[i].reshape(-1, 2)
+            own_error = fit.noise * np.sqrt(fit.variance[:, line]) * louder
+            errors[usable, mode] = np.hypot(own_error, change(fit, line, planes))
+    if not noise:
+        raise TooFewTurnsError(
+            f"no shot has {MIN_TURNS} turns with a beam: there is no tune in them; "
+            "give them as first turns"
+        )
+    with np.errstate(invalid="ignore"):
+        squares = np.array(noise) ** 2
+        counted = np.isfinite(squares).sum(axis=0)
+        found.noise[:] = np.sqrt(np.nansum(squares, axis=0) / counted).reshape(-1, 2)
+    sentences = [f"{_shots(own)}: {what}" for what, own in said.items()]
+    sentences += _silent(turns, found.noise) + _louder(turns, found.noise)
+    return replace(found, said=tuple(sentences))
+
+
+def _empty(turns: TurnByTurn) -> Lines:
+    shots, number, monitors, _ = turns.readings.shape
+    return Lines(
+        monitors=turns.monitors,
+        shots=turns.shots,
+        tune=np.full((shots, 2), np.nan),
+        tune_error=np.full((shots, 2), np.nan),
+        amplitude=np.full((shots, monitors, 2, 2), complex(np.nan, np.nan)),
+        error=np.full((shots, monitors, 2, 2), np.nan),
+        noise=np.full((monitors, 2), np.nan),
+        turns=np.zeros(shots, dtype=np.int64),
+        envelope=np.zeros((shots, 2, number), dtype=complex),
+        said=(),
+    )
+
+
+Said = dict[str, list[int]]
+"""Sentences with the shots that they are said of."""
+
+
+def _say(said: Said, shot: int, sentence: str) -> None:
+    said.setdefault(sentence, []).append(shot)
+
+
+def _shots(ids: Sequence[int]) -> str:
+    shown = ", ".join(str(i) for i in ids[:5]) + (", ..." if len(ids) > 5 else "")
+    return f"shot{'s' * (len(ids) > 1)} {shown}"
+
+
+def _shot(
+    signals: Array, near: Near, say: Callable[[str], None]
+) -> tuple[LineFit, Mask, Modes] | None:
+    """Lines of one shot [signal, turn], the signals that have any, and which line is which mode."""
+    there = np.isfinite(signals)
+    with_beam = there.sum(axis=0) >= 0.5 * there.sum(axis=0).max()
+    last = len(with_beam) - int(with_beam[::-1].argmax()) if with_beam.any() else 0
+    if last < len(with_beam):
+        say(f"the beam is read for {last} turns of {len(with_beam)}: those are used")
+    if last < MIN_TURNS:
+        say(f"{last} turns are too few for a tune; {MIN_TURNS} at least do")
+        return None
+    there, signals = there[:, :last], signals[:, :last]
+    usable = (there.sum(axis=1) >= max(MIN_TURNS, last // 4)) & _moves(signals, there)
+    if not usable.any():
+        say(f"no monitor has {MIN_TURNS} turns of a beam that moves")
+        return None
+    there = there[usable]
+    data = np.where(there, signals[usable], 0.0)
+    planes = np.tile([0, 1], len(signals) // 2)[usable]
+    fit = betatron_lines(data, there, planes, near)
+    off = np.abs(fit.residual) / _robust(fit.residual, there)[:, None]
+    wild = off > SPIKE * np.maximum(1.0, np.median(off, axis=0))  # not what all monitors see
+    if wild.any() and wild.mean() < 0.05:
+        say(f"readings more than {SPIKE:g} times the noise off what was fitted are left out")
+        there = there & ~wild
+        fit = betatron_lines(data * there, there, planes, near)
+    modes = which(fit, planes, near)
+    apart = np.abs(np.diff(fit.frequency[:2]))
+    if None not in modes and apart < APART / last:
+        say(f"the tunes are closer than {APART / last:.2g}: {last} turns do not part their lines")
+        return fit, usable, (None, None)
+    _doubts(fit, planes, modes, say)
+    return fit, usable, modes
+
+
+def _moves(signals: Array, there: Mask) -> Mask:
+    """Signals whose readings are not all the same."""
+    high = np.where(there, signals, -np.inf).max(axis=1)
+    low = np.where(there, signals, np.inf).min(axis=1)
+    return np.asarray(high > low)
+
+
+def _robust(residual: Array, there: Mask) -> Array:
+    """Rms of what is left of each signal, by its median: spikes do not count."""
+    size = np.abs(residual)
+    middle = np.median(size, axis=1)
+    for i in np.flatnonzero(~there.all(axis=1)):
+        middle[i] = np.median(size[i, there[i]])
+    return np.asarray(1.4826 * middle)
+
+
+# --- what is said of it ---------------------------------------------------------------------------
+def _doubts(fit: LineFit, planes: Planes, modes: Modes, say: Callable[[str], None]) -> None:
+    turns = fit.envelope.shape[1]
+    there = [line for line in modes if line is not None]
+    for plane in (0, 1):
+        if not (planes == plane).any():
+            say(f"no monitor reads {'xy'[plane]}")
+    if not there:
+        say("no betatron line stands above the noise")
+    if len(there) != 1:
+        return
+    own = share(fit, planes, there[0])
+    missing = f"no line of the mode nearer to {'xy'[1 - modes.index(there[0])]} is seen"
+    if 0.2 < own < 0.8:
+        say(
+            f"{missing}, and that of the other is in both planes: the tunes are closer than "
+            f"{APART / turns:.2g}, or one mode was not kicked"
+        )
+    else:
+        say(f"{missing}: it was not kicked, or is lost in the noise")
+
+
+def _silent(turns: TurnByTurn, noise: Array) -> list[str]:
+    """Monitors of which nothing is used."""
+    flat = np.isnan(noise)
+    read = np.isfinite(turns.readings).any(axis=(0, 1))
+    names = [turns.monitors[i] for i in np.flatnonzero((flat & read).any(axis=1))]
+    if not names:
+        return []
+    shown = ", ".join(f"'{name}'" for name in names[:5]) + (", ..." if len(names) > 5 else "")
+    one = len(names) == 1
+    return [
+        f"{'monitor' if one else 'monitors'} {shown} {'stands' if one else 'stand'} still or "
+        f"{'has' if one else 'have'} too few readings, and {'is' if one else 'are'} not used"
+    ]
+
+
+def _louder(turns: TurnByTurn, noise: Array) -> list[str]:
+    """The noise that is stated, where it is another one."""
+    if turns.noise is None:
+        return []
+    with np.errstate(invalid="ignore"):
+        ratio = noise / turns.noise
+    if not np.isfinite(ratio).any():
+        return []
+    typical = float(np.nanmedian(ratio))
+    if 0.5 < typical < 2:
+        return []
+    return [f"what no line explains is {typical:.2g} times the stated noise at a typical monitor"]

@@ -1,0 +1,224 @@
+"""Kinds of measurement of a stored beam: each reads closed orbits, tunes and modes in its own way.
+
+A measurement sees the ring in some states (settings of a shot, steps of the RF). In each the beam
+has a closed orbit, two tunes and two modes; what the monitors show of these is linear in them, and
+so `told` is prediction and derivative in one. A new kind is a class with `told` and its data.
+"""
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import Moved, StoredBeam
+from tmlattice.effects import (
+    Cause,
+    LaunchEffect,
+    Monitors,
+    ReadingEffect,
+    RingEffect,
+    Settings,
+    apply,
+    find,
+    monitors_with,
+)
+from tmlattice.inference.metric import Hypothesis
+from tmlattice.lattice import Ring
+from tmlattice.observe.steady import Steady
+
+Array = NDArray[np.float64]
+
+SMALL = 1e-3
+"""Of a monitor's largest error: the step of the differences."""
+
+FEW = 10
+"""Causes with which a model is made from the one without; of more it is kept."""
+
+BEAMS = 6
+"""Stored beams that are remembered: some megabytes each."""
+
+
+class Kept:
+    """Models made a moment ago: measurements of one machine ask for the same ones, and most causes
+    are the same from one call to the next."""
+
+    def __init__(self) -> None:
+        self._bases: dict[str, tuple[tuple[Cause, ...], ResponseModel]] = {}
+        self._beams: deque[tuple[str, float, tuple[Cause, ...], StoredBeam]] = deque(maxlen=BEAMS)
+
+    def beam(
+        self, ring: Ring, settings: Settings, frequency: float, causes: tuple[Cause, ...]
+    ) -> StoredBeam:
+        """The stored beam of a ring with settings and causes.
+
+        Raises:
+            UnstableRingError: there is none.
+        """
+        key, near = repr(settings), None
+        for own, at, known, beam in self._beams:
+            if own == key and known == causes:
+                if at == frequency:
+                    return beam
+                near = beam
+        if near is not None:
+            made = StoredBeam(near.model.at_frequency(frequency))
+        else:
+            made = StoredBeam(self._model(ring, settings, causes).at_frequency(frequency))
+        self._beams.append((key, frequency, causes, made))
+        return made
+
+    def _model(self, ring: Ring, settings: Settings, causes: tuple[Cause, ...]) -> ResponseModel:
+        key = repr(settings)
+        known, base = self._bases.get(key, ((), None))
+        if base is None or causes[: len(known)] != known:
+            pairs = enumerate(zip(causes, known, strict=False))
+            same = next((i for i, (a, b) in pairs if a != b), min(len(causes), len(known)))
+            many = same if same > FEW else len(causes)
+            known = causes[:many] if len(causes) > FEW else ()
+            base = ResponseModel(apply(ring, known, settings))
+            self._bases[key] = (known, base)
+        rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
+        return base.changed_to(apply(base.ring, rest)) if rest else base
+
+
+@dataclass(frozen=True)
+class Beams:
+    """What there is at some causes.
+
+    Attributes:
+        beams: the stored beam of each state.
+        monitors: with their errors.
+    """
+
+    beams: tuple[StoredBeam, ...]
+    monitors: Monitors
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stored(Steady):
+    """Readings of stored beams in some states of a ring.
+
+    Attributes:
+        ring: the design.
+        states: settings and relative RF frequency of each.
+        data, errors: what was read and its noise, of the kind's shape.
+        read_by: the monitor of each reading, -1 for none, of the kind's shape.
+        kept: models made a moment ago; those of the same ring may share one.
+    """
+
+    ring: Ring = field(repr=False)
+    states: tuple[tuple[Settings, float], ...]
+    data: Array = field(repr=False)
+    errors: Array = field(repr=False)
+    read_by: NDArray[np.int64] = field(repr=False)
+    kept: Kept = field(default_factory=Kept, repr=False, compare=False)
+
+    @abstractmethod
+    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """The kind's readings [..., *shape] of what each state shows, or of changes of that, with
+        any axes in front; linear."""
+
+    @property
+    def values(self) -> Array:
+        """As read."""
+        return self.data
+
+    @property
+    def sigma(self) -> Array:
+        """Of each reading."""
+        return self.errors
+
+    @property
+    def monitors(self) -> Sequence[str]:
+        """All of the ring."""
+        return [monitor.name for monitor in self.ring.monitors]
+
+    def owner(self) -> NDArray[np.int64]:
+        """The monitor of each reading; -1: what no monitor tells alone."""
+        return self.read_by
+
+    # --- the model ------------------------------------------------------------------------------
+    def sees(self, hypothesis: Hypothesis) -> bool:
+        """A stored beam has no launch."""
+        return not isinstance(find(hypothesis[0]), LaunchEffect)
+
+    def view(self, causes: Sequence[Cause]) -> Beams:
+        """A closed orbit for each state."""
+        there = tuple(causes)
+        beams = tuple(self.kept.beam(self.ring, *state, there) for state in self.states)
+        return Beams(beams, monitors_with(self.ring, causes))
+
+    def read(self, view: Beams, nuisances: Array) -> Array:
+        """Monitors' errors and all."""
+        matrix, constant = view.monitors.matrix(), view.monitors.constant()
+        return self.told([_seen(b.shown, matrix, constant) for b in view.beams], nuisances)
+
+    def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
+        """Effects on the ring in closed form, those of monitors by differences."""
+        out = np.zeros((len(hypotheses), *self.used.shape))
+        kinds = [find(name) for name, _ in hypotheses]
+        on_ring = [i for i, kind in enumerate(kinds) if isinstance(kind, RingEffect)]
+        if on_ring:
+            some = [hypotheses[i] for i in on_ring]
+            matrix = view.monitors.matrix()
+            known: dict[int, Moved] = {}
+            for beam in view.beams:
+                if id(beam) not in known:
+                    known[id(beam)] = _seen(beam.moved(some), matrix)
+            out[on_ring] = self.told([known[id(beam)] for beam in view.beams], nuisances)
+        place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
+        for name in dict.fromkeys(name for name, _ in hypotheses):
+            effect = find(name)
+            if isinstance(effect, ReadingEffect):
+                own = [i for i, h in enumerate(hypotheses) if h[0] == name]
+                changed = self._of_monitors(view, nuisances, effect)
+                for i in own:
+                    mine = self.read_by == place[hypotheses[i][1] or ""]
+                    out[i][mine] = changed[mine]
+        return out
+
+    def _of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
+        """d readings / d amount of an effect on top, every monitor's own."""
+        high = 1.0 if effect.discrete else SMALL * effect.largest
+        low = 0.0 if effect.discrete else -high
+        ends = []
+        for amount in (high, low):
+            monitors = view.monitors.copy()
+            if amount:
+                effect.set(monitors, slice(None), amount)
+            ends.append((monitors.matrix(), monitors.constant()))
+        (upper, up), (lower, down) = ends
+        slope, constant = ((a - b) / (high - low) for a, b in ((upper, lower), (up, down)))
+        shown = [_seen(b.shown, slope, constant, tunes=0.0) for b in view.beams]
+        return self.told(shown, nuisances)
+
+
+def _seen(shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0) -> Moved:
+    """What monitors make of it."""
+    orbit, modes = shown.orbit + constant, shown.modes
+    wrong = np.flatnonzero((matrix != np.eye(2)).any(axis=(1, 2)))
+    if len(wrong):
+        modes, orbit = modes.copy(), orbit.copy()
+        own = matrix[wrong]
+        modes[..., wrong, :, :] = np.einsum(
+            "mij,...mjp->...mip", own, shown.modes[..., wrong, :, :]
+        )
+        beam = shown.orbit[..., wrong, :]
+        orbit[..., wrong, :] += np.einsum("mij,...mj->...mi", own, beam) - beam
+    return Moved(orbit, tunes * shown.tunes, modes)
+
+
+def rf_of(settings: Settings) -> float:
+    """Relative RF frequency that a shot was set to."""
+    return float(settings.get("rf", {}).get("frequency_relative", 0.0))
+
+
+def stacked(states: Sequence[Moved], name: str) -> Array:
+    """One quantity of all states, [..., state, *its own]: "orbit" behind the axes in front."""
+    depth = {"orbit": 2, "tunes": 1, "modes": 3}[name]
+    parts = [getattr(state, name) for state in states]
+    return np.stack(parts, axis=parts[0].ndim - depth)

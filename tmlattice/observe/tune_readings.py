@@ -1,0 +1,80 @@
+"""Tunes and chromaticities that were read: few numbers, which no monitor's error touches."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import Moved, StoredBeam
+from tmlattice.effects import Settings, apply
+from tmlattice.lattice import Ring
+from tmlattice.measurement import TuneReading
+from tmlattice.observe.steady import NOTHING
+from tmlattice.observe.stored import Stored, rf_of, stacked
+
+Array = NDArray[np.float64]
+
+DELTA = 5e-4
+"""Energy deviation on both sides of the nominal one, of the difference that is the chromaticity."""
+
+TUNE, CHROMATICITY = 1e-4, 0.1
+"""Errors where none is stated: a tune's by what currents drift in minutes, a chromaticity's by what
+that makes of steps of a per mil."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneReadings(Stored):
+    """Tunes and chromaticities, [shot, (Qx, Qy, Q'x, Q'y)]."""
+
+    energies: float
+
+    @property
+    def first(self) -> Array:
+        """No nuisances."""
+        return NOTHING
+
+    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """Each shot at its frequency, and at one above and one below."""
+        tunes = stacked(states, "tunes")
+        slope = (tunes[..., 1::3, :] - tunes[..., 2::3, :] + 0.5) % 1.0 - 0.5
+        return np.concatenate([tunes[..., ::3, :], slope / self.energies], axis=-1)
+
+
+def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]) -> TuneReadings:
+    """What measured tunes are for an inference: each is taken by the mode nearer to its plane."""
+    shots = len(measured.tune)
+    settings: tuple[Settings, ...] = measured.settings or ({},) * shots
+    model = ResponseModel(ring)
+    step = abs(DELTA / model.rf_start[5])
+    energies = 2 * step * float(model.rf_start[5])
+    design = np.array(
+        [StoredBeam(ResponseModel(apply(ring, (), one), 6, rf_of(one))).tunes for one in settings]
+    )
+    near = design + (measured.tune - design + 0.5) % 1.0 - 0.5
+    slopes = np.full((shots, 2), np.nan)
+    if measured.chromaticity is not None:
+        slopes = measured.chromaticity
+    data = np.concatenate([near, slopes], axis=1)
+    errors = np.concatenate(
+        [_filled(measured.tune_error, TUNE, shots),
+         _filled(measured.chromaticity_error, CHROMATICITY, shots)], axis=1
+    )  # fmt: skip
+    there = np.isfinite(data)
+    return TuneReadings(
+        ring=ring,
+        states=tuple((one, rf_of(one) + h) for one in settings for h in (0.0, step, -step)),
+        data=np.where(there, data, 0.0),
+        errors=errors,
+        read_by=np.full(data.shape, -1),
+        used=there,
+        places=places,
+        energies=energies,
+    )
+
+
+def _filled(errors: Array | None, usual: float, shots: int) -> Array:
+    if errors is None:
+        return np.full((shots, 2), usual)
+    return np.where(np.isfinite(errors), errors, usual)

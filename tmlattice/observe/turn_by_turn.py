@@ -1,0 +1,131 @@
+"""Turn by turn of a stored beam: its betatron lines at every monitor, and its tunes.
+
+A kicked beam oscillates in two modes; each is a line in the spectrum of every monitor, whose
+complex amplitude is the mode's vector there times one complex number of the shot. That number is a
+nuisance (nobody knows the kick's size and phase so well), all else is optics: phases, which no gain
+touches, ratios of amplitudes, and in the other plane coupling.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.stored import Moved
+from tmlattice.effects import Settings
+from tmlattice.errors import MeasurementError
+from tmlattice.inference.problem import Point
+from tmlattice.lattice import Ring
+from tmlattice.measurement import TurnByTurn
+from tmlattice.observe.spectra import Lines, lines
+from tmlattice.observe.stored import Beams, Stored, rf_of, stacked
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+TUNE = 1e-4
+"""Below this a tune is not believed: it moves with the amplitude, which the model leaves out."""
+
+FLOOR = 3e-4
+"""Share of a line below which its error is not believed: what amplitude and decoherence do to the
+ratio of two monitors, which the model leaves out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManyTurns(Stored):
+    """Lines [shot, (monitor, plane, mode, re and im), then two tunes]; m, and 1.
+
+    Nuisances are the complex amplitude of each shot and mode, re and im, [shot, 2, 2].
+    """
+
+    @property
+    def first(self) -> Array:
+        """The amplitudes that fit the ring as it is known best."""
+        shots = len(self.data)
+        view = self.view(self.fixed)
+        nothing = np.zeros((shots, 2, 2))
+        slopes = self.as_rows(self.directions(view, nothing)).T
+        left = self.as_rows(self.data - self.read(view, nothing))
+        solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
+        return np.asarray(solved.reshape(nothing.shape))
+
+    def left(self, point: Point) -> tuple[Array, Array]:
+        """A line is no single reading: none is left out alone."""
+        return np.zeros(self.used.shape), np.ones(self.used.shape)
+
+    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """A shot is a state."""
+        size = nuisances[..., 0] + 1j * nuisances[..., 1]
+        seen = np.ascontiguousarray(stacked(states, "modes") * size[:, None, None, :])
+        flat = seen.view(float).reshape(*seen.shape[:-3], -1)
+        return np.concatenate([flat, stacked(states, "tunes")], axis=-1)
+
+    def directions(self, view: Beams, nuisances: Array) -> Array:
+        """Linear in the nuisances; tunes have none."""
+        ones = np.zeros_like(nuisances)
+        ones[..., 0] = 1.0
+        shots = len(ones)
+        lines = self.read(view, ones)[:, :-2].reshape(shots, -1, 2, 2)  # [shot, , mode, re and im]
+        out = np.zeros((shots, 2, 2, shots, lines.shape[1], 2, 2))
+        for shot in range(shots):
+            for mode in range(2):
+                own = lines[shot, :, mode]
+                out[shot, mode, 0, shot, :, mode] = own
+                out[shot, mode, 1, shot, :, mode] = np.stack([-own[:, 1], own[:, 0]], axis=1)
+        flat = out.reshape(nuisances.size, shots, -1)
+        return np.concatenate([flat, np.zeros((*flat.shape[:2], 2))], axis=2)
+
+
+def many_turns(
+    ring: Ring, measured: TurnByTurn, places: Mapping[str, float], spectrum: Lines | None = None
+) -> ManyTurns:
+    """What turns of a stored beam are for an inference.
+
+    A real signal does not tell Q from 1 - Q: lines are looked for near to the design's tunes.
+
+    Args:
+        ring: the design.
+        measured: readings.
+        places: of each effect, for the prior.
+        spectrum: their lines, where they are known already.
+
+    Raises:
+        MeasurementError: no line can be used.
+        UnknownNameError: a monitor that the ring does not have.
+    """
+    names = [monitor.name for monitor in ring.monitors]
+    settings: tuple[Settings, ...] = measured.settings or ({},) * len(measured.shots)
+    count, shots = len(names), len(measured.shots)
+    shape = (shots, 8 * count + 2)
+    blank = ManyTurns(
+        ring=ring,
+        states=tuple((one, rf_of(one)) for one in settings),
+        data=np.zeros(shape),
+        errors=np.ones(shape),
+        read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1, -1]), (shots, 1)),
+        used=np.zeros(shape, dtype=bool),
+        places=places,
+    )
+    design = np.array([beam.tunes for beam in blank.view(()).beams])
+    found = spectrum
+    if found is None:
+        at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
+        found = lines(measured.in_order_of(names), near=design[0], at=at)
+    # what the model leaves out goes with the line of the mode in its own plane
+    size = np.abs(found.amplitude).max(axis=2, keepdims=True)
+    error = np.hypot(found.error, FLOOR * size).reshape(shots, -1)
+    both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
+    tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
+    data = np.concatenate([both.reshape(shots, -1), tunes], axis=1)
+    tune_error = np.hypot(found.tune_error, TUNE)
+    errors = np.concatenate([np.repeat(error, 2, axis=1), tune_error], axis=1)
+    there = np.isfinite(data) & np.isfinite(errors)
+    if not there.any():
+        raise MeasurementError(
+            "no betatron line stands out of the noise"
+            + (f": {'; '.join(found.said)}" if found.said else "; kick the beam harder")
+        )
+    return replace(
+        blank, data=np.where(there, data, 0.0), errors=np.where(there, errors, 1.0), used=there
+    )
