@@ -22,6 +22,9 @@ BESIDE = {
     "files",
     "temporaries",
     "cache",
+    "by_name",
+    "late",
+    "speaks",
     "batch",
     "schemas",
 }  # everybody may use them

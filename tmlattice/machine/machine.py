@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, beams, check, monitors_with
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
@@ -79,6 +80,7 @@ class Machine:
         TmlatticeError: another engine, or negative noise.
     """
 
+    @by_name
     def __init__(
         self,
         ring: Ring,
