@@ -1,5 +1,6 @@
 """`tmlattice diagnose` as a user runs it, its report in words, its figures and its page."""
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -118,7 +119,7 @@ def test_command_reports_writes_and_draws(outcome, folders, schema):
     assert document["provenance"]["measurement"] == str(folders / "weak")
     names = {path.name for path in (folder / "day").iterdir()}
     assert names == {
-        "diagnosis.json", "report.html", "report.txt", "readings.png", "scan.png",
+        "diagnosis.json", "report.html", "report.txt", "plan.png", "readings.png", "scan.png",
         "scan-near.png", "gap.png",
     }  # fmt: skip
     for name in names:
@@ -127,15 +128,18 @@ def test_command_reports_writes_and_draws(outcome, folders, schema):
     assert (folder / "day" / "report.txt").read_text().splitlines()[0] in done.stdout
 
 
-def test_page_opens_offline_and_holds_its_figures(outcome):
+def test_page_holds_its_figures_and_leads_nowhere(outcome):
+    """What a browser makes of it is in test_report_page.py."""
     html = (outcome[0] / "day" / "report.html").read_text(encoding="utf-8")
+    assert len(html.encode()) < 3e6
     parser = References()
     parser.feed(html)
-    assert len(parser.found) == parser.tags.count("img") == 4
-    assert all(source.startswith("data:image/png;base64,") for source in parser.found)
-    assert not {"script", "link", "iframe", "object"} & set(parser.tags)
-    assert not re.search(r"https?://|url\(|@import", html)
-    for words in ("QD::5", "named", "set or repair the gradient of QD::5", "as designed",
+    pictures = [source for source in parser.found if source.startswith("data:image/png;base64,")]
+    assert len(pictures) == parser.tags.count("img") == 5
+    inside = [source for source in parser.found if source not in pictures]
+    assert all(source.startswith(("#", "data:,")) for source in inside)
+    assert not {"iframe", "object"} & set(parser.tags)
+    for words in ("QD::5", "named", "Set or repair the gradient of QD::5", "as designed",
                   "the remedy is the same", "The gap", "Provenance", "false_alarm"):  # fmt: skip
         assert words in html
 
@@ -179,7 +183,7 @@ def test_reference_and_single_shot(folders, tmp_path, schema):
         ([SMALL, "nowhere"], "no measurement folder"),
         (["petra4", "weak"], "no lattice 'petra4'; did you mean 'petra3'"),
         (["nowhere/ring.py", "weak"], "no lattice file"),
-        ([SMALL, "response"], "an orbit response without an RF step"),
+        ([SMALL, "response"], "the noise of the readings is not stated"),
         ([SMALL, "weak", "--reference", "response"], "is an orbit response"),
         ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
         ([SMALL, "strange"], "no monitor 'last_c'; did you mean"),
@@ -312,7 +316,7 @@ def test_every_verdict_has_its_figures(diagnoses, verdict):
         assert caption.endswith(".")
         figure.canvas.draw()
         plt.close(figure)
-    assert names[:2] == ["readings", "scan"]
+    assert names[:3] == ["plan", "readings", "scan"]
     assert "gap" in names
     assert ("credible-set-1" in names) == (verdict == "equivalent")
     assert ("scan-near" in names) == bool(diagnoses[verdict].findings)
@@ -345,9 +349,38 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
 
     diagnosis = diagnoses["named"]
     ax = plot_gap(diagnosis)
-    heights = [bar.get_height() for bar in ax.patches]
-    assert heights == pytest.approx([1e6 * m.rms for m in diagnosis.heldout.misfits])
-    assert ax.lines[0].get_ydata()[0] == pytest.approx(2.0)
+    lengths = [bar.get_width() for bar in ax.patches]
+    assert lengths == pytest.approx([1e6 * m.rms for m in diagnosis.heldout.misfits])
+    assert ax.lines[0].get_xdata()[0] == pytest.approx(2.0)
+    plt.close(ax.figure)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8])
+def test_names_under_the_bars_of_the_gap_do_not_overlap(diagnoses, count):
+    """Long names of many findings, each beside its own bar."""
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots.diagnosis import gap_axes, plot_gap
+
+    diagnosis = diagnoses["named"]
+    (cause,), (error,) = diagnosis.causes, diagnosis.errors
+    long = Cause("corrector_kick_x", "steerer_of_the_long_straight_section_north_supply_17", 1e-5)
+    steps = diagnosis.heldout.misfits
+    many = dataclasses.replace(
+        diagnosis,
+        causes=(cause, *[long] * (count - 1)),
+        errors=(error,) * count,
+        heldout=dataclasses.replace(
+            diagnosis.heldout, misfits=(*steps, *[steps[-1]] * (count - 1))
+        ),
+    )
+    ax = plot_gap(many, gap_axes(many))
+    ax.figure.canvas.draw()
+    boxes = [label.get_window_extent() for label in ax.get_yticklabels()]
+    assert len(boxes) == count + 1
+    for i, one in enumerate(boxes):
+        assert one.x0 >= 0
+        assert not any(one.overlaps(other) for other in boxes[i + 1 :])
     plt.close(ax.figure)
 
 

@@ -236,3 +236,41 @@ def test_explain_stops_at_the_number_of_causes_allowed(petra3):
     assert (result.verdict, result.findings) == ("distributed", ())
     assert any("do not explain" in w for w in result.warnings)
     assert result.gap["fit"]["before"] == result.gap["fit"]["after"]
+
+
+@pytest.mark.parametrize(
+    ("cause", "shots"),
+    [
+        (None, 2),
+        (Cause("quadrupole_gradient", "QD::3", -0.05), 1),
+        (Cause("quadrupole_gradient", "QD::3", -0.05), 3),
+        (Cause("monitor_gain_x", "bpm::4", 0.1), 1),
+        (Cause("dipole_roll", "bend::4", 5e-3), 2),
+    ],
+)
+def test_what_is_in_the_reference_too_is_no_change(small_ring, cause, shots):
+    causes = [] if cause is None else [cause]
+    before, after = (
+        simulate(small_ring, causes, shots=shots, seed=seed).measurement() for seed in (50, 0)
+    )
+    for reference in (after, before):  # the folder itself, and the same machine once more
+        found = diagnose(small_ring, after, reference=reference)
+        assert (found.verdict, found.findings) == ("nothing", ())
+
+
+def test_small_errors_alone_are_no_change(small_ring):
+    machine = {"background": {"all": None}, "machine_seed": 7}
+    before, after = (
+        simulate(small_ring, [], shots=6, seed=seed, **machine).measurement() for seed in (50, 0)
+    )
+    assert diagnose(small_ring, after, reference=before).verdict == "nothing"
+
+
+def test_a_fault_beside_one_that_was_there_before(small_ring):
+    old, new = (Cause("quadrupole_gradient", f"QD::{i}", a) for i, a in ((1, -0.1), (5, -0.05)))
+    before = simulate(small_ring, [old], shots=4, seed=50).measurement()
+    after = simulate(small_ring, [old, new], shots=4, seed=0).measurement()
+    found = diagnose(small_ring, after, reference=before)
+    assert [(f.effect, f.element) for f in found.findings] == [("quadrupole_gradient", "QD::5")]
+    sigma = found.findings[0].amount_sigma
+    assert abs(found.findings[0].amount + 0.05) < 4 * sigma

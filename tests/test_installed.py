@@ -48,7 +48,14 @@ def test_wheel_in_an_empty_folder_brings_the_ring(wheel, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     assert run("-I", "-c", CHECK.format(place=str(place)), cwd=empty).split()[:2] == ["1519", "246"]
-    for name in ("py.typed", "schemas/tune-fit.schema.json", "lattices/match_petra3.py"):
+    for name in (
+        "py.typed",
+        "schemas/tune-fit.schema.json",
+        "lattices/match_petra3.py",
+        "report/page.js",
+        "report/style.css",
+        "report/vendor/plotly-LICENSE",
+    ):
         assert (place / "tmlattice" / name).exists(), name
     assert not (place / "tests").exists()
 

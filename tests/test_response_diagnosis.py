@@ -1,5 +1,6 @@
 """The ordered steps on simulated orbit responses whose errors are known, and the measured one."""
 
+import csv
 import json
 import os
 from dataclasses import replace
@@ -21,10 +22,11 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
 from tmlattice.machine import draw_background
 from tmlattice.machine.response import simulate_response as simulated
-from tmlattice.measurement import read_measurement, write_measurement
+from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
+from tmlattice.observe.response_noise import learnt_noise
 from tmlattice.optics import twiss
 from tmlattice.report.plain import report_text
 
@@ -137,6 +139,40 @@ def test_a_faultless_ring_is_nothing(small_ring):
     assert not found.warnings
 
 
+def test_a_response_without_rf_step_and_noise_is_fitted_and_says_so(small_ring, measured):
+    bare = replace(measured, rf=None, noise=None)
+    found = diagnose(small_ring, bare, effects=["quadrupole_gradient"])
+    assert found.noise_estimated
+    assert max(found.noise) < 2 * 2e-8  # as simulated
+    assert found.steps[-1].heldout_rms_in_plane < 0.3 * found.steps[0].heldout_rms_in_plane
+    said = " ".join(found.warnings)
+    assert "noise of the readings is not stated" in said
+    assert "there is no RF step" in said
+    json.dumps(found.as_json(), allow_nan=True)
+    assert "nan" not in report_text(found)
+
+
+@pytest.mark.parametrize("noise", [2e-8, 5e-7])
+def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noise):
+    exact = ResponseModel(small_ring)
+    monitors = [m.name for m in small_ring.monitors]
+    names = [f"v{i}" for i in range(16)]
+    orbits = 1e-5 * exact.response(names)
+    read = orbits + noise * rng.standard_normal(orbits.shape)
+    measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
+    assert 0.6 < learnt_noise(measured)[0, 1] / noise < 1.5  # of 16 columns
+
+
+def test_readings_that_resemble_nothing_are_named_and_left_out(small_ring, measured, rng):
+    response = measured.response.copy()
+    response[:, 6, 1] = rng.permutation(response[:, 6, 1])
+    wrong = replace(measured, response=response)
+    found = diagnose(small_ring, wrong, effects=["quadrupole_gradient"])
+    assert any(f"{measured.monitors[6]} in y" in said for said in found.warnings)
+    assert found.steps[-1].heldout_rms_in_plane < 0.2 * np.std(response[:, 6, 1])
+    assert found.steps[-1].heldout_rms_in_plane < 0.3 * found.steps[0].heldout_rms_in_plane
+
+
 def test_what_the_fit_may_not_mend_is_warned_about(small_ring):
     """The held-out correctors are noise; the fitted ones are not."""
     measured = wrong_corrector(small_ring, "corrector_calibration", -2.0)
@@ -159,8 +195,8 @@ def test_options_act_and_are_told(small_ring, measured):
     assert options["false_alarm"] == 0.01
     with pytest.raises(MeasurementError, match="does not see monitor_offset_x"):
         diagnose(small_ring, measured, effects=["monitor_offset_x"])
-    with pytest.raises(MeasurementError, match="'reference' has no meaning for an orbit response"):
-        diagnose(small_ring, measured, reference=measured)
+    with pytest.raises(MeasurementError, match="'radiation' has no meaning for an orbit response"):
+        diagnose(small_ring, measured, radiation=True)
 
 
 SIGNATURES = [
@@ -396,6 +432,39 @@ def test_command(tmp_path, measured, result):
     own = (np.arange(kept.sum()), slice(None), [int(p == "y") for p in
            np.array(measured.planes)[kept]])  # fmt: skip
     assert np.sqrt(np.mean(miss[own] ** 2)) < 0.01 * np.sqrt(np.mean(gap[own] ** 2))
+
+
+def test_predict_reproduces_the_held_out_figure_with_an_energy_spread(tmp_path, small_ring):
+    spread = Cause("energy_spread", None, 2.5e-3)
+    measured = simulate_response(
+        small_ring, [*CAUSES, spread], kick=1e-5, noise=2e-9, engine="ocelot", progress=False,
+        seed=3,
+    ).measured  # fmt: skip
+    write_measurement(tmp_path / "m", measured)
+    ring, out, told = (tmp_path / name for name in ("ring.json", "predicted.csv", "found.json"))
+    calibration = tmp_path / "ring.json.calibration.json"
+    for words in (
+        ("diagnose", SMALL, tmp_path / "m", "--lattice-out", ring, "--json", told),
+        ("predict", ring, "--calibration", calibration, "--out", out, "--kick", "1e-5"),
+    ):
+        done = CliRunner().invoke(tmlattice, [str(word) for word in words])
+        assert done.exit_code == 0, done.output
+    assert "energy_spread" in calibration.read_text()
+    figure = json.loads(told.read_text())["steps"][-1]["heldout_rms_in_plane"]
+    with out.open(encoding="utf-8") as table:
+        rows = {(row["corrector"], row["monitor"]): row for row in csv.DictReader(table)}
+    # the same judges as the diagnosis had: the kick from one half of the monitors
+    data = response_data(small_ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(0))
+    left = []
+    for c in np.flatnonzero(split.held):
+        name, plane = data.measured.correctors[c], data.measured.planes[c]
+        own = [rows[small_ring[name].name, m] for m in data.measured.monitors]
+        model = np.array([float(row[plane]) for row in own])
+        read, near = data.pick(data.orbits)[c], split.half[c]
+        kick = model[near] @ read[near] / (model[near] @ model[near])
+        left.append((read - kick * model)[~near])
+    assert np.isclose(np.sqrt(np.mean(np.square(left))), figure, rtol=0.05)  # the third order
 
 
 def test_options_that_have_no_meaning(tmp_path, measured):

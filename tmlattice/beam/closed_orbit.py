@@ -22,7 +22,7 @@ from tmlattice.beam.chain import NO_ORBIT, Chain, closing
 from tmlattice.beam.settle import settle
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Ring
-from tmlattice.maps import LayerMaps, RingMaps, ring_maps
+from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
 from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
@@ -105,6 +105,23 @@ class ResponseModel:
         other._close(frequency)
         return other
 
+    def changed_to(self, ring: Ring) -> "ResponseModel":
+        """Of a ring that differs in some elements, not in their places: only their layers are made
+        anew.
+
+        Raises:
+            UnstableRingError: no closed orbit.
+        """
+        other = copy(self)
+        for name in ("closing", "rf_start"):  # cached for this orbit
+            other.__dict__.pop(name, None)
+        other.ring = ring
+        other.layers, touched = self.layers.changed_to(ring)
+        other.maps = changed_maps(self.maps, other.layers, touched)
+        other._chain = Chain(other.maps)
+        other._close(self.frequency)
+        return other
+
     def _close(self, frequency: float) -> None:
         dimension = self.dimension
         if frequency and dimension != 6:
@@ -117,7 +134,10 @@ class ResponseModel:
             free=self.free, turn=self._turn, tolerance=1e-15
         )
         self.state = self.path[0]
-        self.inverse = np.linalg.inv(self.tangents)
+        try:
+            self.inverse = np.linalg.inv(self.tangents)
+        except np.linalg.LinAlgError:  # the matrices have grown beyond all bounds
+            raise UnstableRingError(NO_ORBIT) from None
         self._solve = closing(self.tangents[-1], self.free, np.arange(len(self.free)))
 
         at, maps = self.maps.at, self.maps

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.effects.directions import Directions, directions
+from tmlattice.effects.directions import Directions, directions_nearby
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import second_derivatives
 
@@ -38,6 +38,10 @@ NEAR = 1e-9
 GROWTH = 1e-2
 """Distance of an eigenvalue from the unit circle at which the motion counts as unstable: off the
 axis second-order maps are symplectic to their own order only (1e-5 for an orbit of 6 mm)."""
+
+
+STILL = 1e-12
+"""m and rad per unit: effects that kick less leave the closed orbit where it is."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,13 @@ class StoredBeam:
             np.zeros((count, monitors, 2)), np.zeros((count, 2)),
             np.zeros((count, monitors, 2, 2), dtype=complex),
         )  # fmt: skip
-        d = directions(model.layers, hypotheses)
+        d = directions_nearby(model.layers, hypotheses)
         if len(d.owner):
             orbit, total, seen = self._sources(d)
             tunes, mixed = self._perturbed(total)
-            seen = seen + np.einsum("mai,rip->rmap", model.reading_slopes, mixed, optimize=True)
+            G = model.reading_slopes.reshape(-1, model.dimension)
+            there = (G @ mixed.transpose(1, 2, 0).reshape(model.dimension, -1)).T
+            seen = seen + there.reshape(2, -1, monitors, 2).transpose(1, 2, 3, 0)
             for out, rows in ((moved.orbit, orbit), (moved.tunes, tunes), (moved.modes, seen)):
                 if len(np.unique(d.owner)) == len(rows):
                     out[d.owner] = rows
@@ -119,29 +125,44 @@ class StoredBeam:
     def _sources(self, d: Directions) -> tuple[Array, Array, ComplexArray]:
         """Of each row of the directions: the closed orbit's change at the monitors, the sources of
         the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2, mode]."""
-        model, at, U = self.model, self.model.maps.at, self._U
-        k = d.layer
-        x, C, back = model.path[k], model.tangents[k], model.inverse[k + 1]
-        bent = np.einsum("raij,rj->rai", second_derivatives(d.D2), x)
+        model, at, U, n = self.model, self.model.maps.at, self._U, self.model.dimension
+        k, rows = d.layer, len(d.layer)
+        x, C, back = model.path[k][..., None], model.tangents[k], model.inverse[k + 1]
+        bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
         S = back @ (d.D1 + bent) @ C
-        w = np.einsum("rai,ri->ra", back, d.D0 + np.einsum("rai,ri->ra", d.D1 + bent / 2, x))
+        w = (back @ (d.D0[..., None] + (d.D1 + bent / 2) @ x))[..., 0]
         z = w @ model.closing.T
         behind = at[None] > k[:, None]  # the monitor reads behind the layer
-        G = model.reading_slopes
-        orbit = np.einsum("mai,ri->rma", G, z) + behind[..., None] * np.einsum("mai,ri->rma", G, w)
-        total, first = self._bends[-1], self._bends[k + 1]
-        whole = (
-            S
-            + np.einsum("abc,rc->rab", total, z)
-            + np.einsum("abc,rc->rab", total, w)
-            - np.einsum("rabc,rc->rab", first, w)
-        )
-        late = S @ U - np.einsum("rabc,rc,bp->rap", first, w, U, optimize=True)
-        bends = np.einsum("mja,mabc,bp->mjpc", G, self._bends[at], U, optimize=True)
-        bends = bends + self._read_bends
-        seen = np.einsum("mja,rap->rmjp", G, late) + np.einsum("mjpc,rc->rmjp", bends, w)
-        seen = behind[..., None, None] * seen + np.einsum("mjpc,rc->rmjp", bends, z)
+        G = model.reading_slopes.reshape(-1, n)
+        shape = (rows, len(at), 2)
+        orbit = (z @ G.T).reshape(shape) + behind[..., None] * (w @ G.T).reshape(shape)
+        bends = self._bends
+        first = (bends[k + 1] @ w[:, None, :, None])[..., 0]
+        whole = S - first + ((z + w) @ bends[-1].reshape(-1, n).T).reshape(rows, n, n)
+        late = G @ ((S - first) @ U).transpose(1, 2, 0).reshape(n, -1)  # [monitor 2, mode row]
+        seen = late.reshape(len(at), 2, 2, rows).transpose(3, 0, 1, 2)
+        if np.abs(w).max(initial=0.0) > STILL:
+            moves = self._seen_bends
+            seen = seen + (w @ moves).view(complex).reshape(*shape, 2)
+            seen = behind[..., None, None] * seen + (z @ moves).view(complex).reshape(*shape, 2)
+        else:
+            seen = behind[..., None, None] * seen
         return orbit, whole, seen
+
+    @cached_property
+    def _seen_bends(self) -> Array:
+        """What a launch of the closed orbit adds to the modes at the monitors: through the maps
+        before, and where read-outs bend, [n, monitor * 2 * mode * (re, im)]."""
+        model, maps = self.model, self.model.maps
+        C = model.tangents[maps.at]
+        through = np.einsum(
+            "mja,mabc,bp->cmjp", model.reading_slopes, self._bends[maps.at], self._U, optimize=True
+        )
+        read = np.einsum(
+            "majk,mkc,mjb,bp->cmap", second_derivatives(maps.R2), C, C, self._U, optimize=True
+        )
+        whole = np.ascontiguousarray(through + read).reshape(model.dimension, -1)
+        return np.asarray(whole.view(float))
 
     @cached_property
     def _bends(self) -> Array:
@@ -157,17 +178,6 @@ class StoredBeam:
         summed = np.zeros((len(W2) + 1, n, n, n))
         summed[j + 1] = each
         return np.cumsum(summed, axis=0)
-
-    @cached_property
-    def _read_bends(self) -> ComplexArray:
-        """What read-outs that bend add to the modes, per unit of launch, [monitor, 2, mode, n]."""
-        model, maps = self.model, self.model.maps
-        C = model.tangents[maps.at]
-        return np.asarray(
-            np.einsum(
-                "majk,mkc,mjb,bp->mapc", second_derivatives(maps.R2), C, C, self._U, optimize=True
-            )
-        )
 
     def _perturbed(self, whole: Array) -> tuple[Array, ComplexArray]:
         """d tunes and d U at the start, [row, n, mode], for sources of the whole turn."""

@@ -47,17 +47,17 @@ if TYPE_CHECKING:
     type=FILE,
     metavar="DIR",
     multiple=True,
-    help="A measurement of the same machine before the fault: static errors cancel. Repeat it "
-    "where several are diagnosed together.",
+    help="A measurement of the same machine and kind before the fault: static errors cancel, and "
+    "what changed is told. Repeat it where several are diagnosed together.",
 )
 @background_option("Small errors everywhere (not given: the data say)")
 @assume_option
 @click.option(
     "--max-effects",
     type=click.IntRange(1),
-    default=8,
-    show_default=True,
-    help="Findings at most; of an orbit response, steps that are kept at most.",
+    default=None,
+    help="Findings at most; of an orbit response, steps that are kept at most. 8 where nothing is "
+    "said, 40 of a change between two responses.",
 )
 @click.option(
     "--effects",
@@ -166,11 +166,18 @@ def diagnose(
             _refuse(what, network=network, radiation=options.pop("radiation"))
         if response:
             options["missing"] = missing
+            if before:
+                _refuse(
+                    "a change since a reference", missing=missing, lattice_out=lattice_out,
+                    repaired_out=repaired_out,
+                )  # fmt: skip
         else:
             _refuse("anything but an orbit response alone", missing=missing)
             options["background"] = dict(background) or None
         if before:
             options["reference"] = before
+        if options["max_effects"] is None:
+            del options["max_effects"]
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
         if lattice_out and lattice_out == repaired_out:
             raise click.UsageError(f"--lattice-out and --repaired-out are both '{lattice_out}'")

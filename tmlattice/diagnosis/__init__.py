@@ -21,7 +21,7 @@ __all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"
 
 _OPTIONS = {
     "first turns": ("reference", "background", "heldout", "radiation"),
-    "an orbit response": ("missing",),
+    "an orbit response": ("reference", "missing"),
     "several measurements, or those of a stored beam": ("reference", "background"),
 }
 _OWN = {name for names in _OPTIONS.values() for name in names}
@@ -36,11 +36,12 @@ def diagnose(
     Args:
         ring: the design.
         measurement: of any kind; or several of one machine by name, which are diagnosed together.
-        options: for every kind holdout, effects, max_effects, false_alarm, assume, seed and
-            progress; for first turns also reference, background, heldout and radiation, see
-            `diagnosis.procedure.diagnose`; for an orbit response alone missing, see
-            `diagnosis.response.diagnose_response`; for several, and for those of a stored beam,
-            reference and background, see `diagnosis.joint.diagnose_together`.
+        options: for every kind holdout, effects, max_effects, false_alarm, assume, seed, progress
+            and reference, a measurement of the same kind and machine from before; for first turns
+            also background, heldout and radiation, see `diagnosis.procedure.diagnose`; for an orbit
+            response alone missing, see `diagnosis.response.diagnose_response`, and with a reference
+            `diagnosis.before_after.diagnose_change`; for several, and for those of a stored beam,
+            background, see `diagnosis.joint.diagnose_together`.
 
     Raises:
         MeasurementError: data that cannot be used, or an option without meaning for them.
@@ -60,13 +61,22 @@ def diagnose(
         before = options["reference"] = _alone(options["reference"])
         if before is not None and type(before) is not type(measurement):
             raise MeasurementError(
-                f"the reference is {in_words(before)}; give {of}, as it was measured"
+                f"the measurement is {of} and the reference {in_words(before)}: give a reference "
+                "of the same kind"
             )
     if isinstance(measurement, Measurement):
         return diagnose_trajectories(ring, measurement, **options)
+    if isinstance(measurement, OrbitResponse) and options.get("reference") is not None:
+        from tmlattice.diagnosis.before_after import diagnose_change
+
+        before = options.pop("reference")
+        if options.pop("missing", False):
+            raise MeasurementError("the option 'missing' has no meaning beside a reference")
+        return diagnose_change(ring, before, measurement, **options)
     if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response import diagnose_response
 
+        options.pop("reference", None)
         return diagnose_response(ring, measurement, **options)
     from tmlattice.diagnosis.joint import diagnose_together
 

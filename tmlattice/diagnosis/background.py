@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 
 from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import Cause
+from tmlattice.errors import BeamLostError
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.sizes import Sizes, learn_sizes
@@ -146,12 +147,16 @@ def small_errors(
         estimate: the likeliest small errors beside it.
         learn: the sizes are learnt from the data; `rms` is where that starts.
         noisy: so is the noise, which is a guess.
+
+    Raises:
+        BeamLostError: the beam does not come round in what is taken for the machine.
     """
     fixed, data = tuple(causes), plain.data
     evidence, errors, opened = None, dict[str, float](), plain.open
     for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
         alone = fit(replace(plain, model=model, fixed=fixed), (), launches)
+        _on_its_way(alone)
         paths = alone.point.view
         hypotheses, scale, spread = background_signatures(model, paths, alone.nuisances, rms)
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
@@ -175,6 +180,7 @@ def small_errors(
             plain, model=model, data=shifted, fixed=fixed, spread=spread, white=None, open=opened
         )
         explained = fit(problem, (), alone.nuisances)
+        _on_its_way(explained)
         launches = explained.nuisances
         problem = replace(problem, fixed=())
         small = SmallErrors(
@@ -186,6 +192,11 @@ def small_errors(
     if fixed:
         small = replace(small, before=fit(problem, (), launches))
     return small
+
+
+def _on_its_way(result: Fit) -> None:
+    if result.point.lost:
+        raise BeamLostError(f"{result.point.lost} among the small errors that the data ask for")
 
 
 def _sizes(

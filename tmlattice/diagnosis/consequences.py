@@ -113,6 +113,20 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
     return told
 
 
+def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
+    """What all causes together do to the stored beam; nothing of it is repaired.
+
+    Args:
+        ring: the design.
+        causes: those of monitors and of settings are passed over.
+    """
+    there = assembly(ring)
+    design = _optics(there, {})
+    felt = [cause for cause in causes if _felt(cause.effect)]
+    found = _beside(design, _optics(there, _changed(ring, ring, felt)))
+    return Consequences(None if design is None else _pair(design.tunes), found, None)
+
+
 def _felt(effect: str) -> bool:
     kind = find(effect)
     return isinstance(kind, RingEffect) and not kind.acts_on_settings and not kind.natural

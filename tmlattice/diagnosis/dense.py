@@ -7,7 +7,7 @@ Gradients and skew gradients are fitted together, because skew ones move the tun
 """
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Told, Trial
+from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
 from tmlattice.diagnosis.state import (
-    Linear,
     State,
     allow,
     amplitudes,
@@ -24,11 +24,9 @@ from tmlattice.diagnosis.state import (
     bend,
     forbid,
     jump,
-    linear,
-    log_evidence,
     rms_of,
-    settle,
 )
+from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.observe.orbit_response import ResponseData, Split
 
@@ -42,6 +40,8 @@ LEAST = 5.0
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.05
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
 25 readings), and by how much their sum may fall without a step that stays all the same."""
+SURE = 100.0
+"""Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
 FIRST, ROUGH = 4, 0.03
 """Rounds of each block after a family came in, or went, and what one has to gain for another."""
 
@@ -217,13 +217,10 @@ def fit_steps(
         most: steps that are kept at most.
         progress: called with each step's name.
     """
-    design = state = begin(data, split)
+    design = begin(data, split)
     before = score(design, split.held)
     steps: dict[Trial, Step] = {}
-    for trial in trials:
-        progress(_title(trial))
-        state = bend(state) if trial.own else state
-        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
+    for trial, state in one_by_one(design, trials, progress):
         count = sum(family.count(data) for family in trial.families)
         steps[trial] = Step.scored(_title(trial), count, score(state, split.held))
     progress("all together")
@@ -248,6 +245,17 @@ def fit_steps(
     return DenseFit(design, state, tuple(kept), tuple(refused), (before, after))
 
 
+def one_by_one(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
+) -> Iterator[tuple[Trial, State]]:
+    """The state with one trial's families after another, each fitted beside those before it."""
+    for trial in trials:
+        progress(_title(trial))
+        state = bend(state) if trial.own else state
+        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
+        yield trial, state
+
+
 def _title(trial: Trial) -> str:
     return ", ".join(family.title for family in trial.families)
 
@@ -265,6 +273,11 @@ def _inner(state: State) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(rms), axis=0)))
 
 
+def _lost(without: Array, inner: Array) -> float:
+    """By how much the judges' figures rise; those that nobody read (no RF step) say nothing."""
+    return float(np.nansum(JUDGES * np.log(without / np.maximum(inner, 1e-300))))
+
+
 def _worth(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, float], dict[Trial, State]]:
@@ -274,21 +287,59 @@ def _worth(
     Correctors that were not fitted have the veto: evidence takes readings for independent, which
     what the model lacks is not.
     """
-    worth: dict[Trial, float] = {}
+    worth, judged = _quickly(state, trials, progress)
+    doubtful = [trial for trial in judged if judged[trial] or not worth[trial] > SURE]
     states: dict[Trial, State] = {}
+    if not doubtful:
+        return worth, states
     inner, evidence = _inner(state), log_evidence(state, state.good)
-    for trial in trials:
+    for trial in doubtful:
         progress(f"without {_title(trial)}")
         without = states[trial] = _without(state, trial)
         good = state.good & without.good
         with_it = evidence if (good == state.good).all() else log_evidence(state, good)
         gained = with_it - log_evidence(without, good) - LEAST
-        lost = float(JUDGES @ np.log(_inner(without) / np.maximum(inner, 1e-300)))
+        lost = _lost(_inner(without), inner)
         log.info("without %s: evidence %+.1f, judges %+.3f", _title(trial), -gained, lost)
-        # of what fitted correctors have of their own those that were not fitted know nothing
-        asked = any(family.per != "column" for family in trial.families)
-        worth[trial] = min(gained, lost) if asked and lost < -VETO else gained
+        worth[trial] = min(gained, lost) if _asked(trial) and lost < -VETO else gained
     return worth, states
+
+
+def _priors(trial: Trial, state: State) -> set[str]:
+    return {group.name for family in trial.families for group in family.groups(state.data)}
+
+
+def _asked(trial: Trial) -> bool:
+    """Whether correctors that were not fitted know of it: not of what fitted ones have of their
+    own."""
+    return any(family.per != "column" for family in trial.families)
+
+
+def _quickly(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
+) -> tuple[dict[Trial, float], dict[Trial, bool]]:
+    """Log evidence of each trial, linear about where the fit stands, which is enough for what
+    nobody doubts; and whether the judges would rather be without it."""
+    worth: dict[Trial, float] = {}
+    against: dict[Trial, bool] = {}
+    inner = _inner(state)
+    blocks: dict[int, tuple[Linear, float]] = {}
+    for trial in trials:
+        progress(f"is {_title(trial)} needed")
+        block = trial.families[0].block
+        if block not in blocks:
+            there = linear(state, block)
+            blocks[block] = there, linear_evidence(there)[0]
+        there, evidence = blocks[block]
+        other, values = linear_evidence(there, _priors(trial, state))
+        worth[trial] = evidence - other - LEAST
+        try:
+            lost = _lost(_inner(state.moved({**state.values, **values})), inner)
+        except TmlatticeError:  # no closed orbit without it
+            lost = np.inf
+        against[trial] = _asked(trial) and lost < -VETO
+        log.info("%s: linear evidence %+.1f, judges %+.3f", _title(trial), worth[trial], lost)
+    return worth, against
 
 
 def _without(state: State, trial: Trial) -> State:

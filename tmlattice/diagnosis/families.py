@@ -7,17 +7,17 @@ Families that move the same numbers (single gradients, and gradients of whole fa
 `variable`: their priors add up.
 """
 
-import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.magnets import families, magnets, straights
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
+from tmlattice.lattice import Element, Ring
 from tmlattice.observe.orbit_response import DELTA, Errors, Predicted, ResponseData
 
 Array = NDArray[np.float64]
@@ -29,20 +29,6 @@ TAILS = 4.0
 LARGEST_GRADIENT = 0.02
 """Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
 LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
-
-
-def stem(name: str) -> str:
-    """What a family's names begin with: up to the first underscore, dot or `::`."""
-    return re.split(r"_|\.|::", name, maxsplit=1)[0].casefold()
-
-
-def families(names: Sequence[str]) -> tuple[list[str], Array]:
-    """Stems that more than one has, and who belongs to them, [name, family] of 0 and 1."""
-    stems = [stem(name) for name in names]
-    kinds = [kind for kind in dict.fromkeys(stems) if stems.count(kind) > 1]
-    return kinds, np.array([[float(own == kind) for kind in kinds] for own in stems]).reshape(
-        len(names), len(kinds)
-    )
 
 
 class Family(ABC):
@@ -244,26 +230,44 @@ class _Magnets(Family):
     per = "ring"
     effect: ClassVar[str]
 
+    @abstractmethod
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Of each magnet: its pieces, and what each of them has of the magnet's number."""
+
     def places(self, data: ResponseData) -> list[str]:
-        """Quadrupoles that can have it."""
-        return [e.name for e in data.ring.elements if e.kind == "quadrupole"]
+        """Each magnet's first piece."""
+        return [next(iter(pieces)) for pieces in self.shares(data)]
 
     def size(self, data: ResponseData) -> int:
-        return len(self.places(data))
+        return len(self.shares(data))
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        return at.rows(self.effect, self.places(at.data), self.block)
-
-    def _causes(self, values: Array, data: ResponseData) -> Iterator[Cause]:
-        for place, value in zip(self.places(data), values, strict=True):
-            yield Cause(self.effect, place, float(value))
+        shares = self.shares(at.data)
+        pairs = [(self.effect, place) for pieces in shares for place in pieces]
+        gain, slopes = at.gain(self.block), at.slopes(pairs)
+        out = np.zeros((len(shares), *at.data.shape))
+        for i, pieces in enumerate(shares):
+            for share in pieces.values():
+                out[i] += share * at.data.pick(next(slopes), self.block)
+            out[i] *= gain
+        return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        causes = tuple(c for c in self._causes(values, data) if c.amount)
+        causes = tuple(
+            Cause(self.effect, place, share * float(value))
+            for pieces, value in zip(self.shares(data), values, strict=True)
+            for place, share in pieces.items()
+            if value
+        )
         return replace(errors, ring=(*errors.ring, *causes))
 
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
-        return list(zip(self._causes(values, data), map(float, sigma), strict=True))
+        """Of every piece."""
+        return [
+            (Cause(self.effect, place, share * float(value)), share * float(error))
+            for pieces, value, error in zip(self.shares(data), values, sigma, strict=True)
+            for place, share in pieces.items()
+        ]
 
 
 class QuadrupoleGradient(_Magnets):
@@ -273,9 +277,9 @@ class QuadrupoleGradient(_Magnets):
     effects: ClassVar[tuple[str, ...]] = ("quadrupole_gradient",)
     block, variable, trust = 0, "gradient", 0.01
 
-    def places(self, data: ResponseData) -> list[str]:
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """Those that have a gradient."""
-        return [e.name for e in data.ring.elements if e.kind == "quadrupole" and e.k1 != 0]
+        return [{e.name: 1.0 for e in own} for own in magnets(data.ring, ("quadrupole",), True)]
 
     def groups(self, data: ResponseData) -> list[Group]:
         """Of each."""
@@ -303,7 +307,21 @@ class FamilyGradient(QuadrupoleGradient):
         return [Group("quadrupole_gradient of families", kinds, 0.01)]
 
 
-class SkewGradient(_Magnets):
+class _Thin(_Magnets):
+    """Integrated fields, each piece with its share of the magnet's length."""
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("quadrupole",))
+
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        out = []
+        for own in self._places(data.ring):
+            whole = sum(e.length for e in own)
+            out.append({e.name: e.length / whole if whole else 1 / len(own) for e in own})
+        return out
+
+
+class SkewGradient(_Thin):
     """Skew gradients in quadrupoles."""
 
     name = effect = "skew_gradient"
@@ -313,6 +331,37 @@ class SkewGradient(_Magnets):
     def groups(self, data: ResponseData) -> list[Group]:
         """Of each."""
         return [Group(self.name, np.eye(self.size(data)), 3e-4, TAILS, most=LARGEST_SKEW)]
+
+
+class OtherGradient(_Thin):
+    """Gradients beside the quadrupoles: of the orbit in sextupoles, of wigglers."""
+
+    name = effect = "gradient_absolute"
+    effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
+    block, variable, trust = 0, "other", 3e-3
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("sextupole", "wiggler"))
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
+
+
+class VerticalFocusing(_Thin):
+    """Of insertion devices, in wigglers and in straights."""
+
+    name = effect = "vertical_focusing"
+    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    block, variable, trust = 0, "device", 3e-3
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        devices = [*magnets(ring, ("wiggler",)), *((e,) for e in straights(ring))]
+        return sorted(devices, key=lambda own: own[0].s)
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
 
 
 class EnergySpread(Family):
@@ -375,3 +424,13 @@ STEPS = (
 )
 """What is tried, one after another. Skew gradients move the tunes to second order, which the
 gradients then take back."""
+
+CHANGES = (
+    Trial((CorrectorCalibration(),), 3, 0),
+    Trial((MonitorGain(),), 2, 0),
+    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), VerticalFocusing()), 4, 0),
+    Trial((MonitorRoll(),), 0, 1),
+    Trial((CorrectorRoll(),), 0, 1),
+    Trial((SkewGradient(),), 2, 2),
+)
+"""What may have changed between two measurements of one ring."""

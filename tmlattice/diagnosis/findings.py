@@ -12,7 +12,7 @@ from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.remedies import credible as credible_remedies
 from tmlattice.diagnosis.remedies import remedies_of, remedy_of
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
-from tmlattice.effects import CATALOGUE, Cause, find
+from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Detection, Rival
@@ -52,8 +52,34 @@ def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: flo
     cause = explanation.fit.causes[k]
     sigma = float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0)))
     members, probability = credible(named.rivals, mass)
-    remedies = remedies_of(ring, [cause, *(m.cause for m in named.rivals[1:])], probability, sigma)
-    positions = [s for m in members for s in _positions(ring, m.hypothesis)]
+    causes = [cause, *(m.cause for m in named.rivals[1:])]
+    shown = [m.cause for m in members]
+    return finding_of(ring, causes, probability, shown, sigma, named.detection, mass)
+
+
+def finding_of(
+    ring: Ring,
+    causes: Sequence[Cause],
+    probability: Array,
+    shown: Sequence[Cause],
+    sigma: float,
+    detection: Detection,
+    mass: float,
+) -> Finding:
+    """A cause with a name.
+
+    Args:
+        ring: the design.
+        causes: the cause, and its rivals by falling probability.
+        probability: of each.
+        shown: the first of them, that hold the mass.
+        sigma: standard error of the amount.
+        detection: how clearly it was seen.
+        mass: that a credible set is to hold.
+    """
+    cause = causes[0]
+    remedies = remedies_of(ring, causes, probability, sigma)
+    positions = [s for m in shown for s in _positions(ring, (m.effect, m.element))]
     where, near = between(ring, positions) if positions else (None, ())
     return Finding(
         effect=cause.effect,
@@ -63,13 +89,13 @@ def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: flo
         amount_sigma=sigma,
         unit=find(cause.effect).unit,
         probability=min(remedies[0].probability, 1.0),
-        detection=named.detection,
+        detection=detection,
         where=where,
         near=near,
         credible_set=tuple(
-            _member(ring, m.cause, float(p)) for m, p in zip(members, probability, strict=False)
+            _member(ring, m, float(p)) for m, p in zip(shown, probability, strict=False)
         ),
-        mass=float(probability[: len(members)].sum()),
+        mass=float(probability[: len(shown)].sum()),
         remedies=credible_remedies(remedies, mass),
     )
 
@@ -149,7 +175,10 @@ def _positions(ring: Ring, hypothesis: Hypothesis) -> list[float]:
     place = _middle(ring, hypothesis[1])
     if place is not None:
         return [place]
-    return [e.s for e in ring.elements if hypothesis[1] is not None and e.family == hypothesis[1]]
+    effect = find(hypothesis[0])
+    if hypothesis[1] is None or not isinstance(effect, RingEffect):
+        return []
+    return [ring.elements[i].s for i in effect.members(ring, hypothesis[1])]
 
 
 def verdict_of(

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.families import QuadrupoleGradient, families
+from tmlattice.diagnosis.families import QuadrupoleGradient
+from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.state import State
 from tmlattice.effects import apply
 from tmlattice.observe.orbit_response import DELTA
@@ -138,9 +139,9 @@ def _orbit_drift(state: State) -> Hypothesis:
 
 def _tune_drift(state: State) -> Hypothesis:
     total = np.zeros((2, len(state.data.plane), len(state.data.at)))
-    places = QuadrupoleGradient().places(state.data)
-    focusing = [int(state.data.ring[name].k1 < 0) for name in places]
-    np.add.at(total, focusing, state.at.rows("quadrupole_gradient", places, 0))
+    single = QuadrupoleGradient()
+    focusing = [int(state.data.ring[name].k1 < 0) for name in single.places(state.data)]
+    np.add.at(total, focusing, single.rows(state.at, np.zeros(len(focusing))))
     total[:, -1] = 0
     return Hypothesis(
         "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", total, own=True,

@@ -26,17 +26,19 @@ from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Learnt, small_errors_of
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.newton import Outcome, fit
+from tmlattice.inference.newton import Outcome, fit, settled
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Blocks, Together
 from tmlattice.lattice import Ring
+from tmlattice.observe.stored import Kept, Stored
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-SETTLING = 3
-"""Steps of Newton for the nuisances alone: they are all but linear."""
+CROWDED = 1.5
+"""What half of the monitors leave at least of their noise where a few causes with names were tried,
+from which on nothing without a name is: errors are everywhere."""
 
 GAP = 0.05
 """Chi-square per reading beyond the noise below which there is no gap to close."""
@@ -86,8 +88,16 @@ def diagnose_together(
     parts = [_named(label, one, how) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
+    kept = Kept()
+    first, then = (
+        [
+            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            for part in some
+        ]
+        for some in (parts, before)
+    )
     problem = replace(
-        Together.of([part.problem for part in parts], [part.problem for part in before]),
+        Together.of(first, then),
         places=places, judgement=judgement, fixed=(),
     )  # fmt: skip
     hypotheses = [
@@ -148,11 +158,12 @@ def _sought(
         raise MeasurementError(f"{start.point.lost} in the design: is it this machine's lattice?")
     few = None
     if not told:
-        few = explain(replace(search, most=min(FEW, search.most)), start)
-        more, _ = problem.judgement.noise
-        alone = chi2.sf(few.fit.chi2, freedom(few.problem, few.fit)) >= more
-        if told is not None or alone or len(start.residual) > MOST:
-            if few.full and not alone and search.most > FEW:
+        narrow = replace(search, most=min(FEW, search.most))
+        few = explain(replace(narrow, unnamed=False), start)
+        if search.unnamed and not _explained(few) and not _crowded(few):
+            few = explain(narrow, start)
+        if told is not None or _explained(few) or len(start.residual) > MOST:
+            if few.full and not _explained(few) and search.most > FEW:
                 few = explain(search, start)
             return few, None
     search.progress("small errors")
@@ -161,11 +172,12 @@ def _sought(
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
         return small_errors_of(problem, everywhere, usual, nuisances, causes, learn=told is None)
 
-    narrow = replace(search, unnamed=False)
-    small = learnt(few.fit.causes if few else (), start.nuisances)
+    small = learnt((), start.nuisances)
     if told is None and small.log_evidence < CLEAR:
         assert few is not None
         return (explain(search, start) if few.full else few), None
+    # two findings say already whether the sizes have to be learnt again beside them
+    narrow = replace(search, unnamed=False, most=min(2, search.most))
     found = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(problem.judgement.retaken):
         beside = (*found.fit.causes, *_doubted(found))
@@ -179,14 +191,36 @@ def _sought(
         small, found = about, again
         if same:
             break
+    if found.full and search.most > narrow.most:
+        whole = replace(search, unnamed=False, problem=small.problem)
+        found = explain(whole, small.before)
     return found, small
+
+
+def _explained(found: Explanation) -> bool:
+    """Whether few causes leave nothing but noise."""
+    more, _ = found.problem.judgement.noise
+    return bool(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)) >= more)
+
+
+def _crowded(found: Explanation) -> bool:
+    """Whether most monitors still read something else."""
+    problem = found.problem
+    left, _ = problem.left(found.fit.point)
+    owner = problem.owner()[problem.valid]
+    own, squares = owner[owner >= 0], left[problem.valid][owner >= 0] ** 2
+    if not len(own):
+        return False
+    count = np.bincount(own, minlength=len(problem.monitors))
+    mean = np.bincount(own, squares, len(problem.monitors)) / np.maximum(count, 1)
+    return float(np.median(np.sqrt(mean[count > 0]))) > CROWDED
 
 
 def _doubted(found: Explanation) -> tuple[Cause, ...]:
     """The likeliest cause that was not taken: sizes that were learnt with a fault among them are
     too large, and it passes for a small error; it has to be weighed with sizes learnt without."""
     top = int(np.argmax(found.scan.statistic)) if len(found.scan.statistic) else -1
-    if top < 0 or found.full or found.scan.statistic[top] < DOUBT:
+    if top < 0 or found.scan.statistic[top] < DOUBT:
         return ()
     name, place = found.scan.hypotheses[top]
     if find(name).discrete:
@@ -290,7 +324,7 @@ def _stages(
         inner = found.problem
         assert isinstance(inner, Among)
         for one in (found.before, found.fit)[: 1 + bool(causes)]:
-            amounts = zip(inner.hypotheses, inner.estimate(one).tolist(), strict=True)
+            amounts = zip(inner.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
             models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
         if causes:
             models[-1] = (models[-1][0], causes)
@@ -300,17 +334,6 @@ def _stages(
         _Stage(static, own, settled(replace(problem, fixed=static), own, problem.first))
         for static, own in models
     ]
-
-
-def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
-    """The point of these causes at the best nuisances."""
-    point = problem.at(causes, nuisances)
-    for _ in range(SETTLING):
-        if point.projection is None:
-            break
-        change = point.projection.coordinates(point.residual)
-        point = problem.at(causes, problem.moved(point.nuisances, change))
-    return point
 
 
 def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:

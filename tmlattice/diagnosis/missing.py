@@ -21,7 +21,8 @@ from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
-from tmlattice.diagnosis.state import State, linear, rms_of, weight
+from tmlattice.diagnosis.rounds import linear, weight
+from tmlattice.diagnosis.state import State, rms_of
 
 Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array

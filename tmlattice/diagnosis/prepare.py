@@ -65,8 +65,9 @@ def prepare(
     radiation: bool,
     effects: Sequence[str] | None,
     judgement: Judgement,
+    common: Sequence[Cause] = (),
 ) -> Prepared:
-    """Data, model and launches.
+    """Data, model and launches; `common` causes are in the reference too.
 
     Raises:
         MeasurementError: data that cannot be used, or that are of another lattice.
@@ -74,7 +75,7 @@ def prepare(
         EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor that the ring does not have, or an effect that does not exist.
     """
-    known = tuple(expected_radiation(ring)) if radiation else ()
+    known = (*(expected_radiation(ring) if radiation else ()), *common)
     data = of_measurement(ring, measurement)
     if reference is not None:
         data = joined(of_measurement(ring, reference, reference=True), data)
@@ -113,6 +114,9 @@ def _dead_monitors(
     count = len(model.at)
     readings = data.readings.reshape(-1, count, 2)
     valid = data.valid.reshape(-1, count, 2)
+    # readings that are all the same twice are one shot that stands twice, and no frozen monitors
+    _, own = np.unique(readings.reshape(len(readings), -1), axis=0, return_index=True)
+    readings, valid = readings[own], valid[own]
     silent, frozen, half, said = [], [], [], []
     for m, name in enumerate(model.maps.monitors):
         there = valid[:, m]

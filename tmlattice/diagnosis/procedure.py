@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.background import SmallErrors
+from tmlattice.diagnosis.common import sought_in
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     credible,
@@ -26,10 +27,10 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.prepare import Prepared, noise_of, prepare, same_monitors
+from tmlattice.diagnosis.prepare import Prepared, noise_of, same_monitors
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
-from tmlattice.diagnosis.strategy import freedom, sought
+from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms
 from tmlattice.errors import TmlatticeError
@@ -112,10 +113,13 @@ def diagnose(
         if heldout is None and holdout > 0:
             said.append("one shot: none is held out, so nobody judges the gap")
     progress("model")
-    ready = prepare(ring, measurement, reference, radiation, effects, judgement)
-    search = Search(ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress)
     rms = None if background is None else background_rms(background)
-    found = sought(ring, ready, search, rms)
+    ready, found = sought_in(
+        ring, measurement, reference, radiation, effects, rms, judgement,
+        lambda ready: Search(
+            ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress
+        ),
+    )  # fmt: skip
     small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
@@ -205,7 +209,8 @@ def _told(
     findings = findings_of(ring, explanation, ready.dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(problem, result)))
     verdict, standing, said = verdict_of(explanation, findings, p_value, ready.estimated, judgement)
-    if verdict == "nothing" and small is not None and small.evidence is not None:
+    learnt = small is not None and small.evidence is not None
+    if verdict == "nothing" and learnt and problem.data.active.all():
         verdict = "distributed"  # the gap has a cause: many small ones
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         result, left = explanation.before, explanation.first_kicks

@@ -183,7 +183,9 @@ def _is_element(ring: Ring, name: str) -> bool:
 def _members(ring: Ring, name: str | None) -> list[Element]:
     """The element of this name, or the family's."""
     own = [element for element in ring.elements if element.name == name]
-    return own or [e for e in ring.elements if e.family == name and e.kind == "quadrupole"]
+    family = find("family_gradient")
+    assert isinstance(family, RingEffect)
+    return own or [ring.elements[i] for i in family.members(ring, name)]
 
 
 def _kind(ring: Ring, name: str | None) -> Kind | None:

@@ -24,19 +24,22 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.families import STEPS, Told, Trial
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
+from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
-from tmlattice.effects import apply, find, names
+from tmlattice.diagnosis.state import begin
+from tmlattice.diagnosis.strangers import strangers
+from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import ResponseData, response_data, split_columns
 
 Array = NDArray[np.float64]
 
@@ -64,7 +67,8 @@ def diagnose_response(
 
     Args:
         ring: the design.
-        measured: with an RF step, and the noise of its readings.
+        measured: with an RF step, if it can be, and the noise of its readings; else that is
+            learnt.
         holdout: share of the correctors that is never fitted.
         effects: only families of these are tried; else all.
         max_effects: steps that are kept at most.
@@ -76,37 +80,88 @@ def diagnose_response(
         progress: called with the name of each stage.
 
     Raises:
-        MeasurementError: no RF step, no noise, too few correctors, or effects that have no family.
+        MeasurementError: too few correctors, or effects that have no family.
         UnknownNameError: an effect or a monitor that does not exist.
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
     measured = mended(ring, measured, assume)
-    trials, data = _trials(effects), response_data(ring, measured)
-    said = consulted(ring, measured)
+    trials, data = trials_of(effects), response_data(ring, measured)
+    said = [*consulted(ring, measured), *assumed_of(measured, data)]
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
     if few is None:
-        fit = fit_steps(data, split, trials, max_effects, progress)
+        odd = strangers(begin(data, split))
+        while True:
+            if odd.any:
+                said += odd.said
+                measured = odd.without(measured)
+                data = response_data(ring, measured)
+                split = split_columns(data, holdout, np.random.default_rng(seed))
+            fit = fit_steps(data, split, trials, max_effects, progress)
+            odd = strangers(fit.state)
+            if not odd.any:
+                break
         found, degenerate = told(fit.state)
         verdict = _verdict(fit, false_alarm)
     else:
         fit, found, degenerate = few.fit, few.told, ()
         verdict = few.verdict
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
-    repaired = apply(ring, fit.state.at.errors.ring)
-    causes = tuple(cause for cause, _ in found)
-    good = fit.state.good
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
         **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
-    return Diagnosis(
+    causes = tuple(cause for cause, _ in found)
+    return as_diagnosis(
+        ring, fit, fit.state.at.errors.ring, found,
+        noise_estimated=measured.noise is None,
         verdict=verdict,
         findings=() if few is None else with_consequences(ring, few.findings, causes),
+        warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
+        degenerate=degenerate,
+        hypotheses=rows,
+        reasons=None if few is not None else explain_gradients(fit.state),
+        provenance=provenance(ring, options, seed, begun),
+    )  # fmt: skip
+
+
+def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
+    """What the measurement does not say, and what is taken instead."""
+    said = []
+    if measured.noise is None or np.isnan(measured.noise).any():
+        x, y = (f"{1e6 * size:.2g} µm" for size in np.median(data.noise, axis=0))
+        said.append(
+            f"the noise of the readings is not stated; from what neighbouring monitors leave it is "
+            f"{x} in x and {y} in y (a jitter of the beam is not in it)"
+        )
+    if measured.rf is None or measured.rf.orbit is None:
+        said.append(
+            "there is no RF step: dispersion is not known, and only what is usual tells the scale "
+            "of all correctors from that of all monitors"
+        )
+    return said
+
+
+def as_diagnosis(
+    ring: Ring, fit: DenseFit, within: Sequence[Cause], found: Sequence[Told], **told: Any
+) -> Diagnosis:
+    """What a fit of a response says, as a diagnosis.
+
+    Args:
+        ring: the design.
+        fit: with its steps.
+        within: what the ring as found has.
+        found: causes with their errors.
+        told: what else the diagnosis is to say.
+    """
+    data, good = fit.state.data, fit.state.good
+    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
+    causes = tuple(cause for cause, _ in found)
+    repaired = apply(ring, within)
+    return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
         heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
@@ -115,10 +170,7 @@ def diagnose_response(
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=None,
         sensitivity={},
-        warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
         noise=(noise_x, noise_y),
-        noise_estimated=False,
-        provenance=_provenance(ring, options, seed, begun),
         ring=ring,
         repaired=repaired,
         causes=causes,
@@ -128,9 +180,8 @@ def diagnose_response(
         refused=fit.refused,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
         priors={name: group.rms for name, group in fit.state.groups.items()},
-        degenerate=degenerate,
-        hypotheses=rows,
-    )  # fmt: skip
+        **told,
+    )
 
 
 def _view(fit: DenseFit) -> ResponseView:
@@ -139,7 +190,8 @@ def _view(fit: DenseFit) -> ResponseView:
     return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
 
 
-def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
+def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
+    """What made a diagnosis."""
     from tmlattice import __version__
 
     return {
@@ -152,16 +204,16 @@ def _provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> di
     }
 
 
-def _trials(effects: Sequence[str] | None) -> list[Trial]:
+def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:
     """Steps of families that may be tried."""
     if effects is None:
-        return list(STEPS)
+        return list(steps)
     wanted = set(names(effects))
     kept = [
         replace(trial, families=tuple(f for f in trial.families if wanted & set(f.effects)))
-        for trial in STEPS
+        for trial in steps
     ]
-    known = {effect for trial in STEPS for family in trial.families for effect in family.effects}
+    known = {effect for trial in steps for family in trial.families for effect in family.effects}
     known |= {name for name in names() if find(name).responds}
     if not known & wanted:
         raise MeasurementError(

@@ -28,6 +28,7 @@ from tmlattice.optics import matrix_tunes
 if TYPE_CHECKING:
     from tmlattice.diagnosis.dense import Step
     from tmlattice.diagnosis.missing import Weighed
+    from tmlattice.diagnosis.reasons import Reasons
     from tmlattice.diagnosis.suspects import Suspect
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
@@ -253,6 +254,7 @@ class Diagnosis(ShownDiagnosis):
         prior_errors: relative error of those that were learnt; above one half the readings hardly
             see the family.
         degenerate: what the data alone do not settle, in words.
+        reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
     """
@@ -283,6 +285,7 @@ class Diagnosis(ShownDiagnosis):
     priors: Mapping[str, float] = field(default_factory=dict)
     prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
+    reasons: "Reasons | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
 
@@ -416,6 +419,7 @@ class Diagnosis(ShownDiagnosis):
                 {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
                 for c, s in zip(self.causes, self.errors, strict=True)
             ],
+            "reasons": None if self.reasons is None else self.reasons.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
             "gap": self.gap,

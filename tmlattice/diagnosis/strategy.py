@@ -7,6 +7,7 @@ small errors are learnt from what is left, and their evidence says whether they 
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.background import SmallErrors, small_errors
 from tmlattice.diagnosis.prepare import Prepared
 from tmlattice.effects import Cause, background_rms, find
+from tmlattice.errors import BeamLostError
 from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Problem
@@ -66,8 +68,8 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
             search.progress("scan")
             return Found(explain(search, ready.before))
         search.progress("background")
-        small = small_errors(ring, ready.problem, ready.known, told, ready.before.nuisances)
-        return Found(*_among(ring, ready, search, small))
+        given = small_errors(ring, ready.problem, ready.known, told, ready.before.nuisances)
+        return Found(*_among(ring, ready, search, given))
     few = None
     if not _crowded(ready):
         search.progress("scan")
@@ -78,11 +80,13 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
     start = ready.before if few is None else few.fit
     about = [] if few is None or not few.named else [_strongest(few)]
     usual = background_rms({"all": None})
-    small = small_errors(
-        ring, ready.problem, ready.known, usual, start.nuisances, about,
-        learn=True, noisy=ready.estimated,
-    )  # fmt: skip
-    if small.evidence is not None and small.evidence < CLEAR:
+    small: SmallErrors | None = None
+    with suppress(BeamLostError):  # then they are none that anybody learns
+        small = small_errors(
+            ring, ready.problem, ready.known, usual, start.nuisances, about,
+            learn=True, noisy=ready.estimated,
+        )  # fmt: skip
+    if small is None or (small.evidence is not None and small.evidence < CLEAR):
         if few is None or (few.full and search.most > FEW):
             few = explain(search, ready.before)
         return Found(few)
@@ -122,10 +126,13 @@ def _among(
         search.progress("background with what was found")
         beside, causes = tried
         errors = small.estimate(beside, turns_of(explanation).whitening)
-        again = small_errors(
-            ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
-            learn=learn, noisy=learn and ready.estimated,
-        )  # fmt: skip
+        try:
+            again = small_errors(
+                ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
+                learn=learn, noisy=learn and ready.estimated,
+            )  # fmt: skip
+        except BeamLostError:
+            break  # what was found is no place from which they can be taken again
         other = explain(replace(narrow, problem=again.problem), again.before)
         if not explanation.count and not other.count:
             break  # it was a small error after all
@@ -143,9 +150,12 @@ def _settled(
     """Small errors linear about all that was found, and its amounts among them."""
     found = explanation.fit
     errors = small.estimate(found, turns_of(explanation).whitening)
-    about = small_errors(
-        ring, small.plain, ready.known, small.sizes, found.nuisances, found.causes, errors
-    )
+    try:
+        about = small_errors(
+            ring, small.plain, ready.known, small.sizes, found.nuisances, found.causes, errors
+        )
+    except BeamLostError:
+        return explanation, small
     problem = about.problem.without(explanation.dropped)
     again = fit(problem, found.causes, found.nuisances)
     if not again.good:

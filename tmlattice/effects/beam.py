@@ -44,6 +44,7 @@ class EnergySpread(LaunchEffect):
 
     name = "energy_spread"
     responds = True
+    calibrates = True  # of readings, with everything else that predicts them
     words = "energy spread of the beam"
     energy = True
     one_sign = True

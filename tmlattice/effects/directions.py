@@ -101,6 +101,30 @@ def kept_directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | Non
     return found
 
 
+def directions_nearby(
+    layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]
+) -> Directions:
+    """`directions`, remembered with the maps; where those were changed from others, only of what
+    sits on changed elements anew."""
+    key = ("directions", tuple(hypotheses))
+    if key not in layers.memory:
+        if layers.origin is None:
+            found = directions(layers, hypotheses)
+        else:
+            origin, places = layers.origin
+            found = directions_nearby(origin, hypotheses)
+            changed = [layers.ring.elements[place] for place in places]
+            names = {e.name for e in changed} | {e.family for e in changed}
+            again = [i for i, (_, place) in enumerate(hypotheses) if place in names or not place]
+            if again:
+                found = found.replaced(again, directions(layers, [hypotheses[i] for i in again]))
+        if layers.origin is not None:
+            return found
+        layers.memory[key] = found
+    remembered: Directions = layers.memory[key]
+    return remembered
+
+
 def directions(
     layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], step: float = STEP
 ) -> Directions:

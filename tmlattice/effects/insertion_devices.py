@@ -1,7 +1,7 @@
 """What goes wrong with wigglers and undulators."""
 
 from tmlattice.effects.build import Build
-from tmlattice.effects.effect import ErrorEffect, register
+from tmlattice.effects.effect import ErrorEffect, ThinKickEffect, register
 from tmlattice.lattice import Element
 
 
@@ -33,3 +33,30 @@ class InsertionDeviceFocusing(ErrorEffect):
     def sits_on(self, element: Element) -> bool:
         """Wigglers."""
         return element.kind == "wiggler"
+
+
+@register
+class VerticalFocusing(ThinKickEffect):
+    """What a planar undulator does: its field focuses vertically and leaves the other plane."""
+
+    name = "vertical_focusing"
+    words = "vertical focusing of an insertion device"
+    group = "insertion devices"
+    unit = "1/m"
+    sign = "thin, in the middle: py -= amount y"
+    slopes = (0.0, 0.0, 0.0, -1.0)
+    quantity = "integrated vertical focusing"
+    remedy = "make the vertical focusing at {} good"
+    to_check = (
+        "Read the gap of the insertion device that stands there, and make its focusing good with "
+        "the quadrupoles beside it."
+    )
+    largest = 0.03
+    sits_on_text = "wigglers, markers, drifts of half a metre or more"
+    usual = False  # of a change between two measurements, or where somebody names it
+
+    def sits_on(self, element: Element) -> bool:
+        """Where an insertion device is, or may stand."""
+        return element.kind in ("wiggler", "marker") or (
+            element.kind == "drift" and element.length >= 0.5
+        )

@@ -5,6 +5,7 @@ from collections import Counter
 from tmlattice.effects.build import Build
 from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
 from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.slices import stem
 
 
 class _OnQuadrupole(RingEffect):
@@ -189,10 +190,9 @@ class FamilyGradient(_OnQuadrupole, StrengthEffect):
         return [family for family, members in count.items() if members > 1]
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
-        """All quadrupoles of the family."""
-        family = (place or "").casefold()
-        return [
-            i
-            for i, e in enumerate(ring.elements)
-            if e.family.casefold() == family and self.sits_on(e)
-        ]
+        """All quadrupoles of the family; or, where none is called so, those whose names begin so,
+        up to an underscore, a dot or a number of their own."""
+        name = (place or "").casefold()
+        powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
+        family = [i for i in powered if ring.elements[i].family.casefold() == name]
+        return family or [i for i in powered if stem(ring.elements[i].name) == name]

@@ -17,8 +17,9 @@ from scipy.linalg import cholesky
 from scipy.linalg.lapack import dtrtri
 
 from tmlattice.effects import Cause
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.newton import Fit, fit, settled
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.sizes import Sizes, learn_sizes
 from tmlattice.inference.whitening import Projection
@@ -177,9 +178,9 @@ class Among(Problem):
         return replace(self, inner=self.inner.without(dropped))
 
     # --- the small errors -----------------------------------------------------------------------
-    def estimate(self, explained: Fit) -> Array:
-        """The likeliest amounts of the small errors beside an explanation, [error]."""
-        return np.asarray(self.rms * (self.rows @ (explained.clean @ self._factor)))
+    def estimate(self, clean: Array) -> Array:
+        """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
+        return np.asarray(self.rms * (self.rows @ (clean @ self._factor)))
 
 
 class _AmongMetric(Metric):
@@ -244,14 +245,16 @@ def small_errors_of(
     evidence, errors, opened = 0.0, dict[str, float](), None
     for turn in range(ROUNDS):
         known = [Cause(*h, a) for h, a in zip(hypotheses, amounts.tolist(), strict=True) if a]
-        inner = replace(problem, fixed=(*problem.fixed, *known, *causes))
-        alone = fit(inner, (), nuisances)
+        inner = replace(problem, fixed=(*problem.fixed, *known))
+        alone = settled(inner, causes, nuisances)
+        if alone.projection is None:
+            raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
         scale = np.array([sizes[name] for name, _ in hypotheses])
-        spread = scale[:, None] * _signatures(inner, alone.point, hypotheses)
+        spread = scale[:, None] * _signatures(inner, alone, hypotheses)
         if learn:
             rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
             moved = alone.residual + amounts / scale @ rows
-            found = _sizes(inner, moved, alone.projection, rows, belongs, len(names))
+            found = _sizes(moved, alone.projection, rows, belongs, len(names))
             evidence = found.log_evidence if turn == 0 else evidence
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
@@ -263,12 +266,11 @@ def small_errors_of(
             inner=inner, hypotheses=hypotheses, rms=scale,
             spread=spread.reshape(-1, *inner.valid.shape), amounts_now=amounts, open=opened,
         )  # fmt: skip
-        before = fit(among, (), alone.nuisances)
-        nuisances = before.nuisances
-        amounts = among.estimate(before)
-    if causes:
-        among = replace(among, inner=replace(inner, fixed=(*problem.fixed, *known)))
-        before = fit(among, (), nuisances)
+        point = settled(among, causes, alone.nuisances)
+        assert point.projection is not None
+        nuisances = point.nuisances
+        amounts = among.estimate(point.projection.out(point.residual))
+    before = fit(among, (), nuisances)
     return Learnt(among, before, sizes, errors, evidence)
 
 
@@ -286,7 +288,6 @@ def _signatures(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]
 
 
 def _sizes(
-    problem: Problem,
     residual: Array,
     projection: Projection,
     rows: Array,

@@ -172,6 +172,27 @@ def fit(
     return _finished(problem, point, slopes, rows, outcome)
 
 
+SETTLING = 3
+"""Steps of Newton for nuisances alone: they are all but linear."""
+
+
+def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
+    """The point of causes that stay as they are, at the best nuisances.
+
+    Args:
+        problem: model and data.
+        causes: with their amounts.
+        nuisances: first guess.
+    """
+    point = problem.at(causes, nuisances)
+    for _ in range(SETTLING):
+        if point.projection is None:
+            break
+        change = point.projection.coordinates(point.residual)
+        point = problem.at(causes, problem.moved(point.nuisances, change))
+    return point
+
+
 def _cost(problem: Problem, point: Point) -> float:
     """Chi-square, and what the prior adds to it where it pulls."""
     if point.lost:

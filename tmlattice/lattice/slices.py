@@ -6,6 +6,7 @@ magnet where they have one family (or are the halves NAME and NAME_2 that `marke
 shorter than a fiftieth of its neighbour is an edge of it, whatever its field.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
@@ -84,3 +85,9 @@ def _same(a: Piece, b: Piece) -> bool:
         return a.angle * b.angle > 0 and a.tilt == b.tilt
     families = a.family.casefold(), b.family.casefold()
     return a.kind == b.kind and families[1] in (families[0], f"{families[0]}_2")
+
+
+def stem(name: str) -> str:
+    """What the names of magnets of one supply begin with: up to the first underscore, dot or
+    `::`."""
+    return re.split(r"_|\.|::", name, maxsplit=1)[0].casefold()

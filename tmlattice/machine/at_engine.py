@@ -198,15 +198,10 @@ class AtEngine:
         state = to_at(start, self.ring.energy, self.ring.mass)
         readings = np.empty((len(start), turns, len(self._monitors), 2))
         for shots, changed, frequency in self._groups(settings or [{}] * len(start)):
-            line = self._line.copy()
-            for i, setting in changed.items():
-                wrong = self._wrong.get(i, NOTHING)
-                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], wrong, setting)
-            on = self.expected_loss > 0 or self._has_rf or frequency
-            if turns > 1 and on and self._voltage:
-                for place in self._cavities:
-                    line[place] = self._cavity(line[place], frequency)
-            readings[shots] = self._track_line(line, state[shots], turns)
+            line = self._set(changed)
+            if turns > 1:
+                self._switch_on(line, frequency)
+            readings[shots] = self.run(line, state[shots], turns)
         return readings
 
     def closed_orbits(self, settings: Sequence[Settings]) -> Array:
@@ -229,18 +224,38 @@ class AtEngine:
         start, solve = at_orbit.stored(functools.partial(self._pass, self._line))
         readings = np.empty((len(settings), len(self._monitors), 2))
         for orbits, changed, frequency in self._groups(settings):
-            line = self._line.copy()
-            for i, setting in changed.items():
-                wrong = self._wrong.get(i, NOTHING)
-                line[self._places[i]] = self._builder.pieces(self.ring.elements[i], wrong, setting)
+            line = self._set(changed)
             late = -self.ring.length * frequency / (1 + frequency)
             turn = functools.partial(self._pass, line)
             readings[orbits] = at_orbit.settle(turn, start, solve, late)[1]
         return readings
 
+    def stored_line(self, settings: Settings) -> tuple[list[Any], list[Any], float]:
+        """The line with the settings of one shot: without RF; with it, where a beam that stays
+        feels one; and what a turn is longer than the RF's, m."""
+        ((_, changed, frequency),) = self._groups([settings])
+        line = self._set(changed)
+        with_rf = line.copy()
+        self._switch_on(with_rf, frequency)
+        return line, with_rf, -self.ring.length * frequency / (1 + frequency)
+
+    def _set(self, changed: Mapping[int, Mapping[str, float]]) -> list[Any]:
+        """The line with settings, by place in the ring."""
+        line = self._line.copy()
+        for i, setting in changed.items():
+            wrong = self._wrong.get(i, NOTHING)
+            line[self._places[i]] = self._builder.pieces(self.ring.elements[i], wrong, setting)
+        return line
+
+    def _switch_on(self, line: list[Any], frequency: float) -> None:
+        """The RF, if the ring radiates, has cavities of its own, or its frequency is set."""
+        if (self.expected_loss > 0 or self._has_rf or frequency) and self._voltage:
+            for place in self._cavities:
+                line[place] = self._cavity(line[place], frequency)
+
     def _pass(self, line: list[Any], beam: Array) -> Array:
         """Readings of the first of the states [6, shot], which move to the line's end."""
-        return np.asarray(self._track_line(line, beam.T, 1, beam)[0, 0])
+        return np.asarray(self.run(line, beam.T, 1, beam)[0, 0])
 
     def lattice(self) -> Any:
         """The line as an AT lattice of its own, without RF, for AT's tools (`at.get_optics`).
@@ -300,12 +315,18 @@ class AtEngine:
         scale = self._bends if self._bends > 0 else 1.0
         return self.ring.energy * 1e9 * float(np.cbrt(scale))
 
-    def _track_line(
-        self, line: list[Any], state: Array, turns: int, beam: Array | None = None
+    def run(
+        self,
+        line: list[Any],
+        state: Array,
+        turns: int,
+        beam: Array | None = None,
+        first: int = 0,
     ) -> Array:
         """Readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2].
 
-        A given `beam`, the states as AT wants them, [6, shot], is left at the line's end.
+        A given `beam`, the states as AT wants them, [6, shot], is left at the line's end; `first`
+        is the number of the first turn, which the RF knows.
         """
         beam = np.asfortranarray(state.T) if beam is None else beam
         readings = np.empty((len(state), turns, len(self._monitors), 2))
@@ -317,7 +338,7 @@ class AtEngine:
                 min(block, turns - turn),
                 refpts=self._monitors,
                 energy=self._energy,
-                turn=turn,
+                turn=first + turn,
             )
             readings[:, turn : turn + block] = np.moveaxis(seen[[0, 2]], [0, 2, 3], [3, 2, 1])
         # AT sets x alone of a lost particle to NaN, and that behind the wall it is lost on.

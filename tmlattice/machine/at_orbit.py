@@ -1,6 +1,6 @@
 """The closed orbit of a line that can be tracked: Broyden's method from one Jacobian."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,59 @@ _NO_ORBIT = (
 )
 
 
+STEPS = np.array([3e-6, 3e-6, 3e-6, 3e-6, 1e-5, 1e-5])
+"""Of the derivatives, m and 1: bends round x to 3e-14 m."""
+
+
+def one_turn(turn: Turn, start: Array) -> Array:
+    """The turn's matrix about a state [6], [6, 6], in AT's coordinates."""
+    steps = np.diag(STEPS)
+    beam = np.asfortranarray(np.vstack([start + steps, start - steps]).T)
+    turn(beam)
+    ends = beam.T
+    return np.asarray((ends[:6] - ends[6:]).T / (2 * STEPS))
+
+
+def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> Array:
+    """The state that returns to itself: some coordinates by Newton's method, the others given.
+
+    Args:
+        turn: of the line.
+        start: near it, [6].
+        free: the coordinates that are found, and that return: (0, 1, 2, 3) at a given energy,
+            all six with the RF.
+        late: what a turn is longer than the RF's, m.
+
+    Raises:
+        UnstableRingError: none within reach.
+    """
+    state, at = start.copy(), np.ix_(free, free)
+    for _ in range(20):
+        solve = np.zeros((6, 6))
+        with np.errstate(invalid="ignore"):
+            slopes = one_turn(turn, state)
+        if not np.isfinite(slopes).all():
+            break
+        try:
+            solve[at] = np.linalg.inv((np.eye(6) - slopes)[at])
+        except np.linalg.LinAlgError:
+            break
+        beam = np.array(state[:, None], order="F")
+        turn(beam)
+        miss = beam[:, 0] - state
+        miss[5] -= late
+        change = solve @ miss
+        if np.abs(change).max() < 1e-11:
+            return state
+        state += change
+    raise UnstableRingError(_NO_ORBIT)
+
+
 def stored(turn: Turn) -> tuple[Array, Array]:
     """The unset ring's closed orbit [6] and what makes good a miss of the turn, [6, 6]."""
-    steps = np.diag([3e-6, 3e-6, 3e-6, 3e-6, 1e-5, 1.0])[:5]  # bends round x to 3e-14 m
     start = np.zeros(6)
     for _ in range(3):
-        beam = np.asfortranarray(np.vstack([start + steps, start - steps]).T)
-        turn(beam)
-        ends = beam.T
-        slopes = (ends[:5] - ends[5:]).T / (2 * steps[range(5), range(5)])
+        slopes = one_turn(turn, start)[:, :5]
         rows = [0, 1, 2, 3, 5]
         solve = np.zeros((6, 6))
         try:

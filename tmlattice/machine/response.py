@@ -116,9 +116,7 @@ def simulate_response(
     rf = rf_of(ring)
     harmonic, frequency = rf.harmonic, rf.frequency(ring)
     if rf_step is None:
-        size = float(np.sqrt(np.mean(design.rf_response()[:, 0] ** 2)))
-        sign = np.sign(design.rf_start[5])
-        rf_step = float(f"{sign * RF_ORBIT / size * frequency:.1e}") if size else 0.0
+        rf_step = rf_step_of(ring, design)
     low, high = (0.0, kick) if one_sided else (-kick / 2, kick / 2)
     steps: list[tuple[str | None, float, float]] = [(name, low, high) for name in columns.names]
     if rf_step:
@@ -156,6 +154,15 @@ def simulate_response(
     )
 
 
+def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:
+    """The step of the RF, Hz, that raises the energy so that the design's orbit changes by 1.3 mm
+    rms, to two digits; 0 where nothing does."""
+    model = ResponseModel(ring) if design is None else design
+    size = float(np.sqrt(np.mean(model.rf_response()[:, 0] ** 2)))
+    step = np.sign(model.rf_start[5]) * RF_ORBIT * rf_of(ring).frequency(ring)
+    return float(f"{step / size:.1e}") if size else 0.0
+
+
 Step = tuple[str | None, float, float]
 Orbits = Iterator[tuple[Array, Array]]
 Engine = Callable[[Ring, Sequence[Cause], Sequence[Step], float], Orbits]
@@ -168,16 +175,27 @@ def _centroids(
 
     Three nodes of Gauss and Hermite; a particle's energy is that of another RF frequency.
     """
-    spread = float(np.sqrt(sum(c.amount**2 for c in causes if c.effect == "energy_spread")))
-    if spread == 0:
-        yield from engine(ring, causes, steps, 0.0)
-        return
-    per_energy = 1 / ResponseModel(apply(ring, causes)).rf_start[5]
-    nodes = np.sqrt(3) * spread * per_energy * np.array([-1, 0, 1])
+    weights, nodes = energies(ring, causes)
     each = [engine(ring, causes, steps, float(node)) for node in nodes]
     for orbits in zip(*each, strict=True):
-        down, up = np.tensordot([1 / 6, 2 / 3, 1 / 6], np.array(orbits), 1)
+        down, up = np.tensordot(weights, np.array(orbits), 1)
         yield down, up
+
+
+def spread_of(causes: Sequence[Cause]) -> float:
+    """The relative energy spread of the beam."""
+    return float(np.sqrt(sum(c.amount**2 for c in causes if c.effect == "energy_spread")))
+
+
+def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
+    """Weights of the energies that stand for the beam's, and the RF frequencies (relative) that
+    a beam of each has."""
+    spread = spread_of(causes)
+    if spread == 0:
+        return np.ones(1), np.zeros(1)
+    per_energy = 1 / ResponseModel(apply(ring, causes)).rf_start[5]
+    nodes = np.sqrt(3) * spread * per_energy * np.array([-1, 0, 1])
+    return np.array([1, 4, 1]) / 6, nodes
 
 
 def _at_orbits(

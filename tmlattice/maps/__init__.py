@@ -10,6 +10,7 @@
 from tmlattice.maps.magnets import (
     LayerMaps,
     RingMaps,
+    changed_maps,
     element_map,
     part_maps,
     ring_maps,
@@ -27,6 +28,7 @@ __all__ = [
     "LayerMaps",
     "RingMaps",
     "TaylorMap",
+    "changed_maps",
     "element_map",
     "kronecker_exponents",
     "ode_of_taylor_map",

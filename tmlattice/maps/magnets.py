@@ -7,7 +7,8 @@ of layers is the ring.
 
 import io
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -36,6 +37,7 @@ __all__ = [
     "Quadratic",
     "RingMaps",
     "Weights",
+    "changed_maps",
     "element_map",
     "layer_elements",
     "part_maps",
@@ -152,6 +154,8 @@ class LayerMaps:
     Attributes:
         layer_of: the layer whose map holds each element; the number of layers for those behind the
             last magnet, [element].
+        origin: from which these were changed, and the places of the other elements; or None.
+        memory: what was worked out from these maps and is worth keeping, by whoever did.
 
     Raises:
         LatticeError: a ring without magnets, or a map that is not finite.
@@ -173,6 +177,21 @@ class LayerMaps:
         self._ways: dict[int, Quadratic] = {}
         self._equal: dict[Hashable, Quadratic] = {}
         self._layers: dict[Hashable, tuple[Weights, list[Weights]]] = {}
+        self.origin: tuple[LayerMaps, tuple[int, ...]] | None = None
+        self.memory: dict[Hashable, Any] = {}
+
+    def changed_to(self, ring: Ring) -> tuple["LayerMaps", list[int]]:
+        """Of a ring some of whose elements are others at the same places, and the layers that hold
+        these; all that was worked out already is shared."""
+        pairs = zip(self.ring.elements, ring.elements, strict=True)
+        places = [i for i, (a, b) in enumerate(pairs) if a is not b]
+        other = copy(self)
+        other.ring = ring
+        other.origin = (self, tuple(places))
+        other.memory = {}
+        touched = sorted({int(self.layer_of[i]) for i in places})
+        other._ways = {k: way for k, way in self._ways.items() if k not in touched}
+        return other, touched
 
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
@@ -268,6 +287,29 @@ def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -
     if key:
         cache.save(key, _written(maps))
     return maps
+
+
+def changed_maps(maps: RingMaps, layers: LayerMaps, touched: Sequence[int]) -> RingMaps:
+    """A ring's maps with some of its layers anew.
+
+    Args:
+        maps: of a ring that differs from that of `layers` in the touched layers alone.
+        layers: of the ring.
+        touched: layers, up to their number, which names the way from the last magnet to the end.
+    """
+    arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2", "R0", "R1", "R2")}
+    closing = maps.closing
+    for k in touched:
+        own, read = layers.layer(k)
+        if k == len(maps.layers):
+            closing = TaylorMap(list(own))
+        else:
+            for name, value in zip(("W0", "W1", "W2"), own, strict=True):
+                arrays[name][k] = value
+        for m, readout in zip(np.flatnonzero(maps.at == k), read, strict=True):
+            for name, value in zip(("R0", "R1", "R2"), readout, strict=True):
+                arrays[name][m] = value
+    return replace(maps, closing=closing, **arrays)
 
 
 _KEPT = ("s", "W0", "W1", "W2", "s_monitors", "at", "R0", "R1", "R2")

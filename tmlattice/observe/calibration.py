@@ -15,6 +15,8 @@ from tmlattice.measurement.documents import located, read_document
 
 Array = NDArray[np.float64]
 
+ENERGY = 1e-3
+"""Energy deviation of the differences that tell what an energy spread does."""
 FORMAT = "tmlattice-calibration"
 CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrates)
 """The effects that a calibration may hold."""
@@ -77,7 +79,7 @@ def calibrated_response(
 
     Args:
         ring: the design.
-        causes: on the ring and on its monitors.
+        causes: on the ring, on its monitors, and an energy spread of the beam.
         correctors: names; None: all, in beam order.
 
     Returns:
@@ -92,10 +94,22 @@ def calibrated_response(
     columns = model.columns(correctors)
     monitors = monitors_with(ring, causes)
     scales = corrector_scales(ring, causes, columns.names)
-    beam = scales[:, None, None] * model.response(columns.names)
+    beam = scales[:, None, None] * _of_centroid(model, columns.names, causes)
     readings = np.einsum("mij,cmj->cmi", monitors.matrix(), beam)
     readings[:, monitors.silent | monitors.frozen] = np.nan
     return columns, readings
+
+
+def _of_centroid(model: ResponseModel, names: Sequence[str], causes: Iterable[Cause]) -> Array:
+    """m/rad of particles that answer each as its energy has it: half the second derivative by the
+    energy, times the mean square, beside what one particle does."""
+    one = model.response(names)
+    square = sum(cause.amount**2 for cause in causes if cause.effect == "energy_spread")
+    if not square:
+        return one
+    step = ENERGY / model.rf_start[5]
+    up, down = (model.at_frequency(f).response(names) for f in (step, -step))
+    return np.asarray(one + square / ENERGY**2 * ((up + down) / 2 - one))
 
 
 def _check(causes: Iterable[Cause]) -> None:

@@ -22,6 +22,7 @@ from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, mon
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.response_noise import learnt_noise
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -35,6 +36,8 @@ TURN = 0.1
 """Roll that shows a corrector's kick in the other plane, rad."""
 INNER = 0.2
 """Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
+NO_RF = 1e-6
+"""Relative step of an RF that was not stepped: its orbit is missing."""
 SMALL = 1e-3
 """Of a monitor's largest error: the step of the differences."""
 
@@ -83,26 +86,34 @@ class ResponseData:
 def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
     """What was measured, as the ring has it.
 
+    Without an RF step its column is empty, and only priors tell the correctors' scale from the
+    monitors'. Noise that nobody states is learnt, see `response_noise`.
+
     Raises:
-        MeasurementError: no RF step, or no noise.
+        MeasurementError: no noise, and too few readings to learn it.
         UnknownNameError: a monitor that the ring does not have.
     """
     names = [monitor.name for monitor in ring.monitors]
     known = {ring[name].name: name for name in measured.monitors}
     measured = measured.select(monitors=[known[name] for name in names if name in known])
-    if measured.rf is None or measured.rf.orbit is None:
-        raise MeasurementError("an orbit response without an RF step: dispersion is not known")
-    if measured.noise is None or np.isnan(measured.noise).any():
-        raise MeasurementError("the noise of the readings is not known; add it")
+    rf = measured.rf
+    if rf is None or rf.orbit is None or rf.step == 0:
+        step, orbit = NO_RF, np.full((len(measured.monitors), 2), np.nan)
+    else:
+        step, orbit = rf.step / rf.frequency, rf.orbit
+    noise = measured.noise
+    if noise is None or np.isnan(noise).any():
+        learnt = learnt_noise(measured)
+        noise = learnt if noise is None else np.where(np.isnan(noise), learnt, noise)
     order = {name: i for i, name in enumerate(names)}
     return ResponseData(
         ring=ring,
         measured=measured,
         at=np.array([order[ring[name].name] for name in measured.monitors]),
-        orbits=np.concatenate([measured.response, measured.rf.orbit[None]]),
-        kicks=np.append(measured.kicks, measured.rf.step / measured.rf.frequency),
+        orbits=np.concatenate([measured.response, orbit[None]]),
+        kicks=np.append(measured.kicks, step),
         plane=np.append([int(p == "y") for p in measured.planes], 0),
-        noise=measured.noise,
+        noise=noise,
     )
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import TooFewTurnsError
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.measurement import TurnByTurn
+from tmlattice.observe.line_errors import change, growth, noise_at
 from tmlattice.observe.line_fit import LineFit
 from tmlattice.observe.line_search import Modes, Near, Planes, betatron_lines, share, which
 
@@ -58,7 +59,8 @@ class Lines:
         amplitude: A, complex, m, [shot, monitor, plane, mode]. For 1 - Q instead of Q it is the
             complex conjugate.
         error: rms of its real and of its imaginary part, but for the scale that all monitors
-            share, m, [shot, monitor, plane, mode].
+            share, m, [shot, monitor, plane, mode]: from the noise where and when the line is, and
+            from how far ratios of monitors change while the beam decoheres.
         noise: rms of one reading, from what no line explains, m, [monitor, plane].
         turns: used of each shot, [shot].
         envelope: g, complex, [shot, mode, turn]; 0 behind the turns that were used.
@@ -104,26 +106,28 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
         if own is None:
             continue
         fit, usable, modes = own
+        planes = np.tile([0, 1], monitors)[usable]
         used = fit.envelope.shape[1]
         found.turns[i] = used
         noise.append(np.full(2 * monitors, np.nan))
         noise[-1][usable] = fit.noise
-        colour = _colour(fit)
         for mode, line in enumerate(modes):
             if line is None:
                 continue
-            if colour[line] > NOT_ONE:
+            louder = noise_at(fit, line)
+            if louder > NOT_ONE:
                 _say(said, shot, IMPURE.format(mode + 1))
             mirrored = near is not None and near[mode] % 1 > 0.5
             turned = np.conj if mirrored else np.asarray
             found.tune[i, mode] = abs(mirrored - fit.frequency[line])
             found.tune_error[i, mode] = fit.frequency_error[line]
             found.envelope[i, mode, :used] = turned(fit.envelope[line])
-            late = 1 + np.repeat(place, 2)[usable] * _growth(fit.envelope[line])
+            late = 1 + np.repeat(place, 2)[usable] * growth(fit.envelope[line])
             values = found.amplitude[i].reshape(-1, 2)
             values[usable, mode] = turned(fit.amplitude[:, line] / late)
             errors = found.error[i].reshape(-1, 2)
-            errors[usable, mode] = fit.noise * np.sqrt(fit.variance[:, line]) * colour[line]
+            own_error = fit.noise * np.sqrt(fit.variance[:, line]) * louder
+            errors[usable, mode] = np.hypot(own_error, change(fit, line, planes))
     if not noise:
         raise TooFewTurnsError(
             f"no shot has {MIN_TURNS} turns with a beam: there is no tune in them; "
@@ -268,26 +272,3 @@ def _louder(turns: TurnByTurn, noise: Array) -> list[str]:
     if 0.5 < typical < 2:
         return []
     return [f"what no line explains is {typical:.2g} times the stated noise at a typical monitor"]
-
-
-def _colour(fit: LineFit) -> Array:
-    """Noise near each line over the noise of all frequencies, of all signals together, [line]."""
-    turns = fit.envelope.shape[1]
-    colour = np.ones(len(fit.frequency))
-    if turns < 64:  # not enough of a spectrum beside the lines
-        return colour
-    power = np.abs(np.fft.rfft(fit.residual)) ** 2
-    filled = np.maximum(fit.noise**2 * turns, 1e-300)
-    white = np.median(power / filled[:, None], axis=0)
-    scale = np.median(white)
-    for i, line in enumerate(fit.frequency):
-        middle = round(line * turns)
-        near = white[max(middle - 10, 1) : middle + 11]
-        colour[i] = np.sqrt(np.mean(near) / scale) if scale > 0 else 1.0
-    return colour
-
-
-def _growth(envelope: ComplexArray) -> complex:
-    """By how much an envelope grows in a turn, on the mean over the line's power."""
-    power = (np.abs(envelope) ** 2).sum()
-    return complex((envelope.conj() * np.gradient(envelope)).sum() / power)

@@ -141,7 +141,10 @@ class Steady(Problem):
 
     def as_rows(self, readings: Array) -> Array:
         """In units of the noise, what is not used left out."""
-        return np.asarray((readings / self.sigma)[..., self.used])
+        scaled = readings / self.sigma
+        if self.used.all():
+            return np.asarray(scaled.reshape(*scaled.shape[: -self.used.ndim], self.used.size))
+        return np.asarray(scaled[..., self.used])
 
     def left(self, point: Point) -> tuple[Array, Array]:
         """What nuisances take is a small share of any reading."""

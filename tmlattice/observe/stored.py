@@ -6,7 +6,8 @@ so `told` is prediction and derivative in one. A new kind is a class with `told`
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +35,55 @@ Array = NDArray[np.float64]
 SMALL = 1e-3
 """Of a monitor's largest error: the step of the differences."""
 
+FEW = 10
+"""Causes with which a model is made from the one without; of more it is kept."""
+
+BEAMS = 6
+"""Stored beams that are remembered: some megabytes each."""
+
+
+class Kept:
+    """Models made a moment ago: measurements of one machine ask for the same ones, and most causes
+    are the same from one call to the next."""
+
+    def __init__(self) -> None:
+        self._bases: dict[str, tuple[tuple[Cause, ...], ResponseModel]] = {}
+        self._beams: deque[tuple[str, float, tuple[Cause, ...], StoredBeam]] = deque(maxlen=BEAMS)
+
+    def beam(
+        self, ring: Ring, settings: Settings, frequency: float, causes: tuple[Cause, ...]
+    ) -> StoredBeam:
+        """The stored beam of a ring with settings and causes.
+
+        Raises:
+            UnstableRingError: there is none.
+        """
+        key, near = repr(settings), None
+        for own, at, known, beam in self._beams:
+            if own == key and known == causes:
+                if at == frequency:
+                    return beam
+                near = beam
+        if near is not None:
+            made = StoredBeam(near.model.at_frequency(frequency))
+        else:
+            made = StoredBeam(self._model(ring, settings, causes).at_frequency(frequency))
+        self._beams.append((key, frequency, causes, made))
+        return made
+
+    def _model(self, ring: Ring, settings: Settings, causes: tuple[Cause, ...]) -> ResponseModel:
+        key = repr(settings)
+        known, base = self._bases.get(key, ((), None))
+        if base is None or causes[: len(known)] != known:
+            pairs = enumerate(zip(causes, known, strict=False))
+            same = next((i for i, (a, b) in pairs if a != b), min(len(causes), len(known)))
+            many = same if same > FEW else len(causes)
+            known = causes[:many] if len(causes) > FEW else ()
+            base = ResponseModel(apply(ring, known, settings))
+            self._bases[key] = (known, base)
+        rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
+        return base.changed_to(apply(base.ring, rest)) if rest else base
+
 
 @dataclass(frozen=True)
 class Beams:
@@ -57,6 +107,7 @@ class Stored(Steady):
         states: settings and relative RF frequency of each.
         data, errors: what was read and its noise, of the kind's shape.
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
+        kept: models made a moment ago; those of the same ring may share one.
     """
 
     ring: Ring = field(repr=False)
@@ -64,6 +115,7 @@ class Stored(Steady):
     data: Array = field(repr=False)
     errors: Array = field(repr=False)
     read_by: NDArray[np.int64] = field(repr=False)
+    kept: Kept = field(default_factory=Kept, repr=False, compare=False)
 
     @abstractmethod
     def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
@@ -96,19 +148,9 @@ class Stored(Steady):
 
     def view(self, causes: Sequence[Cause]) -> Beams:
         """A closed orbit for each state."""
-        made: list[StoredBeam] = []
-        first: dict[int, ResponseModel] = {}
-        for i, (settings, frequency) in enumerate(self.states):
-            same = next((j for j in range(i) if self.states[j][0] == settings), i)
-            if same == i:
-                ring = apply(self.ring, causes, settings)
-                first[i] = ResponseModel(ring, 6, frequency)
-                made.append(StoredBeam(first[i]))
-            elif self.states[same][1] == frequency:
-                made.append(made[same])
-            else:
-                made.append(StoredBeam(first[same].at_frequency(frequency)))
-        return Beams(tuple(made), monitors_with(self.ring, causes))
+        there = tuple(causes)
+        beams = tuple(self.kept.beam(self.ring, *state, there) for state in self.states)
+        return Beams(beams, monitors_with(self.ring, causes))
 
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Monitors' errors and all."""
@@ -128,20 +170,16 @@ class Stored(Steady):
                 if id(beam) not in known:
                     known[id(beam)] = _seen(beam.moved(some), matrix)
             out[on_ring] = self.told([known[id(beam)] for beam in view.beams], nuisances)
+        place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
         for name in dict.fromkeys(name for name, _ in hypotheses):
             effect = find(name)
             if isinstance(effect, ReadingEffect):
                 own = [i for i, h in enumerate(hypotheses) if h[0] == name]
                 changed = self._of_monitors(view, nuisances, effect)
                 for i in own:
-                    m = self.place[self.ring[hypotheses[i][1] or ""].name]
-                    out[i] = np.where(self.read_by == m, changed, 0.0)
+                    mine = self.read_by == place[hypotheses[i][1] or ""]
+                    out[i][mine] = changed[mine]
         return out
-
-    @property
-    def place(self) -> Mapping[str, int]:
-        """Of each monitor among those of the ring."""
-        return {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
 
     def _of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
         """d readings / d amount of an effect on top, every monitor's own."""
@@ -161,11 +199,17 @@ class Stored(Steady):
 
 def _seen(shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0) -> Moved:
     """What monitors make of it."""
-    return Moved(
-        np.einsum("mij,...mj->...mi", matrix, shown.orbit) + constant,
-        tunes * shown.tunes,
-        np.einsum("mij,...mjp->...mip", matrix, shown.modes),
-    )
+    orbit, modes = shown.orbit + constant, shown.modes
+    wrong = np.flatnonzero((matrix != np.eye(2)).any(axis=(1, 2)))
+    if len(wrong):
+        modes, orbit = modes.copy(), orbit.copy()
+        own = matrix[wrong]
+        modes[..., wrong, :, :] = np.einsum(
+            "mij,...mjp->...mip", own, shown.modes[..., wrong, :, :]
+        )
+        beam = shown.orbit[..., wrong, :]
+        orbit[..., wrong, :] += np.einsum("mij,...mj->...mi", own, beam) - beam
+    return Moved(orbit, tunes * shown.tunes, modes)
 
 
 def rf_of(settings: Settings) -> float:

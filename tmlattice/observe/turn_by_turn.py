@@ -19,7 +19,7 @@ from tmlattice.inference.problem import Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
-from tmlattice.observe.stored import Stored, rf_of, stacked
+from tmlattice.observe.stored import Beams, Stored, rf_of, stacked
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -57,21 +57,24 @@ class ManyTurns(Stored):
     def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """A shot is a state."""
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
-        seen = stacked(states, "modes") * size[:, None, None, :]
-        flat = np.stack([seen.real, seen.imag], axis=-1)
-        flat = flat.reshape(*flat.shape[:-4], -1)
+        seen = np.ascontiguousarray(stacked(states, "modes") * size[:, None, None, :])
+        flat = seen.view(float).reshape(*seen.shape[:-3], -1)
         return np.concatenate([flat, stacked(states, "tunes")], axis=-1)
 
-    def directions(self, view: object, nuisances: Array) -> Array:
-        """Linear in the nuisances: one after another, the others zero; tunes have none."""
-        out = []
-        nothing = self.read(view, np.zeros_like(nuisances))  # type: ignore[arg-type]
-        for i in range(nuisances.size):
-            one = np.zeros(nuisances.size)
-            one[i] = 1.0
-            there = self.read(view, one.reshape(nuisances.shape))  # type: ignore[arg-type]
-            out.append(there - nothing)
-        return np.array(out)
+    def directions(self, view: Beams, nuisances: Array) -> Array:
+        """Linear in the nuisances; tunes have none."""
+        ones = np.zeros_like(nuisances)
+        ones[..., 0] = 1.0
+        shots = len(ones)
+        lines = self.read(view, ones)[:, :-2].reshape(shots, -1, 2, 2)  # [shot, , mode, re and im]
+        out = np.zeros((shots, 2, 2, shots, lines.shape[1], 2, 2))
+        for shot in range(shots):
+            for mode in range(2):
+                own = lines[shot, :, mode]
+                out[shot, mode, 0, shot, :, mode] = own
+                out[shot, mode, 1, shot, :, mode] = np.stack([-own[:, 1], own[:, 0]], axis=1)
+        flat = out.reshape(nuisances.size, shots, -1)
+        return np.concatenate([flat, np.zeros((*flat.shape[:2], 2))], axis=2)
 
 
 def many_turns(

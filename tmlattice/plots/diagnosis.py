@@ -1,6 +1,7 @@
 """Figures of a diagnosis."""
 
 from collections.abc import Iterator, Mapping
+from textwrap import wrap
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,7 +13,9 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
+from tmlattice.plots.names import brief
 from tmlattice.plots.parts import plot_parts
+from tmlattice.plots.plan import plot_plan
 from tmlattice.plots.readings import AFTER, BEFORE, mark, plot_readings, readings_caption
 from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import lattice_strip
@@ -36,6 +39,9 @@ WIDE = 300.0
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
+    _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
+    plot_plan(diagnosis, ax)
+    yield "plan", "The ring from above, with what was found.", _figure(ax)
     yield from (response_figures if diagnosis.by_steps else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         if len(finding.remedies) > 1:
@@ -75,8 +81,7 @@ def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]
             plot_scan_near(diagnosis, first),
         )
     if diagnosis.heldout is not None:
-        _, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
-        plot_gap(diagnosis, ax)
+        ax = plot_gap(diagnosis, gap_axes(diagnosis))
         yield (
             "gap",
             "Readings of shots that the fit never saw less the model, as findings are added.",
@@ -113,7 +118,7 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
     grid[1, 1].axis("off")
     found = diagnosis.explanation.first
     _draw_scan(ax, diagnosis, 3.0)
-    threshold = _thresholds(diagnosis)[0]
+    threshold = thresholds(diagnosis)[0]
     _whole_ring(side, diagnosis)
     ax.set_yscale("log")
     ax.set_ylim(FLOOR, 12 * max(float(found.statistic.max(initial=1.0)), threshold))
@@ -145,7 +150,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     values = np.concatenate([np.asarray(v, dtype=float) for v in seen])
     inside = np.concatenate([np.asarray(x, dtype=float) for x in places])
     top = np.nanmax(values[(inside >= low) & (inside <= high)], initial=FLOOR)
-    ax.set_ylim(0, 1.2 * max(float(top), _thresholds(diagnosis)[0]))
+    ax.set_ylim(0, 1.2 * max(float(top), thresholds(diagnosis)[0]))
     ax.yaxis.set_major_formatter("{x:,.0f}")
     labelled = -np.inf
     for monitor in diagnosis.ring.monitors:
@@ -155,7 +160,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
         if monitor.s - labelled > 0.012 * (high - low):  # else the names would overlap
             labelled = monitor.s
             ax.annotate(
-                monitor.name, (monitor.s, 0), xytext=(2, 4), textcoords="offset points",
+                brief(monitor.name), (monitor.s, 0), xytext=(2, 4), textcoords="offset points",
                 rotation=90, fontsize="x-small", color="0.35", va="bottom",
             )  # fmt: skip
     _mark_findings(ax, diagnosis, (low, high))
@@ -175,7 +180,7 @@ def _around(diagnosis: Diagnosis, finding: Finding) -> tuple[float, float]:
     return max(low - ROOM, 0.0), min(high + ROOM, diagnosis.ring.length)
 
 
-def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
+def thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
     """Of the named effects and of free kicks."""
     explanation = diagnosis.explanation
     rate = diagnosis.provenance["options"]["false_alarm"]
@@ -190,7 +195,7 @@ def _thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
 def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     """Statistics at their places, one colour for each group, and both thresholds."""
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
-    s = _middles(diagnosis)
+    s = middles(diagnosis)
     groups = np.array([find(effect).group for effect, _ in found.hypotheses])
     layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
     order = np.argsort(layers)
@@ -206,7 +211,7 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
                 s[own], found.statistic[own], linestyle="none", marker=".", color=colour,
                 ms=size, label=name, zorder=2,
             )  # fmt: skip
-    named, kicks = _thresholds(diagnosis)
+    named, kicks = thresholds(diagnosis)
     ax.axhline(
         named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
     )
@@ -217,7 +222,7 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     ax.grid(alpha=0.25)
 
 
-def _middles(diagnosis: Diagnosis) -> Array:
+def middles(diagnosis: Diagnosis) -> Array:
     """Where each hypothesis of the first scan sits, m; NaN for those without a place."""
     middles = {element.name: element.s for element in diagnosis.ring.elements}
     return np.array(
@@ -232,7 +237,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     """Hypotheses without a place, the best of each effect."""
     found = diagnosis.explanation.first
     best: dict[str, float] = {}
-    places = _middles(diagnosis)
+    places = middles(diagnosis)
     for (effect, _), s, value in zip(found.hypotheses, places, found.statistic, strict=True):
         if not np.isfinite(s):
             best[effect] = max(best.get(effect, FLOOR), float(value))
@@ -240,7 +245,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
         side.axis("off")
         return
     side.grid(alpha=0.25)
-    side.axhline(_thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
+    side.axhline(thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
     for i, (effect, value) in enumerate(best.items()):
         side.plot(i, value, "D", color=COLOURS[find(effect).group], ms=5, clip_on=False, zorder=4)
     side.set_xticks(range(len(best)), [find(effect).label for effect in best])
@@ -262,7 +267,7 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
     placed = [(s, finding) for s, finding in placed if low <= s <= high]
     for k, (s, finding) in enumerate(placed):
         name = finding.remedy.effect if finding.remedy is not None else "unnamed"
-        text = f"{name.replace('_', ' ')} {finding.element or ''}".strip()
+        text = f"{name.replace('_', ' ')} {brief(finding.element or '')}".strip()
         left = s > low + 0.6 * (high - low)
         ax.annotate(
             text, (s, 0.97 - 0.05 * (k % 6)), xycoords=("data", "axes fraction"),
@@ -272,6 +277,10 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
 
 
 # --- the gap --------------------------------------------------------------------------------------
+LABEL = 34
+"""Letters of a line beside a bar."""
+
+
 def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     """The rms residual of held-out readings as findings are added one after another.
 
@@ -284,44 +293,54 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     """
     if diagnosis.heldout is None:
         raise ValueError("no shot was held out")
-    if ax is None:
-        _, ax = plt.subplots()
+    ax = gap_axes(diagnosis) if ax is None else ax
     rms = np.array([1e6 * step.rms for step in diagnosis.heldout.misfits])
-    noise = 1e6 * float(np.sqrt(np.nanmean(np.square(diagnosis.noise))))
-    steps = np.arange(len(rms))
-    ax.bar(steps, rms, width=0.55, color=[BEFORE] + [AFTER] * (len(rms) - 1))
-    for step, value in zip(steps, rms, strict=True):
+    noise = noise_rms(diagnosis)
+    rows = np.arange(len(rms))
+    ax.barh(rows, rms, height=0.55, color=[BEFORE] + [AFTER] * (len(rms) - 1))
+    for row, value in zip(rows, rms, strict=True):
         ax.annotate(
-            f"{value:.1f}", (step, value), xytext=(0, 3), textcoords="offset points", ha="center"
+            f"{value:.1f}", (value, row), xytext=(4, 0), textcoords="offset points", va="center"
         )
-    ax.axhline(noise, color="k", linestyle="--", linewidth=1, label=f"noise {noise:.1f} µm")
-    labels = ["design"] + [
-        f"+ {find(cause.effect).words}\n{cause.element or ''}".rstrip()
-        for cause in diagnosis.faults
-    ]
-    if diagnosis.priors:
-        labels = ["design", "+ small errors\neverywhere", "+ what was\nfound"][: len(rms)]
-    crowded = len(labels) > 4
-    ax.set_xticks(
-        steps,
-        labels if not crowded else [label.replace("\n", " ") for label in labels],
-        rotation=25 if crowded else 0,
-        ha="right" if crowded else "center",
-        fontsize="small",
-    )
-    ax.set_xlim(-0.6, max(len(rms), 2) - 0.4)
+    ax.axvline(noise, color="k", linestyle="--", linewidth=1, label=f"noise {noise:.1f} µm")
+    ax.set_yticks(rows, ["\n".join(wrap(label, LABEL)) for label in gap_labels(diagnosis)])
+    ax.set_ylim(max(len(rms), 2) - 0.4, -0.6)  # the design on top
     if rms.max() > 20 * max(rms.min(), 1e-9):
-        ax.set_yscale("log")
-        ax.set_ylim(0.4 * min(rms.min(), noise), 2.5 * rms.max())
+        ax.set_xscale("log")
+        ax.set_xlim(0.4 * min(rms.min(), noise), 2.5 * rms.max())
     else:
-        ax.set_ylim(0, 1.18 * max(rms.max(), noise))
+        ax.set_xlim(0, 1.18 * max(rms.max(), noise))
     shots = ", ".join(map(str, diagnosis.heldout_shots))
     title = f"Held-out shots {shots}" if shots else "Held-out readings"
-    ax.set_ylabel("held-out readings less model,\nrms [µm]")
+    ax.set_xlabel("held-out readings less model, rms [µm]")
     ax.set_title(title, loc="left", fontsize="medium")
-    ax.legend(loc="upper right", fontsize="small")
-    ax.grid(axis="y", alpha=0.25)
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", frameon=False)
+    ax.grid(axis="x", alpha=0.25)
+    ax.set_axisbelow(True)
     return ax
+
+
+def gap_axes(diagnosis: Diagnosis) -> Axes:
+    """High enough for all names beside the bars."""
+    labels = gap_labels(diagnosis)
+    lines = max(len(wrap(label, LABEL)) for label in labels)
+    height = 1.3 + max(0.5, 0.1 + 0.17 * lines) * max(len(labels), 2)
+    _, ax = plt.subplots(figsize=(8, height), layout="constrained")
+    return ax
+
+
+def noise_rms(diagnosis: Diagnosis) -> float:
+    """Of a reading, both planes together, µm."""
+    return 1e6 * float(np.sqrt(np.nanmean(np.square(diagnosis.noise))))
+
+
+def gap_labels(diagnosis: Diagnosis) -> list[str]:
+    """What each model of the held-out gap has in it beyond the one before, the design first."""
+    steps = 0 if diagnosis.heldout is None else len(diagnosis.heldout.misfits)
+    if diagnosis.priors:
+        return ["design", "+ small errors everywhere", "+ what was found"][:steps]
+    faults = (f"+ {find(c.effect).words} {c.element or ''}".rstrip() for c in diagnosis.faults)
+    return ["design", *faults][:steps]
 
 
 # --- credible set ---------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
-from tmlattice.lattice import Ring
+from tmlattice.lattice import Element, Ring
 
 COLOURS = {
     "bend": "tab:blue",
@@ -38,11 +38,8 @@ def lattice_strip(ring: Ring, ax: Axes) -> Axes:
             ):
                 continue
             width = max(element.length, widest)
-            if kind in ("bend", "wiggler"):
-                bottom, height = -0.3, 0.6
-            else:
-                bottom, height = (0.0, 1.0) if _sign(element) > 0 else (-1.0, 1.0)
-            boxes.append(Rectangle((element.s - width / 2, bottom), width, height))
+            bottom, top = extent(element)
+            boxes.append(Rectangle((element.s - width / 2, bottom), width, top - bottom))
         ax.add_collection(PatchCollection(boxes, facecolor=colour, edgecolor="none"))
     ax.axhline(0, color="0.4", linewidth=0.5, zorder=0)
     ax.set_xlim(0, ring.length)
@@ -52,6 +49,13 @@ def lattice_strip(ring: Ring, ax: Axes) -> Axes:
         ax.spines[side].set_visible(False)
     ax.set_xlabel("s [m]")
     return ax
+
+
+def extent(element: Element) -> tuple[float, float]:
+    """From where to where a magnet is drawn: what focuses in x above the axis."""
+    if element.kind not in ("quadrupole", "sextupole"):
+        return -0.3, 0.3
+    return (0.0, 1.0) if _sign(element) > 0 else (-1.0, 0.0)
 
 
 def _sign(element: Any) -> float:

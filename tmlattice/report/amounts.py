@@ -19,7 +19,8 @@ def words(effect: str) -> str:
     return CATALOGUE[effect].words if effect in CATALOGUE else effect.replace("_", " ")
 
 
-def _scale(effect: str, amount: float) -> tuple[float, str]:
+def scaled(effect: str, amount: float) -> tuple[float, str]:
+    """The factor and the readable unit in which an amount of this size is told."""
     unit = find(effect).unit
     steps = _SCALES.get(unit, ((0.0, 1.0, unit),))
     _, factor, name = [step for step in steps if abs(amount) >= step[0] or step[0] == 0][-1]
@@ -35,7 +36,7 @@ def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
     """
     if find(effect).discrete:
         return find(effect).forms.get(amount, "")
-    factor, unit = _scale(effect, amount)
+    factor, unit = scaled(effect, amount)
     value = factor * amount
     if sigma is None or not 0 < sigma < np.inf:
         return f"{value:.3g} {unit}"

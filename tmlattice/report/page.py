@@ -1,4 +1,4 @@
-"""The HTML report of a diagnosis: figures inside, no link to anything outside.
+"""The HTML report of a diagnosis: figures inside that can be hovered and zoomed, nothing outside.
 
 >>> html = page(diagnosis, draw(diagnosis, folder))
 """
@@ -7,14 +7,16 @@ import json
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tmlattice.diagnosis import Diagnosis
-from tmlattice.report import response_text
+from tmlattice.report import response_text, tables
 from tmlattice.report import text as report
+from tmlattice.report.interactive import figures, strip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,9 +83,9 @@ def shrink(path: Path) -> None:
 
 def draw(diagnosis: Diagnosis, folder: Path) -> list[Picture]:
     """Every figure of a diagnosis as a PNG file in the folder."""
-    from tmlattice.plots.diagnosis import figures
+    from tmlattice.plots import diagnosis as drawn
 
-    return save(figures(diagnosis), folder)
+    return save(drawn.figures(diagnosis), folder)
 
 
 def page(
@@ -96,11 +98,27 @@ def page(
         pictures: of `draw`.
         provenance: where it should state more than the diagnosis' own.
     """
+    parts = files("tmlattice.report")
     return render(
         "diagnosis.html",
         diagnosis.provenance if provenance is None else provenance,
         diagnosis=diagnosis,
         report=report,
         dense=response_text,
+        tables=tables,
         pictures={picture.name: picture for picture in pictures},
+        interactive={name: _inlined(one) for name, one in figures(diagnosis).items()},
+        strip=_inlined(strip(diagnosis.ring)),
+        library=(parts / LIBRARY).read_text(encoding="utf-8"),
+        script=(parts / "page.js").read_text(encoding="utf-8"),
     )
+
+
+LIBRARY = "vendor/plotly-basic.min.js"
+"""plotly.js 4.1.1, the bundle of lines, markers and bars; MIT, see `vendor/plotly-LICENSE`."""
+
+
+def _inlined(figure: Any) -> str:
+    """As JSON that may stand between the tags of a script."""
+    text = json.dumps(figure, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    return text.replace("</", "<\\/").replace("<!--", "<\\!--")

@@ -22,7 +22,7 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
             f"{1e6 * step.heldout_rms_position:.3g}",
             f"{1e6 * step.heldout_rms_coupling:.3g}",
             f"{1e6 * step.heldout_rms_roll:.3g}" if np.isfinite(step.heldout_rms_roll) else "",
-            f"{1e6 * step.dispersion_rms:.3g}",
+            f"{1e6 * step.dispersion_rms:.3g}" if np.isfinite(step.dispersion_rms) else "",
             f"{step.heldout_chi2_per_dof:.3g}",
         )
         for step in steps
@@ -75,6 +75,53 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
     return rows
 
 
+REASON = ("what shares an error", "gradients", "magnets", "chi2", "which would be made by")
+
+
+def reason_rows(result: Diagnosis) -> list[tuple[str, ...]]:
+    """The few numbers behind the gradients: name, amount in %, magnets, chi-square, makes."""
+    found = () if result.reasons is None else result.reasons.reasons
+    return [
+        (
+            own.name + "".join(f" (or {name}, {100 * p:.0f} %)" for name, p in own.rivals[:1]),
+            f"{100 * own.amount:+.2f} ± {100 * own.amount_sigma:.2f} %",
+            str(len(own.members)),
+            f"{own.statistic:.3g}",
+            own.makes,
+        )
+        for own in found
+    ]
+
+
+def reasons_sentence(result: Diagnosis) -> str:
+    """How much they hold, and what is left; empty where no gradients were fitted."""
+    own = result.reasons
+    if own is None:
+        return ""
+    if not own.reasons:
+        return (
+            "Nothing that magnets share explains their gradients, which scatter by "
+            f"{100 * own.scatter:.2g} % (rms)."
+        )
+    return (
+        f"These few numbers hold {100 * own.share:.0f} % of the gradients' mean square; single "
+        f"magnets scatter about what they share by {100 * own.scatter:.2g} % (rms)."
+    )
+
+
+def outlier_texts(result: Diagnosis) -> list[str]:
+    """Magnets that no sound magnet is like, with the neighbours that they pull against."""
+    said = []
+    for own in () if result.reasons is None else result.reasons.outliers[:SHOWN]:
+        text = f"{own.element} {100 * own.amount:+.1f} ± {100 * own.amount_sigma:.1f} %"
+        pulls = ", ".join(
+            f"{name} ({100 * amount:+.1f} %, correlation {correlation:+.2f})"
+            for name, amount, correlation in own.against
+        )
+        said.append(f"{text}; it pulls against {pulls}" if pulls else text)
+    return said
+
+
 def left_sentence(result: Diagnosis) -> str:
     """What stays: noise, or patterns."""
     left = result.unexplained["patterns"]
@@ -98,6 +145,17 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
         lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
         lines += columns([HEAD, *step_rows(result.refused)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
+    if result.reasons is not None:
+        lines += ["", "Few reasons behind the gradients:"]
+        for name, amount, count, square, makes in reason_rows(result):
+            head = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
+            lines += wrapped(head, "   ", width)
+        lines += wrapped(reasons_sentence(result), "", width)
+        outliers = outlier_texts(result)
+        if outliers:
+            lines += ["", "Further off than magnets are, so that something else is likely there:"]
+            for text in outliers:
+                lines += wrapped(text, "   ", width)
     for said, amounts in error_rows(result):
         lines += ["", *wrapped(said, "", width), *wrapped(amounts, "   ", width)]
     lines += ["", *wrapped(left_sentence(result), "", width)]

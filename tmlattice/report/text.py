@@ -85,8 +85,25 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 # --- the sentences --------------------------------------------------------------------------------
+def since_reference(diagnosis: Diagnosis) -> bool:
+    """Whether the findings are what changed between two orbit responses."""
+    options = diagnosis.provenance["options"]
+    return diagnosis.kind != "trajectory" and bool(options.get("reference"))
+
+
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
+    if not since_reference(diagnosis):
+        return _verdict_sentence(diagnosis)
+    if diagnosis.verdict == "nothing":
+        return (
+            "Nothing changed since the reference but what monitors, correctors and magnets drift "
+            "by anyway."
+        )
+    return f"Since the reference: {_verdict_sentence(diagnosis)}"
+
+
+def _verdict_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.findings
     if diagnosis.verdict == "named":
         many = f"{len(found)} faults: " if len(found) > 1 else ""
@@ -123,8 +140,13 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
         "µm, that of held-out ones from "
         f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
         f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
-        f"{1e6 * last.heldout_rms_coupling:.1f} µm, and that of the RF's response from "
-        f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+        f"{1e6 * last.heldout_rms_coupling:.1f} µm"
+        + (
+            ", and that of the RF's response from "
+            f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+            if np.isfinite(last.dispersion_rms)
+            else "."
+        )
     )
 
 
@@ -153,12 +175,17 @@ def _open(finding: Finding) -> str:
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
-    if diagnosis.verdict == "distributed" and diagnosis.priors and not diagnosis.steps:
+    if diagnosis.verdict == "distributed" and diagnosis.steps:
+        return (
+            "Look at what stands out of its kind, set the gradients that --repaired-out writes, "
+            "and measure again."
+        )
+    if diagnosis.verdict == "distributed" and diagnosis.priors:
         return (
             "A measurement of this machine from before the fault (--reference) shows a fault that "
             "small errors hide."
         )
-    if diagnosis.verdict == "distributed" and not diagnosis.steps:
+    if diagnosis.verdict == "distributed":
         return (
             "Small errors everywhere look like this: state them (--background all), or give a "
             "measurement of this machine from before the fault (--reference)."
@@ -169,6 +196,38 @@ def advice(diagnosis: Diagnosis) -> str:
             "tell whether it is constant, linear or not, or changes from shot to shot."
         )
     return ""
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """What was found, short where the findings are listed below."""
+    found = diagnosis.findings
+    if len(found) < 2:
+        return verdict_sentence(diagnosis)
+    several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "equivalent"]
+    unnamed = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "located"]
+    text = f"{len(found)} findings."
+    if several:
+        text += f" More than one explanation fits: {', '.join(several)}."
+    if unnamed:
+        text += f" No effect of the catalogue explains {', '.join(unnamed)}."
+    return text
+
+
+def to_do(diagnosis: Diagnosis) -> list[str]:
+    """What to do next, the first first: repairs, then what would tell more."""
+    remedies = [finding.remedy for finding in diagnosis.findings if finding.remedy is not None]
+    done = [f"{remedy.action[0].upper()}{remedy.action[1:]}." for remedy in remedies]
+    if len(diagnosis.findings) == 1 and remedies:
+        done = [f"{done[0]} First: {find(remedies[0].effect).to_check}"]
+    more = next_text(diagnosis) or advice(diagnosis)
+    return [*done, more] if more else done
+
+
+def gap_sentence(diagnosis: Diagnosis) -> str:
+    """How far the gap falls, on the readings that judge."""
+    rows = gap_rows(diagnosis)
+    name, before, after = rows[-1]
+    return f"{name}: from {before} to {after}"
 
 
 def next_text(diagnosis: Diagnosis) -> str:

@@ -1,0 +1,114 @@
+"""Measurements stacked to one problem, and any problem among small errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause, simulate
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.diagnosis.background import background_signatures
+from tmlattice.diagnosis.prepare import prepare
+from tmlattice.effects import apply, background_rms, find, monitors_with
+from tmlattice.inference.among import Among, _signatures, small_errors_of
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.newton import fit
+from tmlattice.inference.together import Together
+from tmlattice.measurement import ClosedOrbit
+from tmlattice.observe.orbits import closed_orbits
+
+WEAK = Cause("quadrupole_gradient", "QD::3", -0.02)
+NOISE = 1e-6
+
+
+def _orbit(ring, causes, seed):
+    model = ResponseModel(apply(ring, causes))
+    read = monitors_with(ring, causes).read(model.readings)
+    read = read + NOISE * np.random.default_rng(seed).standard_normal(read.shape)
+    names = tuple(monitor.name for monitor in ring.monitors)
+    return ClosedOrbit(orbit=read[None], monitors=names, noise=(NOISE, NOISE))
+
+
+@pytest.fixture(scope="module")
+def turns(small_ring):
+    measured = simulate(small_ring, [WEAK], shots=3, seed=3).measurement()
+    return prepare(small_ring, measured, None, False, None, DEFAULT).problem
+
+
+@pytest.fixture(scope="module")
+def orbit(small_ring):
+    kick = Cause("corrector_kick_x", "v6", 2e-5)
+    return closed_orbits(small_ring, _orbit(small_ring, [WEAK, kick], 1), {})
+
+
+def test_rows_of_both_are_the_rows_of_each(turns, orbit):
+    both = Together.of([turns, orbit])
+    point = both.at([WEAK], both.first)
+    alone = [part.at([WEAK], part.first) for part in (turns, orbit)]
+    assert_allclose(point.chi2, sum(one.chi2 for one in alone))
+    some = [(WEAK.effect, WEAK.element), ("monitor_gain_x", "end_1"), ("energy_spread", None)]
+    rng = np.random.default_rng(0)
+    data = rng.standard_normal((2, len(point.residual)))
+    found = both.metric(point).products(some, data)
+    rows = both.metric(point).rows(some)
+    assert_allclose(found.whole, np.einsum("hr,hr->h", rows, rows), rtol=1e-9)
+    assert_allclose(found.inner, rows @ data.T, rtol=1e-9, atol=1e-9)
+    assert (rows[2, len(alone[0].residual) :] == 0).all()  # a closed orbit has no launch
+
+
+def test_slopes_of_both_are_the_scans_own(turns, orbit):
+    both = Together.of([turns, orbit])
+    point = both.at([WEAK], both.first)
+    h = 1e-5
+    up, down = (
+        both.at([replace(WEAK, amount=WEAK.amount + side * h)], both.first).residual
+        for side in (1, -1)
+    )
+    slope = both.slope(point, 0)
+    assert_allclose(slope, (down - up) / (2 * h), atol=2e-4 * np.abs(slope).max())
+
+
+def test_a_reference_has_what_is_fixed_and_not_what_is_sought(orbit):
+    both = Together.of([orbit], [orbit])
+    cause = Cause("corrector_kick_x", "v6", 2e-5)
+    count = len(orbit.at((), orbit.first).residual)
+    sought = both.at([cause], both.first).residual
+    fixed = replace(both, fixed=(cause,)).at((), both.first).residual
+    assert_allclose(sought[:count], fixed[:count])
+    assert np.abs(sought[count:] - fixed[count:]).max() > 1
+
+
+def test_small_errors_among_any_rows_are_those_of_trajectories(turns):
+    """The covariance that first turns have of their own: two ways to the same chi-square."""
+    rms = {name: find(name).background for name in ("quadrupole_gradient", "monitor_gain_x")}
+    start = fit(turns, (), turns.first)
+    which, scale, spread = background_signatures(
+        turns.model, start.point.view, start.nuisances, rms
+    )
+    own = fit(replace(turns, spread=spread, white=None), (), start.nuisances)
+    rows = scale[:, None] * _signatures(turns, start.point, which)
+    among = Among(
+        places={}, inner=turns, hypotheses=tuple(which), rms=scale,
+        spread=rows.reshape(-1, *turns.valid.shape), amounts_now=np.zeros(len(scale)),
+    )  # fmt: skip
+    other = fit(among, (), start.nuisances)
+    assert own.chi2 < 0.9 * start.chi2
+    assert_allclose(other.chi2, own.chi2, rtol=1e-6)
+
+
+def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):
+    """Sizes learnt from closed orbits; a corrector that is far off stands out among them."""
+    usual = background_rms({"all": None})
+    rng = np.random.default_rng(5)
+    small = [
+        Cause(name, place, float(rms * rng.standard_normal()))
+        for name, rms in usual.items()
+        for place in find(name).places(small_ring)
+    ]
+    everywhere = [(cause.effect, cause.element) for cause in small]
+    problem = closed_orbits(small_ring, _orbit(small_ring, small, 2), {})
+    learnt = small_errors_of(problem, everywhere, usual, problem.first)
+    assert learnt.log_evidence > 1e3
+    assert 0.5 < learnt.before.chi2 / problem.valid.sum() < 1.5  # 70 readings: +- 0.17
+    assert 0.5 < learnt.sizes["quadrupole_offset_x"] / usual["quadrupole_offset_x"] < 2

@@ -1,0 +1,175 @@
+"""What changed between two orbit responses of one machine, simulated and measured."""
+
+import json
+import os
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from tmlattice import diagnose, load_ring
+from tmlattice.cli.command import tmlattice
+from tmlattice.effects import Cause
+from tmlattice.errors import MeasurementError
+from tmlattice.machine.response import simulate_response
+from tmlattice.measurement import read_measurement, write_measurement
+from tmlattice.report.plain import report_text
+
+SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
+REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "real_rings"
+real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no measured rings")
+CHANGED = [
+    Cause("family_gradient", "QF", 0.003),
+    Cause("quadrupole_gradient", "QD::5", -0.008),
+]
+
+
+def machine(ring, changes=(), seed=1, drift=0.0):
+    """Of a ring with small errors everywhere; monitors and correctors drift from day to day."""
+    rng = np.random.default_rng(7)
+    static = [
+        Cause("quadrupole_gradient", f"{name}::{i}", 3e-3 * rng.standard_normal())
+        for name in ("QF", "QD")
+        for i in range(16)
+    ]
+    static += [
+        Cause(f"monitor_gain_{p}", m.name, 0.02 * rng.standard_normal())
+        for m in ring.monitors
+        for p in "xy"
+    ]
+    day = np.random.default_rng(seed)
+    drifts = [
+        Cause("corrector_calibration", f"v{i}", 0.05 * rng.standard_normal()
+              + drift * day.standard_normal())
+        for i in range(16)
+    ]  # fmt: skip
+    return simulate_response(
+        ring, [*static, *drifts, *changes], kick=1e-5, noise=2e-8, rf_step=-3000.0,
+        engine="ocelot", progress=False, seed=seed,
+    ).measured  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def before(small_ring):
+    return machine(small_ring)
+
+
+@pytest.fixture(scope="module")
+def after(small_ring):
+    return machine(small_ring, CHANGED, seed=2, drift=0.01)
+
+
+@pytest.fixture(scope="module")
+def change(small_ring, before, after):
+    return diagnose(small_ring, after, reference=before)
+
+
+def test_the_changed_supply_and_the_changed_magnet_are_found_and_no_other(change):
+    assert change.verdict == "named"
+    found = {(own.effect, own.element): own for own in change.findings}
+    supply = found.pop(("family_gradient", "qf"))
+    magnet = found.pop(("quadrupole_gradient", "QD::5"))
+    assert not found
+    for own, true in ((supply, 0.003), (magnet, -0.008)):
+        assert own.detection.statistic > 25
+        assert abs(own.amount - true) < 3 * own.amount_sigma
+        assert own.amount_sigma < 0.1 * abs(true)  # noise, drifts and what magnets scatter by
+
+
+def test_a_machine_that_only_drifts_has_not_changed(small_ring, before):
+    same = diagnose(small_ring, machine(small_ring, seed=5, drift=0.01), reference=before)
+    assert (same.verdict, same.findings) == ("nothing", ())
+    assert "Nothing changed since the reference" in report_text(same)
+
+
+def test_a_measurement_against_itself_is_nothing(small_ring, before):
+    same = diagnose(small_ring, before, reference=before)
+    assert (same.verdict, same.findings) == ("nothing", ())
+
+
+def test_a_corrector_that_was_reversed_since_is_named(small_ring, before):
+    kicks = np.where(np.arange(len(before.kicks)) == 4, -1.0, 1.0)
+    wrong = replace(before, response=before.response * kicks[:, None, None])
+    (found,) = diagnose(small_ring, wrong, reference=before).findings
+    assert (found.effect, found.element) == ("corrector_calibration", before.correctors[4])
+    assert abs(found.amount + 2) < 0.01  # its own calibration is known to a per cent
+
+
+def test_monitors_and_correctors_of_one_measurement_alone_do_no_harm(small_ring, before, after):
+    fewer = before.select(monitors=before.monitors[2:])
+    other = after.select(correctors=after.correctors[:-1], monitors=after.monitors[::-1])
+    result = diagnose(small_ring, other, reference=fewer)
+    assert {own.element for own in result.findings} == {"qf", "QD::5"}
+    assert any(before.monitors[0].casefold() in said for said in result.warnings)
+
+
+def test_a_reference_of_another_kind_or_machine_is_a_sentence(small_ring, before, after):
+    with pytest.raises(MeasurementError, match="give a reference of the same kind"):
+        diagnose(small_ring, after, reference=object())
+    few = before.select(correctors=before.correctors[:2])
+    with pytest.raises(MeasurementError, match="shares 2 of"):
+        diagnose(small_ring, after, reference=few)
+
+
+def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
+    for name, measured in (("before", before), ("after", after)):
+        write_measurement(tmp_path / name, measured)
+    asked = {}
+
+    def found(ring, measured, **options):  # the work is another test's
+        asked.update(options, correctors=measured.correctors)
+        return change
+
+    monkeypatch.setattr("tmlattice.diagnosis.diagnose", found)
+    words = ["diagnose", SMALL, str(tmp_path / "after"), "--reference", str(tmp_path / "before")]
+    done = CliRunner().invoke(
+        tmlattice, [*words, "--out", str(tmp_path / "out")], catch_exceptions=False
+    )
+    assert done.exit_code == 0, done.output
+    assert asked["reference"].correctors == before.correctors == asked["correctors"]
+    assert "Since the reference: 2 faults" in done.output
+    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    schema = files("tmlattice") / "schemas" / "diagnosis.schema.json"
+    jsonschema.validate(document, json.loads(schema.read_text()))
+    assert document["provenance"]["options"]["reference"] is True
+    assert {own["element"] for own in document["findings"]} == {"qf", "QD::5"}
+    assert "Since the reference" in (tmp_path / "out" / "report.html").read_text()
+    wrong = CliRunner().invoke(tmlattice, [*words, "--lattice-out", str(tmp_path / "r.json")])
+    assert wrong.exit_code == 2
+    assert "no meaning for a change since a reference" in wrong.output
+
+
+@pytest.mark.slow
+@real
+@pytest.mark.parametrize("null", [False, True])
+def test_measured_pairs(tmp_path, null):
+    """Fourteen supplies that were changed on purpose, by 0.1 to 0.75 %; and a pair of nothing."""
+    names = ("07-11_a", "07-11_b") if null else ("07-17_before", "07-17_after")
+    folders = []
+    for name in names:
+        folder = tmp_path / name
+        file = REAL / f"lnls_2014-{name}.loco.mat"
+        done = CliRunner().invoke(tmlattice, ["import", str(file), "--out", str(folder)])
+        assert done.exit_code == 0, done.output
+        folders.append(folder)
+    ring = load_ring(folders[0] / "lattice.json")
+    first, second = (read_measurement(folder) for folder in folders)
+    result = diagnose(ring, second, reference=first)
+    if null:
+        assert (result.verdict, result.findings) == ("nothing", ())
+        return
+    settings = [json.loads((REAL / f"lnls_2014-{name}.setpoints.json").read_text())
+                for name in names]  # fmt: skip
+    currents = {
+        supply.casefold(): [float(np.ravel(own[supply]["value"])[0]) for own in settings]
+        for supply in settings[0]
+        if supply[:3] in ("A2Q", "A6Q")
+    }
+    signs = {name: np.sign(b - a) for name, (a, b) in currents.items() if a != b}
+    assert {own.element: np.sign(own.amount) for own in result.findings} == signs
+    assert all(own.effect == "family_gradient" for own in result.findings)
+    assert min(abs(own.amount) / own.amount_sigma for own in result.findings) > 5

@@ -1,0 +1,160 @@
+"""Several measurements of one machine, and those of a stored beam, in one diagnosis."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.command import tmlattice
+from tmlattice import Cause, diagnose, simulate, write_measurement
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import StoredBeam
+from tmlattice.effects import apply, background_rms, find, monitors_with
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
+
+KICK = Cause("corrector_kick_x", "v6", 3e-5)
+WEAK = Cause("quadrupole_gradient", "QD::3", -0.01)
+SWAPPED = Cause("monitor_swap", "end_1", 1.0)
+NOISE = 2e-6
+
+
+def _names(ring):
+    return tuple(monitor.name for monitor in ring.monitors)
+
+
+def _noisy(read, seed, noise=NOISE):
+    return read + noise * np.random.default_rng(seed).standard_normal(read.shape)
+
+
+def _orbit(ring, causes, seed=1):
+    model = ResponseModel(apply(ring, causes))
+    read = monitors_with(ring, causes).read(model.readings)
+    return ClosedOrbit(orbit=_noisy(read, seed)[None], monitors=_names(ring), noise=(NOISE, NOISE))
+
+
+def _dispersion(ring, causes, seed=2):
+    model = ResponseModel(apply(ring, causes))
+    step = 5e-4 / model.rf_start[5]
+    read = np.einsum("mij,mj->mi", monitors_with(ring, causes).matrix(), model.rf_change(step))
+    one = RfStep(5e8, 100, step * 5e8, _noisy(read, seed))
+    return Dispersion(steps=(one,), monitors=_names(ring), noise=(NOISE, NOISE))
+
+
+def _tunes(ring, causes, seed=103):
+    tune = _noisy(StoredBeam(ResponseModel(apply(ring, causes))).tunes, seed, 1e-4)
+    return TuneReading(tune=tune[None], tune_error=np.full((1, 2), 1e-4))
+
+
+def _turns(ring, causes, seed=4, turns=300):
+    """Lines of the stored beam about its orbit: linear motion, which spectra are of."""
+    beam = StoredBeam(ResponseModel(apply(ring, causes)))
+    size = np.array([[2e-4 + 1e-4j, 1e-4j], [1e-4, 2e-4 - 1e-4j]])  # [shot, mode], sqrt(m) units
+    size = size / np.abs(beam.modes).max() * 3
+    wave = np.exp(2j * np.pi * np.outer(np.arange(turns), beam.tunes))
+    read = np.einsum("sp,mip,tp->stmi", size, beam.modes, wave).real
+    read = monitors_with(ring, causes).read(read + beam.model.readings)
+    return TurnByTurn(readings=_noisy(read, seed, 1e-5), monitors=_names(ring), noise=(1e-5, 1e-5))
+
+
+def _found(diagnosis):
+    return {(f.remedy.effect, f.element) for f in diagnosis.findings if f.remedy}
+
+
+def test_each_sees_its_part_and_both_are_named(small_ring):
+    truth = [KICK, WEAK]
+    whole = {
+        "orbit": _orbit(small_ring, truth),
+        "dispersion": _dispersion(small_ring, truth),
+        "tunes": _tunes(small_ring, truth),
+        "turns": _turns(small_ring, truth),
+        "injection": simulate(small_ring, truth, shots=4, seed=1).measurement(),
+    }
+    diagnosis = diagnose(small_ring, whole)
+    assert diagnosis.verdict in ("named", "equivalent")
+    assert _found(diagnosis) == {(KICK.effect, KICK.element), (WEAK.effect, WEAK.element)}
+    amount, sigma = diagnosis.error(WEAK.effect, WEAK.element)
+    assert abs(amount - WEAK.amount) < 4 * sigma
+    assert sigma < 2e-4
+    shares = {f.remedy.effect: f.seen_by for f in diagnosis.findings}
+    for share in shares.values():
+        assert sum(share.values()) == pytest.approx(1.0)
+    assert shares[KICK.effect]["orbit"] > 0.9
+    assert shares[WEAK.effect]["turns"] > shares[WEAK.effect]["injection"]
+    assert diagnosis.fit_after.chi2_per_dof == pytest.approx(1.0, abs=0.1)
+    assert diagnosis.gap["heldout"]["after"]["chi2_per_dof"] < 1.3
+    assert [p.kind for p in diagnosis.parts] == [
+        "closed_orbit", "dispersion", "tunes", "turn_by_turn", "trajectory",
+    ]  # fmt: skip
+
+
+def test_turns_name_a_magnet_and_an_exchanged_monitor(small_ring):
+    diagnosis = diagnose(small_ring, _turns(small_ring, [WEAK, SWAPPED]))
+    assert diagnosis.kind == "turn_by_turn"
+    assert _found(diagnosis) == {("monitor_swap", "end_1"), (WEAK.effect, WEAK.element)}
+
+
+@pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])
+def test_a_sound_ring_is_nothing(small_ring, make):
+    diagnosis = diagnose(small_ring, make(small_ring, []))
+    assert diagnosis.verdict == "nothing"
+    if make is not _tunes:  # two readings
+        assert diagnosis.fit_after.chi2_per_dof == pytest.approx(1.0, abs=0.3)
+
+
+def _small_errors(ring, seed):
+    rng = np.random.default_rng(seed)
+    return [
+        Cause(name, place, float(rms * rng.standard_normal()))
+        for name, rms in background_rms({"all": None}).items()
+        for place in find(name).places(ring)
+    ]
+
+
+def test_a_fault_among_small_errors_by_turns_and_dispersion(small_ring):
+    truth = [*_small_errors(small_ring, 7), Cause("quadrupole_gradient", "QD::3", -0.03)]
+    both = {"turns": _turns(small_ring, truth), "dispersion": _dispersion(small_ring, truth)}
+    diagnosis = diagnose(small_ring, both)
+    assert ("quadrupole_gradient", "QD::3") in _found(diagnosis)
+    assert len(diagnosis.findings) == 1
+    assert 0.3 < diagnosis.priors["quadrupole_gradient"] / 1e-3 < 3
+
+
+def test_a_reference_cancels_what_was_there(small_ring):
+    small = _small_errors(small_ring, 11)
+    strong = Cause("corrector_kick_x", "v6", 1e-4)
+    before = {"orbit": _orbit(small_ring, small, 5)}
+    after = {"orbit": _orbit(small_ring, [*small, strong], 6)}
+    diagnosis = diagnose(small_ring, after, reference=before)
+    assert _found(diagnosis) == {("corrector_kick_x", "v6")}
+    same = diagnose(small_ring, after, reference=after)
+    assert not same.findings
+
+
+def test_the_command_takes_many_folders(small_ring, tmp_path):
+    from tmlattice.lattice import save_ring
+
+    save_ring(small_ring, tmp_path / "ring.json")
+    write_measurement(tmp_path / "turns", _turns(small_ring, [WEAK]))
+    write_measurement(tmp_path / "tunes", _tunes(small_ring, [WEAK]))
+    told = tmlattice(
+        "diagnose", "ring.json", "turns", "tunes", "--json", "d.json", "--out", "page",
+        cwd=tmp_path, check=0,
+    )  # fmt: skip
+    assert "QD::3" in told.stdout
+    assert "seen by" in told.stdout
+    document = json.loads((tmp_path / "d.json").read_text())
+    assert document["kind"] == "together"
+    assert [m["name"] for m in document["measurements"]] == ["turns", "tunes"]
+    assert set(document["findings"][0]["seen_by"]) == {"turns", "tunes"}
+    assert (tmp_path / "page" / "report.html").stat().st_size > 1000
+    assert (tmp_path / "page" / "readings.png").exists()
+
+
+def test_what_has_no_meaning_is_a_sentence(small_ring):
+    with pytest.raises(MeasurementError, match="'missing' has no meaning"):
+        diagnose(small_ring, _turns(small_ring, []), missing=True)
+    orbit = _orbit(small_ring, [])
+    unknown = ClosedOrbit(orbit=orbit.orbit, monitors=orbit.monitors)
+    with pytest.raises(MeasurementError, match="noise of a closed orbit is not known"):
+        diagnose(small_ring, unknown)

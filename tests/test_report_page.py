@@ -1,0 +1,171 @@
+"""The report in a real browser: Chromium, driven by playwright, without a network.
+
+Debian's package `chromium` and `pip install '.[test]'` are all that it takes.
+"""
+
+import shutil
+
+import pytest
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.machine.response import simulate_response
+from tmlattice.report.page import draw, page
+
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="playwright is not installed: pip install '.[test]'"
+)
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt install chromium")
+
+WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
+PHONE = {"width": 390, "height": 800}
+
+
+def written(diagnosis, folder):
+    file = folder / "report.html"
+    provenance = {**diagnosis.provenance, "measurement": "day_1"}
+    file.write_text(page(diagnosis, draw(diagnosis, folder), provenance), encoding="utf-8")
+    assert file.stat().st_size < 3e6
+    return file.as_uri()
+
+
+@pytest.fixture(scope="module")
+def first_turns(small_ring, tmp_path_factory):
+    data = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
+                    noise=2e-6).measurement()  # fmt: skip
+    return written(diagnose(small_ring, data), tmp_path_factory.mktemp("first_turns"))
+
+
+@pytest.fixture(scope="module")
+def response(small_ring, tmp_path_factory):
+    data = simulate_response(
+        small_ring, [WEAK], background={"quadrupole_gradient": 2e-3, "monitor_gain_x": 0.02},
+        engine="ocelot", progress=False,
+    ).measured  # fmt: skip
+    found = diagnose(small_ring, data, effects=["quadrupole_gradient", "monitor_gain_x",
+                                                "corrector_calibration"])  # fmt: skip
+    return written(found, tmp_path_factory.mktemp("response"))
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """A function that opens a page; whatever it complains of or asks the net for fails the test."""
+    wrong, contexts = [], []
+
+    def opening(address, **options):
+        context = browser.new_context(**options)
+        contexts.append(context)
+        tab = context.new_page()
+        tab.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+        tab.on("pageerror", lambda error: wrong.append(str(error)))
+        tab.on(
+            "request",
+            lambda asked: (
+                wrong.append(asked.url) if not asked.url.startswith(("file:", "data:")) else None
+            ),
+        )
+        tab.goto(address)
+        return tab
+
+    yield opening
+    for context in contexts:
+        context.close()
+    assert not wrong
+
+
+def headings(tab):
+    return tab.eval_on_selector_all("h2", "all => all.map(one => one.id)")
+
+
+def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turns):
+    tab = opened(first_turns)
+    assert headings(tab) == ["findings", "notes", "gap", "scan", "sensitivity", "provenance"]
+    answer = tab.inner_text("#answer")
+    for words in ("NAMED", "Culprit", "QD::5", "Place", "Gap", "Do next"):
+        assert words in answer
+    assert tab.locator("nav a").count() == 6
+    assert tab.locator(".figure .main-svg").first.is_visible()
+    assert tab.locator(".figure").count() == 4
+    for figure in ("plan", "scan"):
+        place = tab.locator(f'.figure[data-figure="data-{figure}"]')
+        place.scroll_into_view_if_needed()
+        tab.evaluate(  # the place of the culprit in the figure, where the mouse goes
+            """place => {
+                const named = trace => (trace.text || []).findIndex(x => x.includes("QD::5"));
+                const own = place.data.findIndex(trace => named(trace) >= 0);
+                const k = named(place.data[own]);
+                const { xaxis, yaxis } = place._fullLayout;
+                const box = place.getBoundingClientRect();
+                window.at = [box.x + xaxis._offset + xaxis.d2p(place.data[own].x[k]),
+                             box.y + yaxis._offset + yaxis.d2p(place.data[own].y[k])];
+            }""",
+            place.element_handle(),
+        )
+        x, y = tab.evaluate("window.at")
+        tab.mouse.move(x - 3, y - 3)
+        tab.mouse.move(x, y)
+        hover = place.locator(".hoverlayer .hovertext")
+        hover.first.wait_for(timeout=5000)
+        assert "QD::5" in hover.first.text_content()
+
+
+def test_zoom_changes_what_is_drawn(opened, first_turns):
+    tab = opened(first_turns)
+    place = tab.locator('.figure[data-figure="data-readings"]')
+    place.scroll_into_view_if_needed()
+    shown = "place => place._fullLayout.xaxis.range"
+    before = place.evaluate(shown)
+    box = place.locator(".xy .nsewdrag, .nsewdrag").first.bounding_box()
+    tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 20)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 25, steps=5)
+    tab.mouse.up()
+    tab.wait_for_function(
+        f"before => String(({shown})(document.querySelector("
+        "'.figure[data-figure=\"data-readings\"]'))) !== before",
+        arg=",".join(map(str, before)),
+    )
+
+
+def test_a_response_has_tables_that_are_sorted_and_copied(opened, response):
+    tab = opened(response, permissions=["clipboard-read", "clipboard-write"])
+    assert {"suspects", "notes", "gap", "steps", "optics", "errors"} <= set(headings(tab))
+    assert "QD::5" in tab.inner_text(".suspects")
+    table = tab.locator("table.sortable").first
+    column = "all => all.map(row => row.cells[2].textContent)"
+    for _ in range(2):
+        table.locator("th button").nth(2).click()
+    ascending = [float(text) for text in table.locator("tbody tr").evaluate_all(column) if text]
+    assert len(ascending) > 20
+    assert ascending == sorted(ascending)
+    table.locator("th button").nth(2).click()
+    descending = [float(text) for text in table.locator("tbody tr").evaluate_all(column) if text]
+    assert descending == ascending[::-1]
+    tab.locator("button.copy").first.click()
+    copied = tab.evaluate("navigator.clipboard.readText()").splitlines()
+    assert copied[0].startswith("name,s [m],")
+    assert len(copied) == len(table.locator("tbody tr").all()) + 1
+    assert any(line.startswith("QD::5,") for line in copied)
+
+
+@pytest.mark.parametrize("kind", ["first_turns", "response"])
+def test_page_fits_a_phone_dark_paper_and_a_reader_without_scripts(opened, kind, request):
+    address = request.getfixturevalue(kind)
+    tab = opened(address, viewport=PHONE, color_scheme="dark")
+    assert tab.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(24, 25, 27)"
+    drawn, still = tab.locator(".figure").first, tab.locator("#answer img")
+    assert (drawn.is_visible(), still.is_visible()) == (True, False)
+    tab.emulate_media(media="print")
+    assert (drawn.is_visible(), still.is_visible()) == (False, True)
+    assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    plain = opened(address, java_script_enabled=False)
+    assert plain.locator("#answer img").is_visible()

@@ -1,0 +1,108 @@
+"""Orbit, tunes and modes of a stored beam against AT, and their derivatives by differences."""
+
+import at
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import StoredBeam
+from tmlattice.effects import CATALOGUE, RingEffect, apply, find
+from tmlattice.errors import UnstableRingError
+from tmlattice.machine.at_engine import AtEngine
+
+WRONG = [
+    Cause("quadrupole_roll", "QF::2", 0.01),
+    Cause("quadrupole_offset_x", "QD::5", 1e-4),
+    Cause("quadrupole_offset_y", "QF::9", 1e-4),
+]
+"""An orbit through the sextupoles, and coupled planes: nothing is zero by symmetry."""
+
+
+@pytest.fixture(scope="module")
+def wrong(small_ring):
+    return apply(small_ring, WRONG)
+
+
+@pytest.fixture(scope="module")
+def beam(wrong):
+    return StoredBeam(ResponseModel(wrong))
+
+
+def _apart(a, b):
+    """Largest difference of modes [monitor, 2, mode], up to one complex factor a mode."""
+    left = []
+    for mode in (0, 1):
+        x, y = a[..., mode].ravel(), b[..., mode].ravel()
+        left.append(np.abs(y - x * (x.conj() @ y) / (x.conj() @ x)).max())
+    return max(left)
+
+
+def _hypotheses(ring):
+    for name, effect in CATALOGUE.items():
+        if isinstance(effect, RingEffect) and effect.power == 1:
+            places = effect.places(ring)
+            yield from ((name, place) for place in places[:: max(len(places) // 2, 1)][:2])
+
+
+def test_every_effect_vs_differences(wrong, beam):
+    hypotheses = list(_hypotheses(wrong))
+    assert len(hypotheses) > 30
+    moved = beam.moved(hypotheses)
+    for i, (name, place) in enumerate(hypotheses):
+        step = 1e-4 * find(name).largest
+        up, down = (
+            StoredBeam(ResponseModel(apply(wrong, [Cause(name, place, side * step)])))
+            for side in (1, -1)
+        )
+        orbit = (up.model.readings - down.model.readings) / (2 * step)
+        tunes = (up.tunes - down.tunes) / (2 * step)
+        modes = (up.modes - down.modes) / (2 * step)
+        # differences err by the square of the step, and by rounding where little moves
+        scale = [max(np.abs(x).max(), 1e-4) for x in (orbit, tunes, modes)]
+        assert_allclose(moved.orbit[i], orbit, atol=1e-5 * scale[0], err_msg=f"{name} {place}")
+        assert_allclose(moved.tunes[i], tunes, atol=1e-4 * scale[1], err_msg=f"{name} {place}")
+        clean = beam.modes
+        for mode in (0, 1):
+            E = clean[..., mode]
+            left = [d[..., mode] - E * np.vdot(E, d[..., mode]) / np.vdot(E, E)
+                    for d in (modes, moved.modes[i])]  # fmt: skip
+            assert np.abs(left[0] - left[1]).max() < 1e-4 * scale[2], f"{name} {place}"
+
+
+def test_tunes_and_modes_vs_at(small_ring):
+    """AT's coupled eigenvectors of its own tracked turn, about its own orbit."""
+    causes = WRONG[:1]  # AT's 4-d orbit has no energy of its own: none is moved
+    beam = StoredBeam(ResponseModel(apply(small_ring, causes)))
+    lattice = AtEngine(small_ring, causes).lattice()
+    lattice.disable_6d()
+    at_monitors = [i for i, e in enumerate(lattice) if isinstance(e, at.Monitor)]
+    turn, along = at.find_m44(lattice, refpts=at_monitors)
+    values, vectors = np.linalg.eig(turn)
+    order = [int(np.abs(np.angle(values) / (2 * np.pi) % 1 - q).argmin()) for q in beam.tunes]
+    theirs = np.angle(values[order]) / (2 * np.pi) % 1
+    assert_allclose(beam.tunes, theirs, atol=2e-6)  # integration steps of AT's magnets
+    modes = (along @ vectors[:, order])[:, [0, 2]]
+    assert (
+        _apart(modes / np.abs(modes).max(), beam.modes / np.abs(modes).max())
+        < 1e-4 * np.abs(beam.modes).max() / np.abs(modes).max()
+    )
+
+
+def test_a_changed_model_is_the_model_of_the_changed_ring(small_ring):
+    changed = apply(small_ring, WRONG)
+    made = ResponseModel(changed)
+    from_design = ResponseModel(small_ring).changed_to(changed)
+    assert_allclose(from_design.readings, made.readings, atol=1e-15)
+    assert_allclose(from_design.tangents, made.tangents, atol=1e-12)
+    some = list(_hypotheses(small_ring))[:12]
+    mine, theirs = (StoredBeam(model).moved(some) for model in (from_design, made))
+    assert_allclose(mine.orbit, theirs.orbit, rtol=1e-9, atol=1e-12)
+    assert _apart(mine.modes[0] + 1e-9, theirs.modes[0] + 1e-9) < 1e-6 * np.abs(mine.modes[0]).max()
+
+
+def test_an_unstable_ring_has_no_modes(small_ring):
+    strong = [Cause("family_gradient", "QF", 1.5)]
+    with pytest.raises(UnstableRingError):
+        StoredBeam(ResponseModel(apply(small_ring, strong), 4))

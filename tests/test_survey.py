@@ -1,0 +1,32 @@
+"""The ring from above, against AT's own geometry."""
+
+import at
+import pytest
+from at_ring import at_lattice
+from numpy.testing import assert_allclose
+
+from tmlattice.lattice.survey import survey
+
+
+@pytest.mark.parametrize("name", ["small_ring", "petra3"])
+def test_plan_matches_at(name, request):
+    """Element by element; AT's y points to the other side where it turns the other way."""
+    ring = request.getfixturevalue(name)
+    plan = survey(ring)
+    theirs, _ = at.get_geometry(at_lattice(ring))
+    assert len(theirs.x) == len(plan.ends)
+    assert_allclose(plan.ends[:, 0], theirs.x, atol=1e-9 * ring.length)
+    assert_allclose(abs(plan.ends[:, 1]), abs(theirs.y), atol=1e-9 * ring.length)
+
+
+def test_a_ring_closes_and_turns_to_the_right(petra3):
+    plan = survey(petra3)
+    assert_allclose(plan.ends[-1], plan.ends[0], atol=1e-3)  # of a diameter of 730 m
+    assert plan.ends[:, 1].min() < -700
+    assert plan.ends[:, 1].max() < 1
+
+
+def test_places_between_elements_lie_on_the_orbit(small_ring):
+    plan = survey(small_ring)
+    quadrupole = small_ring["QD::5"]
+    assert_allclose(plan.along(quadrupole.s, small_ring), plan.at(["QD::5"])[0], atol=1e-9)

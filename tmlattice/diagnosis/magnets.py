@@ -1,0 +1,70 @@
+"""Which elements of a ring are one magnet, which magnets share a supply, and where one may hide.
+
+>>> [own[0].name for own in magnets(ring, ("quadrupole",), powered=True)]
+"""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.slices import stem
+
+Array = NDArray[np.float64]
+
+STRAIGHT = 1.0
+"""m; where so much way lies between two magnets an insertion device may stand."""
+
+
+def families(names: Sequence[str]) -> tuple[list[str], Array]:
+    """Stems that more than one has, and who belongs to them, [name, family] of 0 and 1."""
+    stems = [stem(name) for name in names]
+    kinds = [kind for kind in dict.fromkeys(stems) if stems.count(kind) > 1]
+    return kinds, np.array([[float(own == kind) for kind in kinds] for own in stems]).reshape(
+        len(names), len(kinds)
+    )
+
+
+def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:
+    """Magnets of some kinds, each with its pieces; pieces that are edges of other magnets are none.
+
+    Args:
+        ring: where they stand.
+        kinds: of elements.
+        powered: those alone that have a gradient.
+    """
+    found: dict[str, tuple[Element, ...]] = {}
+    for element in ring.elements:
+        if element.kind in kinds and (element.k1 != 0 or not powered):
+            pieces = [ring[name] for name in ring.pieces(element.name)]
+            if max(pieces, key=lambda piece: piece.length).kind not in kinds:
+                continue
+            own = [e for e in pieces if e.kind in kinds and (e.k1 != 0 or not powered)]
+            found.setdefault(own[0].name, tuple(own))
+    return list(found.values())
+
+
+def straights(ring: Ring) -> list[Element]:
+    """Of every long way without a magnet the marker that is nearest to its middle, or the longest
+    drift where no marker stands."""
+    found, within, begin = list[Element](), list[Element](), 0.0
+    for element in ring.elements:
+        if not element.is_magnet or element.kind in ("hcorrector", "vcorrector"):
+            within.append(element)
+            continue
+        end = element.s - element.length / 2
+        if end - begin > STRAIGHT:
+            found += _middle(within, (begin + end) / 2)
+        within, begin = [], element.s + element.length / 2
+    if ring.length - begin > STRAIGHT:
+        found += _middle(within, (begin + ring.length) / 2)
+    return found
+
+
+def _middle(within: Sequence[Element], middle: float) -> list[Element]:
+    markers = [e for e in within if e.kind == "marker"]
+    drifts = [e for e in within if e.kind == "drift" and e.length >= STRAIGHT / 2]
+    if markers:
+        return [min(markers, key=lambda e: abs(e.s - middle))]
+    return [max(drifts, key=lambda e: e.length)] if drifts else []

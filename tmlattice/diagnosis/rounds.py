@@ -1,0 +1,330 @@
+"""Rounds of Gauss and Newton of a dense fit, what they are solved from, and what they leave.
+
+>>> state = settle(bend(jump(allow(state, families))))
+>>> there = linear(state, 0); marginal(there, ["gradient"])
+"""
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families import Family
+from tmlattice.diagnosis.state import Kept, State
+from tmlattice.inference.normal import Normal, normal_equations, solve
+from tmlattice.inference.priors import Group
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
+
+BAD = 5.0
+"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+FEW = 4
+"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+TYPICAL = 10.0
+"""The median misfit of all columns counts as so many readings of each one's own."""
+ROUNDS = 12
+"""Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
+GAIN = 3e-3
+"""Share of the cost that a round has to gain for another one."""
+EACH = 4
+"""Rounds of EM for the priors in a round of the fit."""
+LEARN = 10
+"""Rounds of EM where evidence counts: the priors of what is not there fall slowly."""
+RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
+"""How often a round that went astray is repeated; by what trust falls then and grows else, and to
+how much at most."""
+STILL = 0.05
+"""Share of what is trusted by which the ring moves, in the mean, before rows are taken anew."""
+
+
+def _ring(state: State) -> dict[str, Array]:
+    """The ring's numbers, in units of what a round may move them by."""
+    return {f.variable: state.values[f.variable] / f.trust
+            for f in state.families if f.per == "ring"}  # fmt: skip
+
+
+def _rows(state: State, family: Family) -> Kept:
+    """Of a variable of the ring: those that stand, or new ones."""
+    ring, gain = _ring(state), state.at.gain(family.block)
+    scale = 1 + state.at.errors.calibration
+    kept = state.kept.get(family.variable)
+    if kept is not None and kept.at.keys() == ring.keys():
+        moved = np.concatenate([ring[name] - kept.at[name] for name in ring])
+        if np.sqrt(np.mean(moved**2)) < STILL and (kept.scale != 0).all():
+            return kept
+    return Kept(family.rows(state.at, state.values[family.variable]), gain, scale, ring)
+
+
+def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
+    """By what rows that stand are to be multiplied: monitors and correctors have moved."""
+    if (gain == kept.gain).all() and (scale == kept.scale).all():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = gain / kept.gain * (scale / kept.scale)[:, None]
+    return np.where(np.isfinite(share), share, 1.0)
+
+
+class Linear(NamedTuple):
+    """The readings of one block where the fit stands.
+
+    Parameters are those of the monitors, x and y of each; of the columns; and of the ring.
+    """
+
+    normal: Normal
+    start: Array
+    trust: Array
+    by_monitor: Array
+    by_column: Array
+    by_ring: Array
+    where: Mapping[str, slice]
+    groups: tuple[Group, ...]
+    kept: Mapping[str, Kept]
+
+
+def weight(state: State, block: int) -> Array:
+    """1 / variance of the readings that are fitted, [column, monitor]."""
+    data, split = state.data, state.split
+    use = np.isfinite(data.pick(data.orbits, block)) & state.good
+    use[:-1] &= state.fitted[:-1, None]
+    use[-1] &= split.half[-1]
+    if state.exploring:
+        use[-1] &= ~split.inner_rf
+    variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
+    return np.where(use, 1 / variance, 0.0)
+
+
+def linear(state: State, block: int) -> Linear:
+    """Normal equations where the fit stands, the parameters there, priors, trusted changes."""
+    data, at = state.data, state.at
+    columns, monitors = data.shape
+    families = state.of_block(block)
+    where: dict[str, slice] = {}
+    rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
+    ring: list[Array] = []
+    kept: dict[str, Kept] = {}
+    end = 2 * monitors + columns
+    start, trust = [np.zeros(end)], [np.ones(end)]
+    for family in {f.variable: f for f in families}.values():
+        values = state.values[family.variable]
+        if family.per == "ring":
+            stands = kept[family.variable] = _rows(state, family)
+            share = _now(stands, at.gain(block), 1 + at.errors.calibration)
+            slopes = stands.rows if share is None else stands.rows * share
+            where[family.variable] = slice(end, end + len(values))
+            end += len(values)
+            start.append(values)
+            trust.append(np.full(len(values), family.trust))
+            ring.append(slopes)
+        else:
+            slopes = family.rows(at, values)
+            low = 0 if family.per == "monitor" else 2 * monitors
+            mine = where[family.variable] = slice(low, low + len(values))
+            start[0][mine], trust[0][mine] = values, family.trust
+            rows[family.per] = slopes
+    by_ring = ring[0] if len(ring) == 1 else np.concatenate([np.zeros((0, *data.shape)), *ring])
+    normal = normal_equations(
+        data.pick(at.left, block), weight(state, block), data.plane_of(block), rows["monitor"],
+        rows["column"], by_ring,
+    )  # fmt: skip
+    groups = []
+    for family in families:
+        for own in family.groups(data):
+            basis = np.zeros((end, own.basis.shape[1]))
+            basis[where[family.variable]] = own.basis
+            known = state.groups.get(own.name, own)
+            groups.append(replace(own, basis=basis, rms=known.rms, each=known.each))
+    return Linear(
+        normal, np.concatenate(start), np.concatenate(trust), rows["monitor"], rows["column"],
+        by_ring, where, tuple(groups), kept,
+    )  # fmt: skip
+
+
+def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
+    """What the readings say of some variables of the ring, all others with their priors taken out.
+
+    Args:
+        there: where the fit stands.
+        names: of variables.
+
+    Returns:
+        Information, and score with all these numbers at zero: their likelihood is
+        exp(score x - x information x / 2).
+    """
+    A = there.normal.matrix
+    pull = there.normal.vector + A @ there.start
+    own = np.concatenate([np.arange(len(A))[there.where[name]] for name in names])
+    spread = np.concatenate([group.basis * group.scale for group in there.groups], axis=1)
+    spread = spread[:, ~spread[own].any(axis=0)]
+    inside = spread.T @ A @ spread + np.eye(spread.shape[1])
+    across = A[own] @ spread
+    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ pull]))
+    information = A[np.ix_(own, own)] - across @ taken[:, :-1]
+    return (information + information.T) / 2, pull[own] - across @ taken[:, -1]
+
+
+class Moved(NamedTuple):
+    """A state after a round, and the cost that the round was to lessen, before and after."""
+
+    state: State
+    before: float
+    after: float
+
+
+def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Moved:
+    """Solve the readings of one block, and move.
+
+    Args:
+        state: where it stands.
+        block: 0 in-plane, 1 coupling.
+        there: `linear` of that block where it stands.
+        bold: factor of every trusted change: small where the last rounds went astray.
+    """
+    found = solve(there.normal, there.groups, there.start, bold * there.trust, rounds=EACH)
+    family = {f.variable: f for f in state.families}
+    values = {name: family[name].bounded(found.values[at]) for name, at in there.where.items()}
+    groups = {group.name: group for group in found.groups}
+    weights = weight(state, block)
+    then = replace(state, groups={**state.groups, **groups}).moved({**state.values, **values})
+
+    def cost(at: State) -> float:
+        left = np.where(weights > 0, state.data.pick(at.at.left, block), 0.0)
+        penalty = sum(
+            _penalty([g for g in found.groups if g.basis[rows].any()], rows, at.values[name])
+            for name, rows in there.where.items()
+        )
+        return float(np.sum(weights * left**2)) + penalty
+
+    return Moved(then, cost(state), cost(then))
+
+
+def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
+    """What the priors of one variable, which add up, ask for its values."""
+    spread = np.concatenate([group.basis[rows] * group.scale for group in groups], axis=1)
+    return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
+
+
+def settle(
+    state: State, blocks: Sequence[int] = (1, 0), most: int = ROUNDS, gain: float = GAIN
+) -> State:
+    """Rounds until none gains any more, none of which may make things worse.
+
+    As Levenberg and Marquardt have it, but that what is trusted is a change of each number by
+    itself: a round that went astray is taken back and repeated with less trust.
+
+    Args:
+        state: where it stands.
+        blocks: that move, in this order.
+        most: rounds of each block.
+        gain: share of the cost that a round has to gain for another one.
+    """
+    bold = dict.fromkeys(blocks, 1.0)
+    for turn in range(most):
+        gained = 0.0
+        for block in blocks:
+            if not state.of_block(block):
+                continue
+            there = linear(state, block)
+            state = replace(state, kept={**state.kept, **there.kept})
+            for _ in range(RETRIES):
+                moved = one_round(state, block, there, bold[block])
+                if moved.after <= moved.before:
+                    break
+                bold[block] /= ASTRAY
+            if moved.after > moved.before:
+                continue
+            bold[block] = min(BOLDER * bold[block], BOLDEST)
+            gained = max(gained, (moved.before - moved.after) / max(moved.after, 1e-300))
+            state = moved.state
+            for seen in (0, 1):
+                if state.of_block(seen):
+                    state = look(state, seen)
+        log.info(
+            "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
+        )
+        if gained < gain:
+            break
+    return state
+
+
+def linear_evidence(
+    there: Linear, gone: Collection[str] = (), rounds: int = LEARN
+) -> tuple[float, dict[str, Array]]:
+    """Log evidence that priors and readings have of one block where the fit stands, linear about
+    it, up to a constant; and the values that are the likeliest.
+
+    Args:
+        there: where the fit stands.
+        gone: priors of families that are not there, by name.
+        rounds: of EM for the priors.
+    """
+    left = [group for group in there.groups if group.name not in gone]
+    found = solve(there.normal, left, there.start, rounds=rounds) if left else None
+    nothing = np.zeros_like(there.start)
+    moved = (nothing if found is None else found.values) - there.start
+    total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
+    if found is None:
+        return total, {name: nothing[rows] for name, rows in there.where.items()}
+    total += found.occam
+    for rows in there.where.values():
+        groups = [g for g in found.groups if g.basis[rows].any()]
+        if groups:
+            total -= 0.5 * _penalty(groups, rows, found.values[rows])
+    return total, {name: found.values[rows] for name, rows in there.where.items()}
+
+
+def log_evidence(state: State, good: Flags) -> float:
+    """Of what is fitted, of the readings of some monitors, both blocks, what the model lacks and
+    the priors at their likeliest; up to a constant of the data."""
+    total = 0.0
+    for block in (0, 1):
+        state = replace(look(state, block), good=good)
+        weights = weight(state, block)
+        use = weights > 0
+        left = np.where(use, state.data.pick(state.at.left, block), 0.0)
+        total += 0.5 * float(np.log(weights[use]).sum() - np.sum(weights * left**2))
+        if state.of_block(block):
+            there = linear(state, block)
+            total += linear_evidence(there)[0]
+    return total
+
+
+def look(state: State, block: int) -> State:
+    """What the model lacks now; and the monitors that are bad, their own gains apart."""
+    data = state.data
+    use = weight(state, block) > 0
+    left = np.where(use, data.pick(state.at.left, block), np.nan)[:-1]
+    typical = float(np.nanmedian(np.abs(left[:, state.good]))) / 0.6745
+    noise = float(np.median(data.noise))
+    squares = np.full(data.shape[0], typical**2)  # the RF's readings are few
+    shared = TYPICAL * typical**2 + np.nansum(left**2, axis=1)
+    squares[:-1] = shared / (TYPICAL + use[:-1].sum(axis=1))
+    lacking = state.lacking.copy()
+    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
+    good = state.good if block else _good_monitors(state)
+    return replace(state, lacking=lacking, good=good)
+
+
+def _good_monitors(state: State) -> Flags:
+    data = state.data
+    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
+    ratio = np.zeros(data.shape[1])
+    for p in (0, 1):
+        rows = state.fitted & (data.plane == p)
+        if rows.sum() < FEW:
+            continue
+        u, d = read[rows], orbits[rows]
+        seen = np.isfinite(d)
+        d = np.where(seen, d, 0)
+        u = np.where(seen, u, 0)
+        gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
+        count = np.maximum(seen.sum(axis=0), 1)
+        rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
+        rms[(seen.sum(axis=0) == 0) | (abs(gain) < 0.2)] = np.inf
+        ratio = np.maximum(ratio, rms / np.median(rms))
+    return np.asarray(ratio <= BAD)

@@ -1,0 +1,157 @@
+"""Few reasons behind many numbers: levels of sharing, weighed by evidence.
+
+>>> told = explain(information, score, candidates, variance, slab=0.01)
+>>> [(candidates.names[own.candidate], own.amount, own.sigma) for own in told.reasons]
+
+Many numbers (gradients, say) are known with a covariance, and each scatters by itself. A candidate
+moves some of them together: all, a family, one. Which few candidates are there is found by adding
+the one that gains most evidence, taking out what the others make needless, and exchanging. All is
+linear and Gaussian, so that every amount comes with the error that the scatter leaves it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
+
+Array = NDArray[np.float64]
+
+CLEAR = 25.0
+"""Chi-square that a reason has to have: five standard deviations."""
+SWEEPS = 5
+"""Times that every reason is exchanged against its rivals."""
+RIVAL = 3.0
+"""Log evidence by which a rival may be behind to be told beside a reason: a twentieth."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One candidate that is there.
+
+    Attributes:
+        candidate: which one.
+        amount, sigma: with the scatter of single numbers in the error.
+        statistic: chi-square that it explains beside all others.
+        rivals: other candidates in its place, with their probabilities; the first is itself.
+    """
+
+    candidate: int
+    amount: float
+    sigma: float
+    statistic: float
+    rivals: tuple[tuple[int, float], ...]
+
+
+class Levels:
+    """Candidates weighed beside each other.
+
+    Args:
+        information: J^T W J of the numbers, nuisances taken out, [number, number].
+        score: J^T W y with all numbers at zero, [number].
+        candidates: what each moves, [number, candidate].
+        variance: of the scatter of each number, or the whole covariance, [number] or
+            [number, number].
+        slab: prior rms of each candidate's amount, [candidate].
+        cost: log odds against each candidate, beside the number of them, [candidate].
+    """
+
+    def __init__(
+        self,
+        information: Array,
+        score: Array,
+        candidates: Array,
+        variance: Array,
+        slab: Array,
+        cost: Array | None = None,
+    ) -> None:
+        scatter = np.diag(variance) if variance.ndim == 1 else variance
+        factor = lu_factor(np.eye(len(score)) + information @ scatter)
+        self.slab = slab
+        self.cost = np.log(len(slab)) + (np.zeros(len(slab)) if cost is None else cost)
+        self.score = candidates.T @ lu_solve(factor, score)
+        self.information = candidates.T @ lu_solve(factor, information) @ candidates
+        self.information = (self.information + self.information.T) / 2
+
+    def fitted(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Amounts and covariance of some candidates together."""
+        at = np.array(chosen, dtype=int)
+        inside = self.information[np.ix_(at, at)] + np.diag(self.slab[at] ** -2.0)
+        covariance = np.linalg.inv(inside)
+        return covariance @ self.score[at], covariance
+
+    def gains(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Log evidence of one more of each candidate beside some, and its chi-square."""
+        score, own = self.score, np.diag(self.information)
+        if len(chosen):
+            amounts, covariance = self.fitted(chosen)
+            across = self.information[:, list(chosen)]
+            score = score - across @ amounts
+            own = own - np.einsum("ij,jk,ik->i", across, covariance, across)
+        own = np.maximum(own, 0.0)
+        spread = own + self.slab**-2.0
+        gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
+        square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
+        seen = own > 1e-6 * np.diag(self.information)  # else the chosen ones make it up
+        gain = np.where(seen, gain, 0.0) - self.cost
+        gain[list(chosen)] = -np.inf
+        return gain, np.where(seen, square, 0.0)
+
+    def choose(self, most: int, clear: float = CLEAR) -> list[int]:
+        """The candidates that are there."""
+        chosen: list[int] = []
+        while len(chosen) < most:
+            gain, square = self.gains(chosen)
+            gain[square < clear] = -np.inf
+            best = int(np.argmax(gain))
+            if not gain[best] > 0:
+                break
+            chosen = self._pruned([*chosen, best], clear)
+            if best not in chosen:
+                break
+        for _ in range(SWEEPS):
+            before = list(chosen)
+            for own in before:
+                others = [c for c in chosen if c != own]
+                gain, square = self.gains(others)
+                best = int(np.argmax(np.where(square < clear, -np.inf, gain)))
+                if gain[best] > gain[own] + 1e-9:
+                    chosen = [*others, best]
+            chosen = self._pruned(chosen, clear)
+            if set(chosen) == set(before):
+                break
+        return chosen
+
+    def _pruned(self, chosen: list[int], clear: float) -> list[int]:
+        """Without those that the others make needless, the least needed first."""
+        while chosen:
+            worth = []
+            for own in chosen:
+                gain, square = self.gains([c for c in chosen if c != own])
+                worth.append(gain[own] if square[own] >= clear else -np.inf)
+            least = int(np.argmin(worth))
+            if worth[least] > 0:
+                break
+            chosen = [c for i, c in enumerate(chosen) if i != least]
+        return chosen
+
+    def reasons(self, chosen: Sequence[int]) -> list[Reason]:
+        """With amounts, errors and rivals, by falling chi-square."""
+        if not chosen:
+            return []
+        amounts, covariance = self.fitted(chosen)
+        found = []
+        for i, own in enumerate(chosen):
+            gain, square = self.gains([c for c in chosen if c != own])
+            near = [int(c) for c in np.flatnonzero(gain > gain[own] - RIVAL) if c != own]
+            odds = np.exp(gain[[own, *near]] - gain[own])
+            told = sorted(zip([own, *near], odds / odds.sum(), strict=True),
+                          key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
+            found.append(
+                Reason(
+                    own, float(amounts[i]), float(np.sqrt(covariance[i, i])), float(square[own]),
+                    tuple((c, float(p)) for c, p in told),
+                )
+            )  # fmt: skip
+        return sorted(found, key=lambda reason: -reason.statistic)

@@ -1,0 +1,154 @@
+"""A stored beam in AT: its turns after a kick, of one particle or of many, and its tunes."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import at
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import UnstableRingError
+from tmlattice.machine import at_orbit
+from tmlattice.machine.at_engine import AtEngine, Settings
+
+Array = NDArray[np.float64]
+
+TRANSVERSE, ALL = (0, 1, 2, 3), (0, 1, 2, 3, 4, 5)
+ENERGY = 1e-3
+"""Half the step in energy of a chromaticity."""
+AT_ONCE = 2**21
+"""States that are read at once: 100 MB, whatever the number of particles and turns."""
+
+
+@dataclass(frozen=True)
+class Beam:
+    """Particles of a stored beam.
+
+    Attributes:
+        particles: how many; 1 is the beam's middle alone, which does not decohere.
+        emittance: of the two modes, m rad.
+        spread: rms relative energy deviation.
+    """
+
+    particles: int = 1
+    emittance: tuple[float, float] = (0.0, 0.0)
+    spread: float = 0.0
+
+
+def turns_of(
+    engine: AtEngine,
+    kicked: Array,
+    turns: int,
+    settings: Settings,
+    beam: Beam,
+    random: np.random.Generator,
+) -> Array:
+    """Where the middle of a stored beam is after a kick, [turn, monitor, 2], m.
+
+    It is stored on the closed orbit of the ring as it is, with the RF where there is one, and
+    matched to it. Lost particles no longer count; the beam is lost (NaN) with half of them.
+
+    Args:
+        engine: the ring.
+        kicked: what the kick changes at the start of the ring, x, px, y, py, m and rad, [4].
+        turns: how many.
+        settings: of the shot.
+        beam: its particles.
+        random: of the particles.
+
+    Raises:
+        UnstableRingError: no closed orbit, or no stable motion about it.
+    """
+    line, with_rf, late = engine.stored_line(settings)
+    state = _orbit(engine, line, late)
+    rf = any(isinstance(element, at.RFCavity) for element in with_rf)
+    if rf:
+        state = at_orbit.closed(functools.partial(_pass, engine, with_rf), state, ALL, late)
+    states = np.tile(state, (beam.particles, 1))
+    if beam.particles > 1:
+        states += _matched(engine, with_rf, state, rf, beam, random)
+    states[:, :4] += kicked
+    moving = np.asfortranarray(states.T)
+    readings = np.empty((turns, len(engine.ring.monitors), 2))
+    block = max(AT_ONCE // (beam.particles * len(engine.ring.monitors)), 1)
+    for first in range(0, turns, block):
+        number = min(block, turns - first)
+        seen = engine.run(with_rf, moving.T, number, moving, first)
+        alive = np.isfinite(seen[..., 0]).mean(axis=0)
+        mean = np.nansum(seen, axis=0) / np.maximum(alive * beam.particles, 1)[..., None]
+        readings[first : first + number] = np.where(alive[..., None] > 0.5, mean, np.nan)
+    return readings
+
+
+def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
+    """Tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode].
+
+    Raises:
+        UnstableRingError: no closed orbit, or no tune.
+    """
+    line, _, late = engine.stored_line(settings)
+    state = _orbit(engine, line, late)
+    turn = functools.partial(_pass, engine, line)
+    tune = _tunes(turn, state)
+    slopes = []
+    for step in (ENERGY, -ENERGY):
+        other = at_orbit.closed(turn, state + step * np.eye(6)[4], TRANSVERSE)
+        slopes.append((_tunes(turn, other) - tune + 0.5) % 1 - 0.5)
+    return tune, (slopes[0] - slopes[1]) / (2 * ENERGY)
+
+
+def _orbit(engine: AtEngine, line: list[Any], late: float) -> Array:
+    """The stored beam's state at the start of the line, without RF, [6]."""
+    turn = functools.partial(_pass, engine, line)
+    start, solve = at_orbit.stored(turn)
+    return at_orbit.settle(turn, start, solve, late)[0] if late else start
+
+
+def _pass(engine: AtEngine, line: list[Any], beam: Array) -> Array:
+    """Readings of the first of the states [6, shot], which move to the line's end."""
+    return np.asarray(engine.run(line, beam.T, 1, beam)[0, 0])
+
+
+def _tunes(turn: at_orbit.Turn, state: Array) -> Array:
+    _, eigenvalues = _modes(at_orbit.one_turn(turn, state)[:4, :4])
+    return np.asarray(np.angle(eigenvalues) / (2 * np.pi) % 1)
+
+
+def _modes(matrix: Array) -> tuple[Array, Any]:
+    """Normalised directions and eigenvalues of a turn, modes in the order of x, y, z."""
+    try:
+        directions, eigenvalues = at.a_matrix(matrix)
+    except at.AtError:
+        raise UnstableRingError("the ring is unstable about its closed orbit: no tune") from None
+    if np.abs(np.abs(eigenvalues) - 1).max() > 1e-2:
+        raise UnstableRingError("the ring is unstable about its closed orbit: no tune")
+    return np.asarray(directions), eigenvalues
+
+
+def _matched(
+    engine: AtEngine,
+    line: list[Any],
+    state: Array,
+    rf: bool,
+    beam: Beam,
+    random: np.random.Generator,
+) -> Array:
+    """Deviations of particles from the middle, Gaussian and of mean 0, [particle, 6].
+
+    With the RF they fill its bucket, without each keeps its energy, on the orbit of that energy.
+    """
+    matrix = at_orbit.one_turn(functools.partial(_pass, engine, line), state)
+    drawn = random.standard_normal((beam.particles, 6))
+    drawn -= drawn.mean(axis=0)
+    sizes = np.sqrt(np.repeat([*beam.emittance, 0.0], 2))
+    if rf:
+        directions, _ = _modes(matrix)
+        sizes[4:] = beam.spread / np.hypot(directions[4, 4], directions[4, 5])
+    else:
+        directions = np.zeros((6, 6))
+        directions[:4, :4] = _modes(matrix[:4, :4])[0]
+        directions[:4, 4] = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 4])
+        directions[4, 4] = 1.0
+        sizes[4:] = beam.spread, 0.0
+    return np.asarray((drawn * sizes) @ directions.T)

@@ -1,0 +1,109 @@
+"""What changed between two orbit responses of one ring, as a measurement of its own.
+
+>>> there, change = response_change(data_before, errors, data_after)
+>>> response_data(there, change).orbits            # the model before, and what changed since
+
+What the model of the first measurement lacks is in the second one too: it cancels in their
+difference. So the difference is put on top of what the model with the errors of the first says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.effects import Cause, apply
+from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.orbit_response import Errors, ResponseData
+
+Array = NDArray[np.float64]
+
+LEAST = 3
+"""Monitors, and correctors, that both measurements have at least."""
+
+
+def alike(
+    ring: Ring, before: OrbitResponse, after: OrbitResponse
+) -> tuple[OrbitResponse, OrbitResponse]:
+    """The correctors and monitors that both have, in the order of the first.
+
+    Raises:
+        MeasurementError: hardly any, or other planes.
+        UnknownNameError: one that the ring does not have.
+    """
+    before, after = (_as_the_ring_names_them(ring, one) for one in (before, after))
+    columns = [name for name in before.correctors if name in set(after.correctors)]
+    monitors = [name for name in before.monitors if name in set(after.monitors)]
+    for what, own, all_of in (
+        ("correctors", columns, after.correctors), ("monitors", monitors, after.monitors),
+    ):  # fmt: skip
+        if len(own) < max(LEAST, len(all_of) // 4):
+            raise MeasurementError(
+                f"the reference shares {len(own)} of {len(all_of)} {what}: it is not of this "
+                "machine; give one with the same names"
+            )
+    first, second = (one.select(columns, monitors) for one in (before, after))
+    other = [c for c, a, b in zip(columns, first.planes, second.planes, strict=True) if a != b]
+    if other:
+        raise MeasurementError(f"corrector '{other[0]}' kicks in another plane in the reference")
+    return first, second
+
+
+def _as_the_ring_names_them(ring: Ring, measured: OrbitResponse) -> OrbitResponse:
+    monitors, correctors = (
+        tuple(ring[name].name for name in names)
+        for names in (measured.monitors, measured.correctors)
+    )
+    return replace(measured, monitors=monitors, correctors=correctors)
+
+
+def response_change(
+    before: ResponseData, errors: Errors, after: ResponseData
+) -> tuple[Ring, OrbitResponse]:
+    """The ring of the first measurement, and what the second would have been in it.
+
+    Args:
+        before: of the design; correctors and monitors as in `after`.
+        errors: of ring, monitors and correctors, fitted to it.
+        after: the second measurement.
+
+    Returns:
+        The design with the ring's errors and the correctors' rolls; and a measurement by perfect
+        monitors, with steps as the correctors really made them: the ring's response, and on top of
+        it the difference of the two.
+    """
+    columns = before.measured.correctors
+    mend = np.linalg.inv(errors.monitors)
+    scale = (before.kicks / after.kicks)[:, None, None]
+    change = np.einsum("mij,cmj->cmi", mend, after.orbits * scale - before.orbits)
+    noise = np.hypot(before.noise, after.noise * np.abs(np.median(scale)))
+    noise = np.sqrt(np.einsum("mij,mj->mi", mend**2, noise**2))
+    rolls = _rolls(columns, errors.roll)
+    ring = apply(before.ring, (*errors.ring, *rolls))
+    kicks = before.kicks[:-1] * (1 + errors.calibration[:-1])
+    model = ResponseModel(ring)
+    response = model.response(columns)[:, before.at] * kicks[:, None, None]
+    rf = before.measured.rf
+    if rf is not None and rf.orbit is not None:
+        orbit = model.rf_change(before.kicks[-1])[before.at]
+        rf = replace(rf, orbit=orbit + change[-1])
+    measured = replace(
+        before.measured,
+        kicks=kicks,
+        response=response + change[:-1],
+        noise=noise,
+        rf=rf,
+    )
+    return ring, measured
+
+
+def _rolls(columns: Sequence[str], roll: Array) -> list[Cause]:
+    return [
+        Cause("corrector_roll", name, float(value))
+        for name, value in zip(columns, roll, strict=False)
+        if value
+    ]

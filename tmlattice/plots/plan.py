@@ -1,0 +1,115 @@
+"""The ring from above, with what was found."""
+
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.lattice.survey import Survey, survey
+from tmlattice.plots.names import brief
+from tmlattice.plots.strip import COLOURS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Small:
+    """What is drawn small, beside the orbit: by so much of the ring's size, outside positive."""
+
+    marker: str
+    colour: str
+    beside: float
+
+
+SMALL = {"monitor": Small("o", "tab:cyan", 0.02), "corrector": Small("^", "tab:orange", -0.02)}
+"""By kind."""
+
+CULPRIT, SUSPECT = "#d1105a", "#c58a00"
+
+
+def groups(diagnosis: Diagnosis) -> dict[str, list[int]]:
+    """The elements that are drawn, by kind: their places in the ring's order."""
+    drawn: dict[str, list[int]] = {}
+    for i, element in enumerate(diagnosis.ring.elements):
+        kind = "corrector" if element.kind in ("hcorrector", "vcorrector") else element.kind
+        if kind in COLOURS or kind in SMALL:
+            drawn.setdefault(kind, []).append(i)
+    return drawn
+
+
+def beside(plan: Survey, kind: str, places: list[int]) -> Array:
+    """Where elements are drawn, [element, (x, y)], m: bends turn right, so outside is left."""
+    off = SMALL[kind].beside * float(np.ptp(plan.ends, axis=0).max()) if kind in SMALL else 0.0
+    heading = plan.heading[places]
+    return plan.middle[places] + off * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+
+
+def place_of(finding: Finding, diagnosis: Diagnosis, plan: Survey) -> Array | None:
+    """Where a finding stands, (x, y), m; None where it has no place."""
+    if finding.s is not None:
+        return plan.along(finding.s, diagnosis.ring)
+    if finding.where is None or finding.effect is not None:
+        return None
+    return plan.along(float(np.mean(finding.where)), diagnosis.ring)
+
+
+def inwards(place: Array, plan: Survey) -> tuple[str, str]:
+    """Where beside a place its name has room: towards the middle of the ring."""
+    away = place - plan.ends.mean(axis=0)
+    side = "left" if away[0] > 0 else "right"
+    if abs(away[1]) > abs(away[0]):
+        return ("bottom" if away[1] > 0 else "top"), side
+    return "middle", side
+
+
+def label(number: int, finding: Finding) -> str:
+    """A finding's number and name."""
+    return f"{number}. {brief(finding.element or 'unnamed')}"
+
+
+def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
+    """The ring from above: magnets along the orbit, monitors and correctors small, culprits marked.
+
+    Args:
+        diagnosis: of `diagnose`.
+        ax: where to draw; else a new one.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
+    plan = survey(diagnosis.ring)
+    ax.plot(*plan.ends.T, color="0.7", linewidth=0.8, zorder=1)
+    for kind, places in groups(diagnosis).items():
+        if kind in SMALL:
+            look, at = SMALL[kind], beside(plan, kind, places)
+            ax.plot(*at.T, look.marker, color=look.colour, ms=1.5, zorder=3, label=f"{kind}s")
+            continue
+        arcs = [(plan.ends[i], plan.middle[i], plan.ends[i + 1]) for i in places]
+        lines = LineCollection(arcs, colors=COLOURS[kind], linewidths=3, label=f"{kind}s")
+        ax.add_collection(lines)
+    for number, finding in enumerate(diagnosis.findings, 1):
+        place = place_of(finding, diagnosis, plan)
+        if place is None:
+            continue
+        ax.plot(*place, "o", ms=16, mfc="none", mec=CULPRIT, mew=2.2, zorder=5)
+        high, side = inwards(place, plan)
+        off = {"left": -12, "right": 12, "top": 12, "bottom": -12, "middle": 0}
+        ax.annotate(
+            label(number, finding), (place[0], place[1]),
+            xytext=(off[side], off[high]), textcoords="offset points",
+            ha="right" if side == "left" else "left",
+            va={"top": "bottom", "bottom": "top"}.get(high, "center"),
+            color=CULPRIT, fontweight="bold", zorder=6,
+        )  # fmt: skip
+    for suspect in diagnosis.suspects:
+        at = plan.at([suspect.element])[0]
+        ax.plot(*at, "o", ms=12, mfc="none", mec=SUSPECT, mew=1.5, zorder=4)
+    ax.set_aspect("equal")
+    ax.margins(0.06)
+    ax.set_xlabel("x [m]")
+    ax.set_ylabel("y [m]")
+    ax.legend(fontsize="x-small", frameon=False, loc="center")
+    return ax

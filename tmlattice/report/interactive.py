@@ -1,0 +1,402 @@
+"""Figures that one can hover and zoom, for plotly.js in the page: plain dictionaries.
+
+The same figures as those of `tmlattice.plots`, whose pictures stand in the page where it is printed
+or where scripts are off. The colours "@ink" and "@faint" follow the reader's light or dark page.
+
+>>> figures(diagnosis)["scan"]["layout"]["xaxis"]["title"]["text"]
+"""
+
+from collections.abc import Iterable, Sequence
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_hex
+from numpy.typing import ArrayLike
+
+from tmlattice.diagnosis.result import Diagnosis, PartView
+from tmlattice.effects import find
+from tmlattice.lattice import Ring
+from tmlattice.lattice.survey import survey
+from tmlattice.plots import plan as plan_view
+from tmlattice.plots import strip as strip_view
+from tmlattice.plots.diagnosis import (
+    COLOURS,
+    FLOOR,
+    gap_labels,
+    middles,
+    noise_rms,
+    thresholds,
+)
+from tmlattice.plots.readings import AFTER, BEFORE, design_readings
+from tmlattice.report.amounts import amount_text, words
+from tmlattice.report.tables import standouts
+
+Figure = dict[str, Any]
+
+MOST = 4000
+"""Points of the scan that are drawn: the page stays quick. The picture has all."""
+
+
+def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
+    """By the name that the picture of `plots.diagnosis.figures` has."""
+    made = {"plan": plan(diagnosis)}
+    if not diagnosis.by_steps:
+        left = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
+        if left or not diagnosis.parts:
+            made["readings"] = parts(diagnosis, left) if left else readings(diagnosis)
+        made["scan"] = scan(diagnosis)
+        if diagnosis.heldout is not None:
+            made["gap"] = gap(diagnosis)
+        return made
+    made["steps"] = steps(diagnosis)
+    if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
+        made |= {"gradients": gradients(diagnosis), "beta-beat": beta_beat(diagnosis)}
+    return made
+
+
+# --- parts ----------------------------------------------------------------------------------------
+def _short(values: ArrayLike, digits: int = 5) -> list[float | None]:
+    """Numbers with so many digits; None where there is none."""
+    return [
+        float(f"{v:.{digits}g}") if np.isfinite(v) else None
+        for v in np.asarray(values, dtype=float).ravel()
+    ]
+
+
+def _colour(name: str) -> str:
+    return name if name.startswith("@") else str(to_hex(name))
+
+
+def _trace(
+    x: ArrayLike, y: ArrayLike, name: str, colour: str, *, mode: str = "lines", size: float = 1.2,
+    text: Sequence[str] | None = None, told: str = "", dash: str = "solid", **more: Any,
+) -> Figure:  # fmt: skip
+    """A line, or markers, whose points tell their `text`, and then what `told` makes of them."""
+    style: Figure = {"line": {"width": size, "color": _colour(colour), "dash": dash}}
+    if mode == "markers":
+        style = {"marker": {"size": size, "color": _colour(colour)}}
+    hover: Figure = {"hoverinfo": "skip"}
+    if text is not None:
+        hover = {"text": list(text), "hovertemplate": f"%{{text}}{told}<extra></extra>"}
+    return {
+        "type": "scatter", "x": _short(x, 6), "y": _short(y, 4), "name": name, "mode": mode,
+        **style, **hover, **more,
+    }  # fmt: skip
+
+
+def _axis(title: str, **more: Any) -> Figure:
+    return {"title": {"text": title}, "automargin": True, "zeroline": False, **more}
+
+
+def _layout(height: int, **axes: Any) -> Figure:
+    return {
+        "height": height, "margin": {"l": 10, "r": 10, "t": 30, "b": 10}, "hovermode": "closest",
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom",
+                   "itemsizing": "constant"},
+        **axes,
+    }  # fmt: skip
+
+
+def _marks(diagnosis: Diagnosis) -> list[Figure]:
+    """Where the findings sit, over all rows against s."""
+    shapes: list[Figure] = []
+    for finding in diagnosis.findings:
+        ends = finding.where if finding.effect is None else (finding.s, finding.s)
+        if ends is None or ends[0] is None:
+            continue
+        band = ends[0] != ends[1]
+        shapes.append({
+            "type": "rect" if band else "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1,
+            "x0": ends[0], "x1": ends[1], "layer": "below",
+            "line": {"color": "@culprit", "width": 0 if band else 1.2, "dash": "dot"},
+            **({"fillcolor": "rgba(255,200,0,0.25)"} if band else {}),
+        })  # fmt: skip
+    return shapes
+
+
+def strip(ring: Ring) -> list[Figure]:
+    """The lattice along s, each kind one outline; every magnet tells its name.
+
+    It stands once in the page, and is drawn under each figure that names an axis for its `strip`.
+    """
+    traces = []
+    widest = ring.length / 600
+    for kind, colour in strip_view.COLOURS.items():
+        own = [e for e in ring.elements if e.kind == kind]
+        if not own:
+            continue
+        xs: list[float | None] = []
+        ys: list[float | None] = []
+        for element in own:
+            half = max(element.length, widest) / 2
+            low, high = strip_view.extent(element)
+            a, b = round(element.s - half, 2), round(element.s + half, 2)
+            xs += [a, a, b, b, None]
+            ys += [low, high, high, low, None]
+        traces.append({
+            "type": "scatter", "x": xs, "y": ys, "fill": "toself", "mode": "none",
+            "fillcolor": _colour(colour), "hoverinfo": "skip", "showlegend": False,
+        })  # fmt: skip
+        heights = [sum(strip_view.extent(e)) / 2 for e in own]
+        traces.append(
+            _trace([e.s for e in own], heights, kind, colour, mode="markers", size=8, opacity=0,
+                   text=[e.name for e in own], told=f"<br>{kind}<br>s = %{{x:.2f}} m",
+                   showlegend=False)
+        )  # fmt: skip
+    return traces
+
+
+_STRIP_AXIS = {"visible": False, "range": [-1.2, 1.2], "fixedrange": True}
+
+
+# --- the ring from above --------------------------------------------------------------------------
+def plan(diagnosis: Diagnosis) -> Figure:
+    """Magnets along the orbit, monitors and correctors small beside it, culprits marked."""
+    ring, view = diagnosis.ring, survey(diagnosis.ring)
+    traces = [_trace(view.ends[:, 0], view.ends[:, 1], "orbit", "@faint", showlegend=False)]
+    for kind, places in plan_view.groups(diagnosis).items():
+        small = kind in plan_view.SMALL
+        colour = plan_view.SMALL[kind].colour if small else strip_view.COLOURS[kind]
+        at = plan_view.beside(view, kind, places)
+        own = [ring.elements[i] for i in places]
+        trace = _trace(at[:, 0], at[:, 1], f"{kind}s", colour, mode="markers",
+                       size=3 if small else 4, told=f"<br>{kind}",
+                       text=[f"{e.name}<br>s = {e.s:.2f} m" for e in own])  # fmt: skip
+        trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
+        traces.append(trace)
+    for number, finding in enumerate(diagnosis.findings, 1):
+        place = plan_view.place_of(finding, diagnosis, view)
+        if place is None:
+            continue
+        name = finding.element or "unnamed"
+        traces.append({
+            **_trace(place[:1], place[1:], name, "@culprit", mode="markers", size=20,
+                     text=[plan_view.label(number, finding)], showlegend=False,
+                     told=f"<br>{name}<br>s = {_s_text(finding.s, finding.where)}"),
+            "mode": "markers+text", "texttemplate": " %{text} ",
+            "textposition": " ".join(plan_view.inwards(place, view)),
+            "textfont": {"color": "@culprit", "size": 15},
+            "marker": {"size": 20, "symbol": "circle-open", "color": "@culprit",
+                       "line": {"width": 3}},
+        })  # fmt: skip
+    suspected = [suspect.element for suspect in diagnosis.suspects]
+    suspected += [name for _, name, _ in standouts(diagnosis)] if diagnosis.steps else []
+    if suspected:
+        x, y = view.at(suspected).T
+        trace = _trace(x, y, "suspects", "@amber", mode="markers", size=14,
+                       text=[f"suspect: {name}" for name in suspected])  # fmt: skip
+        trace["marker"]["symbol"] = "circle-open"
+        traces.append(trace)
+    layout = _layout(
+        460, xaxis=_axis("m", showgrid=False),
+        yaxis=_axis("", scaleanchor="x", scaleratio=1, showgrid=False),
+    )  # fmt: skip
+    return {"data": traces, "layout": layout}
+
+
+def _s_text(s: float | None, where: tuple[float, float] | None) -> str:
+    if s is not None:
+        return f"{s:.2f} m"
+    return "" if where is None else f"{where[0]:.1f} to {where[1]:.1f} m"
+
+
+# --- trajectories ---------------------------------------------------------------------------------
+def readings(diagnosis: Diagnosis) -> Figure:
+    """What each model leaves of the shot that the design explains worst, monitor by monitor."""
+    data, found = diagnosis.trajectories.data, diagnosis.explanation
+    monitors = diagnosis.ring.monitors
+    first = slice(0, len(monitors))
+    read = np.where(data.valid, data.readings, np.nan)
+    models = {"design": (design_readings(diagnosis), BEFORE)}
+    if diagnosis.verdict != "distributed":
+        models["with the findings"] = (np.asarray(found.fit.point.view.readings), AFTER)
+    left = np.nan_to_num(read - models["design"][0]) ** 2 * data.active[:, None, None]
+    shot = int(left.sum(axis=(1, 2)).argmax())
+    s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
+    traces = []
+    for plane, name in enumerate("xy"):
+        for model, (predicted, colour) in models.items():
+            values = 1e3 * (read - predicted)[shot, first, plane]
+            traces.append(
+                _trace(s, values, model, colour, text=names, showlegend=not plane,
+                       told=f"<br>s = %{{x:.2f}} m<br>{name} less {model}: %{{y:.4f}} mm",
+                       legendgroup=model, yaxis="y2" if plane else "y")
+            )  # fmt: skip
+    layout = _layout(
+        460, xaxis=_axis("s [m]", anchor="y3"), yaxis=_axis("left of x [mm]", domain=[0.58, 1]),
+        yaxis2=_axis("left of y [mm]", domain=[0.12, 0.54]),
+        yaxis3={**_STRIP_AXIS, "domain": [0, 0.08]}, shapes=_marks(diagnosis),
+    )  # fmt: skip
+    return {"data": traces, "layout": layout, "strip": "y3"}
+
+
+def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
+    """What each measurement leaves at each monitor in units of the noise, before and after."""
+    places = {monitor.name: monitor.s for monitor in diagnosis.ring.monitors}
+    height = 0.9 / len(shown)
+    traces, axes = [], {}
+    for k, part in enumerate(shown):
+        axis = "y" if k == 0 else f"y{k + 1}"
+        s = np.array([places[diagnosis.ring[name].name] for name in part.monitors])
+        order = np.argsort(s)
+        names = [part.monitors[i] for i in order]
+        for model, colour, left in zip(
+            ("design", "with the findings"), (BEFORE, AFTER), part.left, strict=True
+        ):
+            traces.append(
+                _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
+                       told=f"<br>{part.label}, {model}<br>%{{y:.3g}} times the noise",
+                       showlegend=not k, legendgroup=model, yaxis=axis)
+            )  # fmt: skip
+        top = 1 - k * height
+        axes[axis.replace("y", "yaxis")] = _axis(
+            f"{part.label}<br>left / noise", type="log", dtick=1, domain=[top - 0.85 * height, top]
+        )
+    last = f"y{len(shown) + 1}"
+    axes[last.replace("y", "yaxis")] = {**_STRIP_AXIS, "domain": [0, 0.06]}
+    layout = _layout(120 + 180 * len(shown), xaxis=_axis("s [m]", anchor=last),
+                     shapes=_marks(diagnosis), **axes)  # fmt: skip
+    return {"data": traces, "layout": layout, "strip": last}
+
+
+def _amount(effect: str, power_of_it: float) -> str:
+    power = find(effect).power
+    return amount_text(effect, float(np.sign(power_of_it) * abs(power_of_it) ** (1 / power)))
+
+
+def scan(diagnosis: Diagnosis) -> Figure:
+    """How much better each hypothesis alone explains the data, before anything was found."""
+    found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
+    s = middles(diagnosis)
+    drawn = np.flatnonzero(np.isfinite(s) & (found.statistic > FLOOR))
+    drawn = drawn[np.argsort(-found.statistic[drawn])][:MOST]
+    layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
+    order = np.argsort(layers)
+    order_of = {group: k for k, group in enumerate(COLOURS)}
+    kicks = np.maximum(free.statistic[order], FLOOR)
+    traces = [_trace(layers[order], kicks, "a free kick in each shot", "@faint")]
+    by_effect: dict[str, list[int]] = {}
+    for i in drawn:
+        by_effect.setdefault(found.hypotheses[i][0], []).append(int(i))
+    shown: set[str] = set()
+    for effect, own in sorted(by_effect.items(), key=lambda item: order_of[find(item[0]).group]):
+        group = find(effect).group
+        told = [f"{found.hypotheses[i][1]}<br>{_amount(effect, found.amount[i])}" for i in own]
+        traces.append(
+            _trace(s[own], found.statistic[own], group, COLOURS[group], mode="markers", size=4,
+                   told=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
+                   text=told, legendgroup=group, showlegend=group not in shown)
+        )  # fmt: skip
+        shown.add(group)
+    named, of_kicks = thresholds(diagnosis)
+    ends = [0.0, diagnosis.ring.length]
+    traces.append(_trace(ends, [named] * 2, f"threshold {named:.1f}", "@ink", dash="dash"))
+    text = f"of free kicks {of_kicks:.1f}"
+    traces.append(_trace(ends, [of_kicks] * 2, text, "@faint", dash="dot"))
+    if not len(order):
+        del traces[0], traces[-1]
+    layout = _layout(
+        480, xaxis=_axis("s [m]", anchor="y2"), shapes=_marks(diagnosis),
+        yaxis=_axis("fall of chi²", type="log", dtick=1, domain=[0.13, 1], exponentformat="power"),
+        yaxis2={**_STRIP_AXIS, "domain": [0, 0.09]},
+    )  # fmt: skip
+    return {"data": traces, "layout": layout, "strip": "y2"}
+
+
+def gap(diagnosis: Diagnosis) -> Figure:
+    """The rms residual of held-out readings as findings are added one after another."""
+    assert diagnosis.heldout is not None
+    rms = [1e6 * step.rms for step in diagnosis.heldout.misfits]
+    wrapped = [wrap(label, 28) for label in gap_labels(diagnosis)]
+    labels = ["<br>".join(lines) for lines in wrapped]
+    pitch = max(48, 10 + 17 * max(len(lines) for lines in wrapped))
+    rows = list(range(len(rms)))
+    noise = noise_rms(diagnosis)
+    bars = {
+        "type": "bar", "orientation": "h", "y": rows, "x": _short(rms), "width": 0.55,
+        "marker": {"color": [_colour(BEFORE)] + [_colour(AFTER)] * (len(rms) - 1)},
+        "text": [f"{value:.1f}" for value in rms], "textposition": "auto",
+        "hovertext": labels, "hovertemplate": "%{hovertext}<br>%{x:.1f} µm<extra></extra>",
+        "showlegend": False,
+    }  # fmt: skip
+    wide = max(rms) > 20 * max(min(rms), 1e-9)
+    line = _trace([noise, noise], [-0.5, len(rms) - 0.5], f"noise {noise:.1f} µm", "@ink",
+                  dash="dash")  # fmt: skip
+    layout = _layout(
+        110 + pitch * len(rms),
+        xaxis=_axis("held-out readings less model, rms [µm]", type="log" if wide else "linear"),
+        yaxis={"tickvals": rows, "ticktext": labels, "automargin": True, "fixedrange": True,
+               "range": [len(rms) - 0.4, -0.6], "zeroline": False},
+    )  # fmt: skip
+    return {"data": [bars, line], "layout": layout}
+
+
+# --- orbit responses ------------------------------------------------------------------------------
+_ONE_TWO_FIVE = [float(f"{m}e{e}") for e in range(-3, 6) for m in (1, 2, 5)]
+
+
+def steps(diagnosis: Diagnosis) -> Figure:
+    """Held-out rms after each step that was kept."""
+    kept = diagnosis.steps
+    at = list(range(len(kept)))
+    traces = []
+    for name, label, colour in (
+        ("heldout_rms_in_plane", "in-plane", "C0"),
+        ("heldout_rms_position", "in-plane, with position jump", "tab:cyan"),
+        ("heldout_rms_coupling", "coupling", "C3"),
+        ("dispersion_rms", "RF response", "C2"),
+    ):
+        values = [1e6 * getattr(step, name) for step in kept]
+        trace = _trace(at, values, label, colour, text=[step.effect for step in kept],
+                       told=f"<br>{label} %{{y:.3g}} µm")  # fmt: skip
+        traces.append({**trace, "mode": "lines+markers"})
+    noise = 1e6 * diagnosis.gap["noise"]
+    traces.append(
+        _trace([0, len(kept) - 1], [noise, noise], f"noise {noise:.2g} µm", "@faint", dash="dot")
+    )
+    names = ["<br>".join(wrap(step.effect.replace("_", " "), 16)) for step in kept]
+    layout = _layout(
+        400, xaxis={"tickvals": at, "ticktext": names, "automargin": True},
+        yaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
+    )  # fmt: skip
+    return {"data": traces, "layout": layout}
+
+
+def gradients(diagnosis: Diagnosis) -> Figure:
+    """Relative gradient error of each quadrupole, with its standard error."""
+    rows = [
+        (c.element or "", diagnosis.ring[c.element or ""].s, 100 * c.amount, 100 * sigma)
+        for c, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True)
+        if c.effect == "quadrupole_gradient"
+    ]
+    told = [f"{name}<br>{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
+    trace = _trace([r[1] for r in rows], [r[2] for r in rows], "gradient error", "tab:red",
+                   mode="markers", size=5, text=told, told="<br>s = %{x:.2f} m",
+                   showlegend=False)  # fmt: skip
+    trace["error_y"] = {"array": _short([r[3] for r in rows], 3), "thickness": 1, "width": 0}
+    return _above_strip(diagnosis, [trace], "gradient error [%]")
+
+
+def beta_beat(diagnosis: Diagnosis) -> Figure:
+    """Beta of the ring as found relative to the design's, along the ring."""
+    from tmlattice.beam.chain import Chain
+    from tmlattice.optics import twiss
+
+    before, after = (twiss(Chain.from_ring(r)) for r in (diagnosis.ring, diagnosis.repaired))
+    names = ["start", *(magnet.name for magnet in diagnosis.ring.magnets)]
+    traces = []
+    for plane, colour in enumerate(("C0", "C3")):
+        beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
+        name = "xy"[plane]
+        traces.append(_trace(before.s, beat, name, colour, text=names,
+                             told=f"<br>s = %{{x:.2f}} m<br>{name}: %{{y:+.3f}} %"))  # fmt: skip
+    return _above_strip(diagnosis, traces, "beta / design - 1 [%]")
+
+
+def _above_strip(diagnosis: Diagnosis, traces: Iterable[Figure], title: str) -> Figure:
+    layout = _layout(
+        340, xaxis=_axis("s [m]", anchor="y2"), yaxis=_axis(title, domain=[0.18, 1]),
+        yaxis2={**_STRIP_AXIS, "domain": [0, 0.12]}, shapes=_marks(diagnosis),
+    )  # fmt: skip
+    return {"data": list(traces), "layout": layout, "strip": "y2"}

@@ -1,0 +1,158 @@
+"""Tables of the page: every error with its own error, and all that a reader has to know.
+
+>>> [table.title for table in error_tables(diagnosis)]
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tmlattice.diagnosis.consequences import Beam, beam_with
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.effects import Cause, find
+from tmlattice.measurement.assume import ASSUMPTIONS
+from tmlattice.report.amounts import amount_text, scaled, words
+
+TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
+"""By the group of an effect; all other elements are magnets."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Elements with all amounts that were fitted to them.
+
+    Attributes:
+        title: of what.
+        head: of the columns: the name, then numbers.
+        rows: one an element, those furthest from zero in units of their errors first.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def error_tables(diagnosis: Diagnosis) -> list[Table]:
+    """Magnets, monitors, correctors and the beam of a dense fit, value and error of each effect."""
+    grouped: dict[str, list[tuple[Cause, float]]] = {}
+    for cause, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True):
+        title = TITLES.get(find(cause.effect).group, "Magnets")
+        title = "Beam" if cause.element is None else title
+        grouped.setdefault(title, []).append((cause, sigma))
+    return [
+        _table(diagnosis, title, grouped[title])
+        for title in ("Magnets", *TITLES.values(), "Beam")
+        if title in grouped
+    ]
+
+
+def _table(diagnosis: Diagnosis, title: str, told: Sequence[tuple[Cause, float]]) -> Table:
+    effects = list(dict.fromkeys(cause.effect for cause, _ in told))
+    places = {element.name: element.s for element in diagnosis.ring.elements}
+    known = {(cause.element or "", cause.effect): (cause.amount, sigma) for cause, sigma in told}
+    units = {}
+    for effect in effects:
+        rms = np.sqrt(np.mean([c.amount**2 for c, _ in told if c.effect == effect]))
+        units[effect] = scaled(effect, float(rms))
+    names = list(dict.fromkeys(cause.element or "" for cause, _ in told))
+
+    def clearest(name: str) -> float:
+        own = (known.get((name, effect), (0.0, 1.0)) for effect in effects)
+        return max(abs(amount) / sigma if sigma > 0 else 0.0 for amount, sigma in own)
+
+    names.sort(key=clearest, reverse=True)
+    rows = []
+    for name in names:
+        cells = [name or "the beam", _number(places.get(name, np.nan), 2)]
+        for effect in effects:
+            factor, _ = units[effect]
+            amount, sigma = known.get((name, effect), (np.nan, np.nan))
+            digits = 4 if not 0 < factor * sigma < np.inf else _digits(factor * sigma)
+            cells += [_number(factor * value, digits) for value in (amount, sigma)]
+        rows.append(tuple(cells))
+    head = ["name", "s [m]"]
+    for effect in effects:
+        head += [f"{find(effect).label} [{units[effect][1]}]", "error"]
+    return Table(title, tuple(head), tuple(rows))
+
+
+def _digits(error: float) -> int:
+    """That show an error with two digits."""
+    return int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else ""
+
+
+STANDS_OUT = 5.0
+"""Times the usual scatter of its own effect, and of its own error, from which on an amount of a
+dense fit is suspect."""
+
+ENOUGH, MOST = 8, 8
+"""Amounts of an effect that show a scatter; suspects that are listed."""
+
+
+def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """What stands out of its kind in a dense fit: (kind, where, what); the clearest first."""
+    found: list[tuple[float, tuple[str, str, str]]] = []
+    told = list(zip(diagnosis.causes, diagnosis.errors, strict=True))
+    for effect in dict.fromkeys(cause.effect for cause, _ in told):
+        own = [(c, sigma) for c, sigma in told if c.effect == effect and c.element is not None]
+        if len(own) < ENOUGH:
+            continue
+        amounts = np.array([cause.amount for cause, _ in own])
+        off = amounts - np.median(amounts)
+        scatter = 1.4826 * float(np.median(abs(off)))
+        for (cause, sigma), distance in zip(own, abs(off), strict=True):
+            times = float(distance / max(scatter, sigma, 1e-30))
+            if times > STANDS_OUT:
+                kind = diagnosis.ring[cause.element or ""].kind
+                what = f"{words(effect)} {amount_text(effect, cause.amount, sigma)}"
+                said = f"{what}, {times:.0f} times the scatter of its kind"
+                found.append((times, (kind, cause.element or "", said)))
+    return [row for _, row in sorted(found, key=lambda row: -row[0])[:MOST]]
+
+
+def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """The stored beam by the design and as found: (what, design, found)."""
+    told = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
+
+    def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
+        if values is None:
+            return "unstable"
+        return " / ".join(f"{factor * value:.{digits}f}" for value in values)
+
+    def row(name: str, field: str, factor: float, digits: int) -> tuple[str, str, str]:
+        found: Beam | None = told.found
+        return name, "", pair(None if found is None else getattr(found, field), factor, digits)
+
+    tunes = pair(told.design, 1, 5), pair(None if told.found is None else told.found.tunes, 1, 5)
+    return [
+        ("fractional tunes, x / y", *tunes),
+        row("beta beat, rms [%]", "beta_beat_rms", 100, 2),
+        row("beta beat, largest [%]", "beta_beat_max", 100, 2),
+        row("dispersion off the design's, rms [mm]", "dispersion_rms", 1e3, 1),
+        row("closed orbit, rms [µm]", "orbit_rms", 1e6, 1),
+    ]
+
+
+def notes(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
+    """All that limits what was said, in one place: (what, text)."""
+    for warning in diagnosis.warnings:
+        yield "warning", warning
+    if diagnosis.bad_monitors:
+        yield "bad monitors, left out", ", ".join(diagnosis.bad_monitors)
+    if diagnosis.left_out:
+        places = [
+            f"{row['monitor']} {row['plane']}"
+            + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
+            for row in diagnosis.left_out
+        ]
+        more = f" and {len(places) - MOST} more" if len(places) > MOST else ""
+        yield "readings left out", ", ".join(places[:MOST]) + more
+    for name in diagnosis.provenance["options"].get("assume", ()):
+        yield "assumed of the data", f"{name}: {ASSUMPTIONS[name].words}"
+    for said in diagnosis.degenerate:
+        yield "not settled by the data", said
