@@ -25,6 +25,7 @@ BESIDE = {
     "by_name",
     "late",
     "speaks",
+    "workers",
     "batch",
     "schemas",
 }  # everybody may use them

@@ -17,6 +17,7 @@ from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.shots import Shots, stream
+from tmlattice.workers import Caught, caught, heard
 
 Array = NDArray[np.float64]
 
@@ -172,13 +173,13 @@ class Machine:
         setup = pickle.dumps((self.ring, self.causes, self._made_of, shots, turns, seed))
         size = min(jobs, len(chunks))
         with ProcessPoolExecutor(size, get_context("spawn"), _start, (setup,)) as pool:
-            waiting: deque[Future[Array]] = deque()
+            waiting: deque[Future[Caught]] = deque()
             for chunk in chunks:  # no more in flight than the processes need
-                waiting.append(pool.submit(_work, chunk))
+                waiting.append(pool.submit(caught, _work, chunk))
                 if len(waiting) > 2 * jobs:
-                    yield waiting.popleft().result()
+                    yield heard(waiting.popleft().result())
             while waiting:
-                yield waiting.popleft().result()
+                yield heard(waiting.popleft().result())
 
 
 _worker: tuple[Machine, Shots, int, int] | None = None
