@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from html import escape
+from pathlib import PurePath
 
 
 class Speaks:
@@ -27,6 +28,11 @@ class Speaks:
             if text
         )
         return f"<b>{type(self).__name__} {escape(title)}</b><table>{lines}</table>"
+
+
+def last_part(name: str) -> str:
+    """Of a path; a built-in name as it is."""
+    return PurePath(name).name
 
 
 def counted(number: int, word: str) -> str:

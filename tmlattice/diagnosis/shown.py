@@ -3,7 +3,7 @@
 from typing import Any
 
 from tmlattice.late import Method
-from tmlattice.speaks import Speaks
+from tmlattice.speaks import Speaks, last_part
 
 MOST = 4
 """Findings in the line that a diagnosis shows."""
@@ -52,7 +52,7 @@ class ShownDiagnosis(Speaks):
     def _told(self) -> tuple[str, dict[str, str]]:
         own: Any = self  # its attributes are the dataclass's
         closed = None if own.heldout is None else own.heldout.closed
-        rows = {"of": f"{own.kind} of {own.ring.name}"}
+        rows = {"of": f"{own.kind} of {last_part(own.ring.name)}"}
         for number, finding in enumerate(own.findings[:MOST], 1):
             rows[f"finding {number}"] = finding.in_short
         if len(own.findings) > MOST:

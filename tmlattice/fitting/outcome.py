@@ -11,7 +11,7 @@ from tmlattice.fitting.advice import advice
 from tmlattice.fitting.method_fit import MethodFit, errors, pair, trusted
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
-from tmlattice.speaks import Speaks
+from tmlattice.speaks import Speaks, last_part
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class TuneFit(Speaks):
         rows |= {f"tunes of {m.method}": both(m.tunes) or "none" for m in self.methods}
         rows["trusted"] = "none" if self.trusted is None else self.trusted.method
         what = self.source if self.change is None else f"{self.magnet} {100 * self.change:+g} %"
-        return f"of {self.ring.name}, {what}", rows
+        return f"of {last_part(self.ring.name)}, {what}", rows
 
     @property
     def _first(self) -> MethodFit:

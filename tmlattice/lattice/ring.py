@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.late import Method
-from tmlattice.speaks import Speaks, shown
+from tmlattice.speaks import Speaks, last_part, shown
 
 Kind = Literal[
     "drift",
@@ -217,7 +217,7 @@ class Ring(Speaks):
 
     def _told(self) -> tuple[str, dict[str, str]]:
         correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in self.elements)
-        return self.name, {
+        return last_part(self.name), {
             "length": f"{self.length:.3f} m",
             "energy": f"{self.energy:g} GeV",
             "magnets": str(len(self.magnets)),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.late import Method
-from tmlattice.speaks import Speaks, counted
+from tmlattice.speaks import Speaks, counted, last_part
 
 
 class Shown(Speaks):
@@ -43,7 +43,7 @@ class Shown(Speaks):
         if own.get("tune") is not None:
             pairs = (" ".join(f"{q:.5f}" for q in pair) for pair in own["tune"][:3])
             rows["tunes"] = "; ".join(pairs)
-        rows["lattice"] = str(own.get("lattice") or "")
+        rows["lattice"] = last_part(own.get("lattice") or "")
         return "", rows
 
 
