@@ -18,6 +18,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.errors import TmlatticeError
 from tmlattice.files import OutputError, output_file, write_json
+from tmlattice.workers import caught, heard
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +73,8 @@ def run_batch(
 
     Raises:
         OutputError: the folder cannot be written.
-        TmlatticeError: no scheduler answers.
+        TmlatticeError: no scheduler answers, or several processes without the package that runs
+            them.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,7 +126,7 @@ def _results(
                 except Exception as error:
                     failed[name] = _error(error, 0.0)
                     continue
-                future = client.submit(guarded, work, argument, pure=False)
+                future = client.submit(caught, guarded, work, argument, pure=False)
                 names[future.key] = name
                 running.add(future)
                 return
@@ -135,7 +137,7 @@ def _results(
         for future in _arriving(running, client):
             name = names.pop(future.key)
             try:
-                result = future.result()
+                result = heard(future.result())
             except Exception as error:  # the worker itself was lost
                 result = _error(error, 0.0)
             feed()
@@ -203,8 +205,14 @@ def _error(error: Exception, seconds: float) -> dict[str, Any]:
 @contextmanager
 def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
     """A Dask client and its number of workers."""
-    import dask
-    from distributed import Client, LocalCluster
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ModuleNotFoundError as error:
+        raise TmlatticeError(
+            f"several processes need the package '{error.name}', which is not installed: run "
+            "`pip install 'tmlattice[study]'`, or take one process (--workers 1, --jobs 1)"
+        ) from error
 
     if scheduler is not None:
         try:

@@ -25,7 +25,30 @@ BAD_INPUT = 2
 STOPPED = 130  # as the shell has it for Ctrl-C
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+class Sections(click.Group):
+    """A group whose help lists its commands by what they are for."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """In the order of `SECTIONS`."""
+        limit = formatter.width - 6 - max(map(len, self.commands))
+        for title, commands in SECTIONS.items():
+            rows = [(c.name or "", c.get_short_help_str(limit)) for c in commands]
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
+SECTIONS: dict[str, tuple[click.Command, ...]] = {
+    "Measure": (info, simulate, import_files, check),
+    "Fit": (tune_fit, predict),
+    "Diagnose": (diagnose, effects),
+    "Study": (study, challenge, reproduce),
+}
+
+
+@click.group(
+    cls=Sections,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
 @click.version_option(__version__, prog_name="tmlattice")
 def tmlattice() -> None:
     """The gap between the model of a storage ring and the ring itself.
@@ -37,17 +60,9 @@ def tmlattice() -> None:
     """
 
 
-tmlattice.add_command(tune_fit)
-tmlattice.add_command(info)
-tmlattice.add_command(study)
-tmlattice.add_command(import_files)
-tmlattice.add_command(simulate)
-tmlattice.add_command(effects)
-tmlattice.add_command(check)
-tmlattice.add_command(diagnose)
-tmlattice.add_command(predict)
-tmlattice.add_command(reproduce)
-tmlattice.add_command(challenge)
+for _commands in SECTIONS.values():
+    for _command in _commands:
+        tmlattice.add_command(_command)
 
 
 def main() -> NoReturn:

@@ -251,8 +251,7 @@ def _write(
     document["provenance"] = {**document["provenance"], **source}
     if folder:
         progress("figures")
-        _write_folder(result, folder, document["provenance"])
-        write_json(folder / "diagnosis.json", document)
+        _write_folder(result, folder, document)
     if extra:
         write_json(extra, document)
 
@@ -377,17 +376,13 @@ def _progress(quiet: bool) -> Iterator[Callable[[str], None]]:
         yield status.update
 
 
-def _write_folder(result: "Diagnosis", folder: Path, provenance: dict[str, Any]) -> None:
+def _write_folder(result: "Diagnosis", folder: Path, document: dict[str, Any]) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
-    from tmlattice.report.page import draw, page
-    from tmlattice.report.plain import report_text
+    from tmlattice.report.speaking import write_files
 
-    pictures = draw(result, folder)
-    html = page(result, pictures, provenance)
-    (folder / "report.html").write_text(html, encoding="utf-8")
-    (folder / "report.txt").write_text(report_text(result) + "\n", encoding="utf-8")
+    write_files(result, folder, document)
 
 
 def _print(

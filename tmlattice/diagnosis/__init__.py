@@ -9,6 +9,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from tmlattice.by_name import by_name
 from tmlattice.diagnosis.kinds import Measured, kind_of
 from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
@@ -26,6 +27,7 @@ _OPTIONS = {
 _OWN = {name for names in _OPTIONS.values() for name in names}
 
 
+@by_name
 def diagnose(
     ring: Ring, measurement: Measured | Mapping[str, Measured], **options: Any
 ) -> Diagnosis:

@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
@@ -47,6 +48,7 @@ SPIKE = 20.0
 """Sigma from which one reading is wrong for once, where its neighbours agree without it."""
 
 
+@by_name
 def check_data(
     ring: Ring,
     data: Measurement | OrbitResponse,

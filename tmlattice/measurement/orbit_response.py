@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
+from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]
 
@@ -40,8 +41,8 @@ def check_rf(rf: RfStep) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class OrbitResponse:
+@dataclass(frozen=True, eq=False, repr=False)
+class OrbitResponse(Shown):
     """Measured orbit changes.
 
     The RF frequency is constant while a corrector is stepped, so a horizontal step also shifts

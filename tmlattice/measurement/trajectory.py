@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
+from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
@@ -47,8 +48,8 @@ class Comparison:
     readings: int
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurement(Shown):
     """Readings of one or more shots, each launched at the start of the ring.
 
     Attributes:
