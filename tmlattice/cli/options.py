@@ -167,6 +167,17 @@ def _identities(path: Path) -> set[Any]:
     return names if status is None else names | {(status.st_dev, status.st_ino)}
 
 
+def no_numbers(error: Exception) -> str:
+    """What to say of data whose numbers end a calculation: singular, without end, too many."""
+    from tmlattice.errors import plain
+
+    said = plain(str(error), 100) or type(error).__name__
+    return (
+        f"with these numbers nothing can be worked out ({said}); check launches, settings, noise "
+        "and readings for units and for values that are far off (`tmlattice check`)"
+    )
+
+
 def _remember(context: click.Context, option: click.Parameter, value: Any) -> None:
     context.meta[f"tmlattice.{option.name}"] = value
 
