@@ -1,8 +1,8 @@
 """What measurements of a stored beam cost, and how it grows: `python benchmarks/observe.py`.
 
 Turns of two modes with coupling and noise at all monitors, as many as asked for; for each size the
-processor seconds that the spectra take (`observe.spectra.lines`), that the folder takes to be written
-and read, and the rms of the amplitudes' deviations over their errors. The least of three runs.
+processor seconds that the spectra take (`observe.spectra.lines`), that the folder takes to be
+written and read, and the rms of the amplitudes' deviations over their errors. The least of three runs.
 
 22 November 2026, `python benchmarks/observe.py --files`, one thread of a busy machine:
 
