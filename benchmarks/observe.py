@@ -2,7 +2,7 @@
 
 Turns of two modes with coupling and noise at all monitors, as many as asked for; for each size the
 processor seconds that the spectra take (`observe.spectra.lines`), that the folder takes to be
-written and read, and the rms of the amplitudes' deviations over their errors. The least of three runs.
+written and read, and the rms of the amplitudes' deviations over their errors. Least of three runs.
 
 22 November 2026, `python benchmarks/observe.py --files`, one thread of a busy machine:
 
