@@ -109,13 +109,13 @@ def halves(folder, outputs):
     return wrong
 
 
-def prepared(folder):
+def prepared(folder, challenges=True):
     """Files that the commands read."""
     from inputs import write_all
 
     import tmlattice.cli.command  # noqa: F401  (children find it loaded, whoever edits it meanwhile)
 
-    write_all(folder)
+    write_all(folder, challenges)
     for results in folder.glob("set/results/*"):
         results.unlink()
 
@@ -126,11 +126,12 @@ def fresh(master, folder):
     shutil.copytree(master, folder)
 
 
-def references(master, folder):
+def references(master, folder, names=tuple(COMMANDS)):
     """What each command writes, and the seconds that it takes."""
     whole = {}
     results = None
-    for name, (words, outputs) in COMMANDS.items():
+    for name in names:
+        words, outputs = COMMANDS[name]
         fresh(master, folder)
         if name == "challenge score":  # it reads what the run wrote
             shutil.copytree(results, master / "set" / "results", dirs_exist_ok=True)
@@ -142,7 +143,7 @@ def references(master, folder):
         whole[name] = contents(folder, outputs), seconds
         if name == "challenge run":
             results = Path(shutil.copytree(folder / "set/results", master.parent / "results"))
-    shutil.rmtree(master / "set" / "results")
+    shutil.rmtree(master / "set" / "results", ignore_errors=True)
     return whole, results
 
 

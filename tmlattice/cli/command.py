@@ -32,8 +32,8 @@ def tmlattice() -> None:
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
     .repr), MAD-X (.seq, .madx, or a TWISS table: .tfs, .twiss, .dat), elegant (.lte), Xsuite
-    (.json) or the package's own JSON. OCELOT's files are Python code and are run, and AT's .m and
-    .repr, MAD-X's and elegant's are evaluated: load only files that you trust.
+    (.json) or the package's own JSON. OCELOT's files are Python code and are run: load only files
+    that you trust. All others are data (SECURITY.md).
     """
 
 
