@@ -9,7 +9,7 @@ BIN = $(VENV)/bin
 # files in their order: the long ones are not the last.
 PARALLEL = --numprocesses logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test test-all coverage check bench docs notebooks clean
+.PHONY: run test test-all coverage check bench fuzz docs notebooks clean
 
 run: $(VENV)/installed
 	$(BIN)/tmlattice tune-fit
@@ -29,6 +29,11 @@ check: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# damaged inputs of every format, then kills and full disks: half an hour
+fuzz: $(VENV)/installed
+	$(BIN)/python tests/fuzz/run.py 10000
+	$(BIN)/python tests/fuzz/kills.py 200
 
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/speed.py

@@ -186,7 +186,7 @@ def guarded(work: Work, argument: Any) -> dict[str, Any]:
     try:
         return work(argument)
     except Exception as error:
-        log.warning("a case failed", exc_info=True)
+        log.info("a case failed", exc_info=True)
         return _error(error, time.perf_counter() - begun)
 
 

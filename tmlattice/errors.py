@@ -5,19 +5,27 @@ import unicodedata
 from collections.abc import Iterable
 
 
-def plain(text: str, longest: int | None = None) -> str:
-    """A text from a file as it may be shown: in one line, without what steers a terminal.
+def harmless(text: str) -> str:
+    """A text without what steers a terminal; its lines stay lines.
 
     Control characters, and those that turn the direction of writing, become their escapes.
+    """
+    if text.isprintable():
+        return text
+    steers = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return "".join(
+        repr(c)[1:-1] if c != "\n" and unicodedata.category(c) in steers else c for c in text
+    )
+
+
+def plain(text: str, longest: int | None = None) -> str:
+    """A text from a file as it may be shown: in one line, `harmless`.
 
     Args:
         text: as it stands in the file.
         longest: characters; what is beyond is left out.
     """
-    shown = "".join(
-        repr(c)[1:-1] if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp") else c
-        for c in " ".join(text.split())
-    )
+    shown = harmless(" ".join(text.split()))
     if longest is None or len(shown) <= longest:
         return shown
     return shown[: longest - 3] + "..."

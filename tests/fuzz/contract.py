@@ -160,11 +160,11 @@ class Inputs:
         return words, self.folder / file
 
 
-def made(folder):
+def made(folder, challenges=True):
     """Every format, on a ring of ten magnets."""
     from inputs import write_all
 
-    inputs = Inputs(folder, write_all(folder))
+    inputs = Inputs(folder, write_all(folder, challenges))
     inputs.put_back()
     return inputs
 

@@ -50,7 +50,7 @@ def challenge(folder):
         run(Path("set"), jobs=1, progress=False)
 
 
-def write_all(folder):
+def write_all(folder, challenges=True):
     """Write the files; {format: (command, file that is damaged)}."""
     import at
     from at_ring import at_lattice
@@ -79,11 +79,10 @@ def write_all(folder):
         own.write_text(json.dumps(document))
     xsuite = Path(__file__).parent.parent / "lattices" / "xtrack_line.json"
     shutil.copy(xsuite, folder / "xsuite.json")
-    challenge(folder)
     score = ["challenge", "score", "set", "--no-oracle", "--jobs", "1"]
     run = ["challenge", "run", "set", "--jobs", "1", "-q"]
     info = lambda name, *more: (["info", name, *more], name)  # noqa: E731
-    return {
+    found = {
         "own JSON": info("own.json"),
         "AT .json": info("at.json"),
         "AT .mat": info("at.mat"),
@@ -96,11 +95,16 @@ def write_all(folder):
         "turns, table": (["diagnose", "ring.json", "turns"], "turns/readings.csv"),
         "response, JSON": (["diagnose", "ring.json", "response"], "response/measurement.json"),
         "response, table": (["diagnose", "ring.json", "response"], "response/response.csv"),
-        "result": (score, "set/results/0000.json"),
-        "truth": (score, "set/truth/0000.json"),
-        "truth, arrays": (score, "set/truth/0000.npz"),
-        "challenge": (score, "set/challenge.json"),
-        "case": (run, "set/cases/0000/case.json"),
-        "case, data": (run, "set/cases/0000/fit/readings.csv"),
         "check": (["check", "ring.json", "turns"], "turns/measurement.json"),
     }
+    if challenges:
+        challenge(folder)
+        found |= {
+            "result": (score, "set/results/0000.json"),
+            "truth": (score, "set/truth/0000.json"),
+            "truth, arrays": (score, "set/truth/0000.npz"),
+            "challenge": (score, "set/challenge.json"),
+            "case": (run, "set/cases/0000/case.json"),
+            "case, data": (run, "set/cases/0000/fit/readings.csv"),
+        }
+    return found

@@ -1,11 +1,12 @@
 """`make fuzz`: as many damaged inputs as are asked for, and a table of what became of them.
 
-python tests/fuzz/run.py [INPUTS] [FIRST SEED] [FILE.json]
+python tests/fuzz/run.py [INPUTS] [FIRST SEED] [SECONDS AT MOST] [FILE.json]
 """
 
 import os
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 from contract import dumped, limit_memory, made, report, tried  # noqa: E402
 
 
-def main(count=10_000, first=0, file=None):
+def main(count=10_000, first=0, seconds=10**9, file=None):
     """Exit code 1 where the contract was broken."""
     with tempfile.TemporaryDirectory() as place:
         os.environ["TMLATTICE_CACHE"] = "off"
@@ -23,7 +24,10 @@ def main(count=10_000, first=0, file=None):
         folder = Path(place)
         inputs = made(folder)
         limit_memory()
+        end = time.monotonic() + seconds
         for seed in range(first, first + count):
+            if time.monotonic() > end:
+                break
             name, said = tried(seed, folder, inputs, np.random.default_rng([19, seed]))
             if said is not None:
                 print(f"--- {name}, seed {seed}: {said}", flush=True)
@@ -34,5 +38,5 @@ def main(count=10_000, first=0, file=None):
 
 
 if __name__ == "__main__":
-    numbers = [int(word) for word in sys.argv[1:3]]
-    sys.exit(main(*numbers, file=sys.argv[3] if len(sys.argv) > 3 else None))
+    numbers = [int(word) for word in sys.argv[1:4]]
+    sys.exit(main(*numbers, file=sys.argv[4] if len(sys.argv) > 4 else None))

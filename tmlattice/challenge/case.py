@@ -34,7 +34,9 @@ SET = "tmlattice-challenge-set"
 PUBLIC = "tmlattice-challenge-case"
 TRUTH = "tmlattice-challenge-truth"
 
-TIERS = ("A", "B", "C", "D", "E")
+CAUSES = {"A": (1, 1), "B": (1, 1), "C": (2, 3), "D": (0, 1), "E": (0, 0)}
+"""Fewest and most of a case, by tier."""
+TIERS = tuple(CAUSES)
 
 
 @dataclass(frozen=True)
@@ -252,8 +254,13 @@ def read_truth(folder: Path, name: str) -> Truth:
         TmlatticeError: it is not there, or damaged.
     """
     try:
-        return _truth(folder, name)
-    except (OSError, LookupError, TypeError, ValueError, BadZipFile) as error:
+        truth = _truth(folder, name)
+        few, many = CAUSES[truth.tier]
+        known = truth.unknown is None or truth.tier == "D"
+        if not (few <= len(truth.causes) <= many and known):
+            raise ValueError(f"{len(truth.causes)} causes are none of tier {truth.tier}")
+        return truth
+    except (OSError, ArithmeticError, LookupError, TypeError, ValueError, BadZipFile) as error:
         said = plain(str(error), 100)
         raise TmlatticeError(
             f"the truth of case {name} in '{folder}' cannot be read ({said}); make it anew"

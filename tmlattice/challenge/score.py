@@ -85,6 +85,8 @@ def score(
     for name in names:
         try:
             truths[name] = read_truth(folder, name)
+            if truths[name].tier != described["tier"]:
+                raise TmlatticeError(f"its truth is of tier {truths.pop(name).tier}")
         except TmlatticeError as error:
             failed[name] = str(error)
     if not truths:

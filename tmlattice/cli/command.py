@@ -19,7 +19,7 @@ from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
-from tmlattice.errors import TmlatticeError, plain
+from tmlattice.errors import TmlatticeError, harmless
 
 BAD_INPUT = 2
 STOPPED = 130  # as the shell has it for Ctrl-C
@@ -55,8 +55,8 @@ def tmlattice() -> None:
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
     .repr), MAD-X (.seq, .madx, or a TWISS table: .tfs, .twiss, .dat), elegant (.lte), Xsuite
-    (.json) or the package's own JSON. OCELOT's files are Python code and are run, and AT's .m and
-    .repr, MAD-X's and elegant's are evaluated: load only files that you trust.
+    (.json) or the package's own JSON. OCELOT's files are Python code and are run: load only files
+    that you trust. All others are data (SECURITY.md).
     """
 
 
@@ -90,13 +90,8 @@ def main() -> NoReturn:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    click.echo(f"tmlattice: {_shown(message)}", err=True)
+    click.echo(f"tmlattice: {harmless(message)}", err=True)
     sys.exit(code)
-
-
-def _shown(message: str) -> str:
-    """Names of files, elements and keys may hold what steers a terminal; lines stay lines."""
-    return "\n".join(plain(line) for line in message.splitlines())
 
 
 def _show_warning(
@@ -108,4 +103,4 @@ def _show_warning(
     line: str | None = None,
 ) -> None:
     if not issubclass(category, RuntimeWarning):  # numpy's, of numbers that are judged elsewhere
-        click.echo(f"tmlattice: warning: {_shown(str(message))}", err=True)
+        click.echo(f"tmlattice: warning: {harmless(str(message))}", err=True)

@@ -194,6 +194,7 @@ def open_ring(
     Raises:
         LatticeError: no such ring, or one without monitors.
     """
+    from tmlattice.errors import harmless
     from tmlattice.lattice import load_ring
     from tmlattice.lattice.checks import need_monitors, no_whole_turn
 
@@ -201,7 +202,7 @@ def open_ring(
     if read:
         need_monitors(ring)
     if told := no_whole_turn(ring):
-        click.echo(f"tmlattice: warning: {told}", err=True)
+        click.echo(f"tmlattice: warning: {harmless(told)}", err=True)
     return ring
 
 
@@ -345,11 +346,19 @@ def trajectories(path: Path, refusal: str, ring: "Ring", **given: Any) -> "Measu
 
 
 def console() -> "Console":
-    """Where results are printed: as wide as the terminal, else 100 columns."""
+    """Where results are printed: as wide as the terminal, else 100 columns; names from files steer
+    nothing there."""
     from rich.console import Console
+    from rich.text import Text
 
-    wide = Console(highlight=False, markup=False)
-    return wide if wide.is_terminal else Console(highlight=False, markup=False, width=100)
+    from tmlattice.errors import harmless
+
+    class Screen(Console):
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(harmless(text), **options)
+
+    wide = Screen(highlight=False, markup=False)
+    return wide if wide.is_terminal else Screen(highlight=False, markup=False, width=100)
 
 
 def table(*columns: str) -> "Table":

@@ -9,7 +9,7 @@ cause is sought among them. A reference of each kind holds what was there before
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,19 +17,26 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
 from tmlattice.diagnosis.kinds import How, Measured, Part, part_of
-from tmlattice.diagnosis.result import Diagnosis, Finding, JointView, PartView, ring_tunes
+from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
+from tmlattice.diagnosis.stages import (
+    held_out,
+    misfit_of,
+    pairs_of,
+    seen_by,
+    stages_of,
+    views_of,
+)
 from tmlattice.diagnosis.strategy import CLEAR, DOUBT, FEW, freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
-from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.newton import Outcome, fit, settled
-from tmlattice.inference.problem import Hypothesis, Point, Problem
+from tmlattice.inference.newton import Outcome, fit
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
-from tmlattice.inference.together import Blocks, Together
+from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.observe.stored import Kept, Stored
 
@@ -39,9 +46,6 @@ Flags = NDArray[np.bool_]
 CROWDED = 1.5
 """What half of the monitors leave at least of their noise where a few causes with names were tried,
 from which on nothing without a name is: errors are everywhere."""
-
-GAP = 0.05
-"""Chi-square per reading beyond the noise below which there is no gap to close."""
 
 
 def diagnose_together(
@@ -240,15 +244,6 @@ def _doubted(found: Explanation) -> tuple[Cause, ...]:
 
 
 # --- what is told ----
-@dataclass(frozen=True)
-class _Stage:
-    """One model of the ring: small errors, which a reference has too, causes, what it leaves."""
-
-    static: tuple[Cause, ...]
-    causes: tuple[Cause, ...]
-    point: Point
-
-
 def _told(
     ring: Ring,
     parts: Sequence[Part],
@@ -271,11 +266,11 @@ def _told(
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
     kept = problem.without(found.dropped)
-    stages = _stages(kept, found, small, causes)
-    views = _views(parts, kept, stages)
+    stages = stages_of(kept, found, small, causes)
+    views = views_of(parts, kept, stages)
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
-    heldout = _held_out(parts, problem.fixed, stages, aside, since)
+    heldout = held_out(parts, problem.fixed, stages, aside, since)
     if heldout is None:
         said = (*said, "nothing is held out, so nobody but the fit judges the gap")
     warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
@@ -287,11 +282,11 @@ def _told(
     return Diagnosis(
         verdict=verdict,
         findings=tuple(
-            replace(one, seen_by=_seen_by(parts, kept, stages[-1].point, one))
+            replace(one, seen_by=seen_by(parts, kept, stages[-1].point, one))
             for one in with_consequences(ring, findings, causes)
         ),
-        fit_before=_misfit(_pairs(parts, kept, stages[0])),
-        fit_after=_misfit(_pairs(parts, kept, stages[-1])),
+        fit_before=misfit_of(pairs_of(parts, kept, stages[0])),
+        fit_after=misfit_of(pairs_of(parts, kept, stages[-1])),
         heldout=heldout,
         heldout_shots=(),
         unexplained={"p_value": p_value, "places": []},
@@ -324,135 +319,6 @@ def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:
     at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
     aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
     return replace(found, monitors=aside)
-
-
-def _stages(
-    problem: Together, found: Explanation, small: Learnt | None, causes: tuple[Cause, ...]
-) -> list[_Stage]:
-    """The design; then with small errors and with the causes among them, or with one cause after
-    the other."""
-    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...]]] = [((), ())]
-    if small is not None:
-        inner = found.problem
-        assert isinstance(inner, Among)
-        for one in (found.before, found.fit)[: 1 + bool(causes)]:
-            amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
-            models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
-        if causes:
-            models[-1] = (models[-1][0], causes)
-    else:
-        models += [((), causes[: i + 1]) for i in range(len(causes))]
-    return [
-        _Stage(
-            static,
-            own,
-            settled(replace(problem, fixed=(*problem.fixed, *static)), own, problem.first),
-        )
-        for static, own in models
-    ]
-
-
-def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
-    """Residuals in units of the noise, and the noise, of the readings of a problem (of some)."""
-    there = problem.valid if among is None else problem.valid & among
-    rows = problem.as_rows(there.astype(float))
-    own = rows > 0
-    return point.residual[own], 1 / rows[own]
-
-
-def _views(
-    parts: Sequence[Part], problem: Together, stages: Sequence[_Stage]
-) -> tuple[PartView, ...]:
-    """What each measurement leaves before and after."""
-    views = []
-    for i, (part, own) in enumerate(zip(parts, problem.parts, strict=False)):
-        points = [stage.point.view[i] for stage in (stages[0], stages[-1])]
-        owner = own.owner()[own.valid]
-        by_monitor = np.full((2, len(own.monitors)), np.nan)
-        for row, point in zip(by_monitor, points, strict=True):
-            left, _ = _left(own, point)
-            for m in np.unique(owner[owner >= 0]):
-                row[m] = np.sqrt(np.mean(left[owner == m] ** 2))
-        before, after = (_misfit([(own, point)]) for point in points)
-        count = int(own.valid.sum())
-        views.append(
-            PartView(part.label, part.kind, count, before, after, tuple(own.monitors), by_monitor)
-        )
-    return tuple(views)
-
-
-def _misfit(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = ()) -> Misfit:
-    """Of all readings, those in metres for the rms."""
-    left, sizes = [], []
-    for i, (problem, point) in enumerate(pairs):
-        some = among[i] if among else problem.valid
-        own, noise = _left(problem, point, some)
-        left.append(own)
-        metres = (problem.owner() >= 0)[problem.valid & some]
-        sizes.append((own * noise)[metres])
-    every, size = np.concatenate(left), np.concatenate(sizes)
-    rms = float(np.sqrt(np.mean(size**2))) if len(size) else float("nan")
-    return Misfit(rms, float(np.mean(every**2)) if len(every) else float("nan"))
-
-
-def _pairs(parts: Sequence[Part], problem: Together, stage: _Stage) -> list[tuple[Problem, Point]]:
-    """Of the measurements themselves, not of their reference."""
-    if stage.point.lost:
-        raise MeasurementError(f"{stage.point.lost}, with what was found: too much to be explained")
-    return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
-
-
-def _held_out(
-    parts: Sequence[Part],
-    fixed: tuple[Cause, ...],
-    stages: Sequence[_Stage],
-    aside: set[str],
-    since: int,
-) -> Gap | None:
-    """Half of the monitors gives a held-out shot its nuisances, the other half judges; monitors
-    that were set aside do neither."""
-    judges = []
-    for part in parts:
-        if (judge := part.heldout) is not None:
-            lost = [i for i, name in enumerate(judge.monitors) if name in aside]
-            judges.append(judge.without(np.isin(judge.owner(), lost)))
-    if not judges:
-        return None
-    misfits = []
-    for stage in stages:
-        pairs, among = [], []
-        for judge in judges:
-            seen = [
-                c
-                for c in (*fixed, *stage.static, *stage.causes)
-                if judge.sees((c.effect, c.element))
-            ]
-            there = replace(judge, fixed=tuple(seen))
-            scored = there.owner() % 2 == 1
-            gives = settled(there.without(scored), (), there.first)
-            pairs.append((there, there.at((), gives.nuisances)))
-            among.append(scored)
-        misfits.append(_misfit(pairs, among))
-    before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
-    there_is = before > GAP and since < len(misfits) - 1
-    return Gap(
-        tuple(misfits), np.zeros((0, 0, 0)), 1 - after / before if there_is else None, None, since
-    )
-
-
-def _seen_by(
-    parts: Sequence[Part], problem: Together, point: Point, finding: Finding
-) -> dict[str, float] | None:
-    """Share of each measurement in what is known of a finding's amount."""
-    own = [i for i, c in enumerate(point.causes)
-           if (c.effect, c.element) == (finding.effect, finding.element)]  # fmt: skip
-    if not own or point.projection is None or find(point.causes[own[0]].effect).discrete:
-        return None
-    row = point.projection.out(problem.slope(point, own[0]))
-    assert isinstance(point.projection, Blocks)
-    squares = [float(mine @ mine) for mine in point.projection.split(row)][: len(parts)]
-    total = max(sum(squares), 1e-300)
-    return {part.label: square / total for part, square in zip(parts, squares, strict=True)}
 
 
 def _noise(parts: Sequence[Part]) -> tuple[float, float]:

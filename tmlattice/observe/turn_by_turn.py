@@ -24,8 +24,9 @@ from tmlattice.observe.stored import Beams, Stored, rf_of, stacked
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-TUNE = 1e-4
-"""Below this a tune is not believed: it moves with the amplitude, which the model leaves out."""
+TUNE = 3e-4
+"""Below this a tune is not believed: it moves with the amplitude, which the model leaves out (by
+1.5e-4 on PETRA III at half a millimetre)."""
 
 FLOOR = 3e-4
 """Share of a line below which its error is not believed: what amplitude and decoherence do to the

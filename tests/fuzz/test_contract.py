@@ -1,0 +1,53 @@
+"""Some of what `make fuzz` does, with the same seeds each time."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from contract import broken, made, report, tried
+from kills import filled, killed, prepared, references
+
+SOME = 104
+"""Inputs, eight of each format; `make fuzz` takes 10,000."""
+WRITING = ("simulate", "check", "import")
+"""Of the commands, the quick ones; `make fuzz` kills all of them."""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("fuzz"), challenges=False)
+
+
+def test_undamaged_files_are_accepted(inputs):
+    for name in inputs.names:
+        words, _ = inputs.of(name)
+        tally = inputs.tallies.setdefault(
+            name, type("T", (), {"longest": 0, "slow": 0, "refused": 0, "accepted": 0})
+        )
+        assert broken(words, inputs.folder, tally) is None
+        assert tally.accepted == 1, name
+    inputs.tallies.clear()
+
+
+def test_damaged_files_end_in_one_sentence(inputs):
+    found = [
+        tried(seed, inputs.folder, inputs, np.random.default_rng([19, seed]))
+        for seed in range(SOME)
+    ]
+    wrong = [own for own in found if own[1] is not None]
+    assert not wrong, report(inputs)
+    assert sum(tally.refused for tally in inputs.tallies.values()) > SOME / 2, report(inputs)
+
+
+def test_killed_commands_and_full_disks_leave_nothing_half_written(tmp_path):
+    master, folder = tmp_path / "master", tmp_path / "work"
+    master.mkdir()
+    prepared(master, challenges=False)
+    whole, results = references(master, folder, WRITING)
+    rng = np.random.default_rng(19)
+    for name in WRITING:
+        assert killed(name, whole, results, master, folder, rng)[0] is None, name
+        assert filled(name, results, master, folder, 100) is None, name

@@ -1,0 +1,165 @@
+"""What a joint diagnosis leaves of each measurement, model after model, and who judges.
+
+The models are the design, the design with small errors, and that with what was found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.kinds import Part
+from tmlattice.diagnosis.result import Finding, PartView
+from tmlattice.effects import Cause, find
+from tmlattice.errors import MeasurementError
+from tmlattice.inference.among import Among, Learnt
+from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.newton import settled
+from tmlattice.inference.problem import Point, Problem
+from tmlattice.inference.search import Explanation
+from tmlattice.inference.together import Blocks, Together
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+GAP = 0.05
+"""Chi-square per reading beyond the noise below which there is no gap to close."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One model of the ring: small errors, which a reference has too, causes, what it leaves."""
+
+    static: tuple[Cause, ...]
+    causes: tuple[Cause, ...]
+    point: Point
+
+
+def stages_of(
+    problem: Together, found: Explanation, small: Learnt | None, causes: tuple[Cause, ...]
+) -> list[Stage]:
+    """The design; then with small errors and with the causes among them, or with one cause after
+    the other."""
+    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...]]] = [((), ())]
+    if small is not None:
+        inner = found.problem
+        assert isinstance(inner, Among)
+        for one in (found.before, found.fit)[: 1 + bool(causes)]:
+            amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
+            models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
+        if causes:
+            models[-1] = (models[-1][0], causes)
+    else:
+        models += [((), causes[: i + 1]) for i in range(len(causes))]
+    return [
+        Stage(
+            static,
+            own,
+            settled(replace(problem, fixed=(*problem.fixed, *static)), own, problem.first),
+        )
+        for static, own in models
+    ]
+
+
+def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
+    """Residuals in units of the noise, and the noise, of the readings of a problem (of some)."""
+    there = problem.valid if among is None else problem.valid & among
+    rows = problem.as_rows(there.astype(float))
+    own = rows > 0
+    return point.residual[own], 1 / rows[own]
+
+
+def views_of(
+    parts: Sequence[Part], problem: Together, stages: Sequence[Stage]
+) -> tuple[PartView, ...]:
+    """What each measurement leaves before and after."""
+    views = []
+    for i, (part, own) in enumerate(zip(parts, problem.parts, strict=False)):
+        points = [stage.point.view[i] for stage in (stages[0], stages[-1])]
+        owner = own.owner()[own.valid]
+        by_monitor = np.full((2, len(own.monitors)), np.nan)
+        for row, point in zip(by_monitor, points, strict=True):
+            left, _ = _left(own, point)
+            for m in np.unique(owner[owner >= 0]):
+                row[m] = np.sqrt(np.mean(left[owner == m] ** 2))
+        before, after = (misfit_of([(own, point)]) for point in points)
+        count = int(own.valid.sum())
+        views.append(
+            PartView(part.label, part.kind, count, before, after, tuple(own.monitors), by_monitor)
+        )
+    return tuple(views)
+
+
+def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = ()) -> Misfit:
+    """Of all readings, those in metres for the rms."""
+    left, sizes = [], []
+    for i, (problem, point) in enumerate(pairs):
+        some = among[i] if among else problem.valid
+        own, noise = _left(problem, point, some)
+        left.append(own)
+        metres = (problem.owner() >= 0)[problem.valid & some]
+        sizes.append((own * noise)[metres])
+    every, size = np.concatenate(left), np.concatenate(sizes)
+    rms = float(np.sqrt(np.mean(size**2))) if len(size) else float("nan")
+    return Misfit(rms, float(np.mean(every**2)) if len(every) else float("nan"))
+
+
+def pairs_of(parts: Sequence[Part], problem: Together, stage: Stage) -> list[tuple[Problem, Point]]:
+    """Of the measurements themselves, not of their reference."""
+    if stage.point.lost:
+        raise MeasurementError(f"{stage.point.lost}, with what was found: too much to be explained")
+    return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
+
+
+def held_out(
+    parts: Sequence[Part],
+    fixed: tuple[Cause, ...],
+    stages: Sequence[Stage],
+    aside: set[str],
+    since: int,
+) -> Gap | None:
+    """Half of the monitors gives a held-out shot its nuisances, the other half judges; monitors
+    that were set aside do neither."""
+    judges = []
+    for part in parts:
+        if (judge := part.heldout) is not None:
+            lost = [i for i, name in enumerate(judge.monitors) if name in aside]
+            judges.append(judge.without(np.isin(judge.owner(), lost)))
+    if not judges:
+        return None
+    misfits = []
+    for stage in stages:
+        pairs, among = [], []
+        for judge in judges:
+            seen = [
+                c
+                for c in (*fixed, *stage.static, *stage.causes)
+                if judge.sees((c.effect, c.element))
+            ]
+            there = replace(judge, fixed=tuple(seen))
+            scored = there.owner() % 2 == 1
+            gives = settled(there.without(scored), (), there.first)
+            pairs.append((there, there.at((), gives.nuisances)))
+            among.append(scored)
+        misfits.append(misfit_of(pairs, among))
+    before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
+    there_is = before > GAP and since < len(misfits) - 1
+    return Gap(
+        tuple(misfits), np.zeros((0, 0, 0)), 1 - after / before if there_is else None, None, since
+    )
+
+
+def seen_by(
+    parts: Sequence[Part], problem: Together, point: Point, finding: Finding
+) -> dict[str, float] | None:
+    """Share of each measurement in what is known of a finding's amount."""
+    own = [i for i, c in enumerate(point.causes)
+           if (c.effect, c.element) == (finding.effect, finding.element)]  # fmt: skip
+    if not own or point.projection is None or find(point.causes[own[0]].effect).discrete:
+        return None
+    row = point.projection.out(problem.slope(point, own[0]))
+    assert isinstance(point.projection, Blocks)
+    squares = [float(mine @ mine) for mine in point.projection.split(row)][: len(parts)]
+    total = max(sum(squares), 1e-300)
+    return {part.label: square / total for part, square in zip(parts, squares, strict=True)}
