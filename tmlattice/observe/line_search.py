@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from tmlattice.observe.line_fit import NARROW, WIDEST, LineFit, fit_lines
 
@@ -110,7 +110,7 @@ def _typical(power: Array) -> Array:
 def _seen(signals: int, trials: int) -> float:
     """What `_typical` of so many signals' noise exceeds in so many trials by CHANCE."""
     above = signals - signals // 2
-    return float(-np.log(beta.ppf(CHANCE / trials, above, signals - above + 1)))
+    return float(-np.log(betaincinv(above, signals - above + 1, CHANCE / trials)))
 
 
 def _others(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
