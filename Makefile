@@ -1,5 +1,6 @@
 # Two commands do everything on a fresh machine with Python and make:
-#   make run     the environment, then `tmlattice tune-fit` on the built-in ring
+#   make run     the environment, then on the built-in ring: one orbit to the tunes, and a fault
+#                that is measured, found, named and reported
 #   make test    the environment, then the tests
 PYTHON ?= python3
 VENV ?= .venv
@@ -12,6 +13,8 @@ PARALLEL = --numprocesses logical --maxprocesses 8 --dist loadfile --no-loadscop
 
 run: $(VENV)/installed
 	$(BIN)/tmlattice tune-fit
+	$(BIN)/tmlattice simulate petra3 --effect "quadrupole_gradient qd::12 -0.05" --out first-run/day --force
+	$(BIN)/tmlattice diagnose petra3 first-run/day --out first-run/report
 
 test: $(VENV)/installed
 	$(BIN)/python -m pytest -m "not slow" $(PARALLEL)

@@ -1,10 +1,11 @@
 """Batches: failures stay alone, finished cases are kept, local processes and a scheduler agree."""
 
 import json
+import sys
 
 import pytest
 
-from tmlattice.batch import finished, run_batch
+from tmlattice.batch import fingerprint, finished, run_batch
 from tmlattice.errors import TmlatticeError
 
 
@@ -49,3 +50,42 @@ def test_two_processes_and_a_scheduler_by_its_address(tmp_path):
 def test_no_scheduler_is_one_sentence(tmp_path):
     with pytest.raises(TmlatticeError, match="no Dask scheduler answers"):
         run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)
+
+
+def test_results_of_other_data_or_of_nobody_are_done_again(tmp_path):
+    marks = {name: fingerprint("lattice", name) for name in "abc"}
+
+    def once(value, marks):
+        some = cases(**{name: {"n": value} for name in "abc"})
+        return run_batch(dict, some, tmp_path, jobs=1, progress=False, made_by=marks)
+
+    once(1, marks)
+    marks["a"] = fingerprint("another lattice", "a")
+    (tmp_path / "b.json").write_text("null")
+    again = once(2, marks)
+    assert {name: result["n"] for name, result in again.items()} == {"a": 2, "b": 2, "c": 1}
+    (tmp_path / "c.json").write_text("[" * 100_000)
+    assert once(3, marks)["c"]["n"] == 3
+
+
+def loud(case):
+    import warnings
+
+    warnings.warn(f"case {case} is odd", UserWarning, stacklevel=1)
+    warnings.warn("all of them are", UserWarning, stacklevel=1)
+    return {"n": case}
+
+
+def test_warnings_of_worker_processes_reach_the_user(tmp_path):
+    """Each once, whatever the number of processes."""
+    with pytest.warns(UserWarning, match="odd|all of them") as told:
+        run_batch(loud, cases(a=1, b=2, c=3), tmp_path, jobs=2, progress=False)
+    texts = sorted(str(w.message) for w in told if w.category is UserWarning)
+    assert texts == ["all of them are", "case 1 is odd", "case 2 is odd", "case 3 is odd"]
+
+
+def test_several_processes_without_their_package_say_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(TmlatticeError, match=r"pip install 'tmlattice\[study\]'.*--workers 1"):
+        run_batch(dict, cases(a={}, b={}), tmp_path, jobs=2, progress=False)
+    assert run_batch(dict, cases(a={"n": 1}), tmp_path, jobs=1, progress=False)["a"] == {"n": 1}

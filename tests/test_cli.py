@@ -167,6 +167,37 @@ def test_help_imports_nothing_heavy(tmp_path):
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
 
 
+def test_help_groups_the_commands_by_what_they_are_for(tmp_path):
+    from tmlattice.cli.command import SECTIONS
+    from tmlattice.cli.command import tmlattice as group
+
+    done = tmlattice("--help", cwd=tmp_path, check=0)
+    at = [done.stdout.index(f"\n{title}:") for title in ("Measure", "Fit", "Diagnose", "Study")]
+    assert at == sorted(at)
+    listed = [command.name for commands in SECTIONS.values() for command in commands]
+    assert sorted(listed) == sorted(group.commands)
+    for name in listed:
+        assert f"\n  {name} " in done.stdout, name
+
+
+def test_make_run_ends_with_a_fault_found_named_and_reported(tmp_path):
+    """The lines of the Makefile behind the tunes, which have a test of their own."""
+    import shlex
+
+    lines = (Path(__file__).parent.parent / "Makefile").read_text().split("\nrun:")[1].splitlines()
+    commands = []
+    for line in lines[1:]:
+        if not line.startswith("\t"):
+            break
+        commands.append(shlex.split(line.strip().removeprefix("$(BIN)/tmlattice ")))
+    assert commands[0] == ["tune-fit"]
+    for words in commands[1:]:
+        done = tmlattice(*words, cwd=tmp_path, check=0)
+    assert words[0] == "diagnose"
+    assert "NAMED: quadrupole qd::12" in done.stdout
+    assert (tmp_path / "first-run" / "report" / "report.html").stat().st_size > 10_000
+
+
 def test_version_has_one_source(tmp_path):
     from importlib.metadata import version
 

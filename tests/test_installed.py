@@ -68,3 +68,33 @@ def test_installed_command_is_there(tmp_path):
     assert run(
         "-I", "-c", "import tmlattice; print(tmlattice.load_ring('petra3').name)", cwd=tmp_path
     )
+
+
+def test_the_conda_recipe_asks_for_what_pip_does():
+    """Names that differ between the two stand here; versions and the rest are the same."""
+    import tomllib
+
+    import yaml
+
+    from tmlattice import __version__
+
+    recipe = yaml.safe_load((ROOT / "packaging" / "conda" / "recipe.yaml").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+    ours = {f"python{project['requires-python']}"}
+    for wanted in project["dependencies"]:
+        name, _, least = wanted.partition(">=")
+        ours.add(f"{names.get(name, name)}>={least}")
+    assert {wanted.replace(" ", "") for wanted in recipe["requirements"]["run"]} == ours
+    assert recipe["context"]["version"] == __version__
+    command = project["scripts"]["tmlattice"]
+    assert recipe["build"]["python"]["entry_points"] == [f"tmlattice = {command}"]
+
+
+def test_a_plain_install_takes_nothing_that_only_studies_need():
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    plain = {wanted.partition(">=")[0] for wanted in project["dependencies"]}
+    assert not plain & {"distributed", "dask", "scikit-learn"}
+    assert any("distributed" in wanted for wanted in project["optional-dependencies"]["study"])

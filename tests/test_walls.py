@@ -22,6 +22,10 @@ BESIDE = {
     "files",
     "temporaries",
     "cache",
+    "by_name",
+    "late",
+    "speaks",
+    "workers",
     "batch",
     "schemas",
 }  # everybody may use them

@@ -1,19 +1,48 @@
 """tmlattice: the gap between the model of a storage ring and the ring itself.
 
-Magnets as second-order Taylor maps from OCELOT, the ring as a torch network of one unshared layer
-per magnet, fine-tuned on one perturbed first-turn orbit, tracked for its tunes.
+Magnets as second-order Taylor maps from OCELOT, the ring as a network of one unshared layer per
+magnet; from one first turn, or from whatever else was measured, to the tunes and to the magnet that
+is wrong.
+
+The tour
+--------
+A ring is a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), or a `Ring`:
 
 >>> import tmlattice
 >>> ring = tmlattice.load_ring("petra3")
->>> network = tmlattice.TaylorNetwork.from_ring(ring)
->>> readings = network([[1e-3, 0, 1e-3, 0]])              # [1, 246, 2], m
->>> states = network.track([[1e-5, 0, 1e-5, 0]], turns=500)
->>> tmlattice.tunes(states, tmlattice.one_turn_optics(network)).fraction
+>>> figure = ring.plot()                                   # betas and magnets
+
+A machine whose fault is known, what its monitors read, and what that says:
+
 >>> weak = [tmlattice.Cause("quadrupole_gradient", "qd::12", -0.2)]
 >>> measurement = tmlattice.simulate(ring, weak, shots=6, seed=1).measurement()
+>>> diagnosis = tmlattice.diagnose(ring, measurement)
+>>> print(diagnosis.report())                              # diagnosis.plot(), .save("folder")
 
-Names are imported when they are first used: `import tmlattice` itself loads neither torch nor
-OCELOT, which take seconds.
+Your own: a folder, or a control room's file (`tmlattice import --example` writes templates):
+
+>>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")
+
+The paper's experiment, one orbit to the tunes, by the recipe and by what does better:
+
+>>> print(tmlattice.tune_fit("petra3").advice)
+
+The network itself:
+
+>>> network = tmlattice.TaylorNetwork.from_ring(ring)
+>>> readings = network([[1e-3, 0, 1e-3, 0]])               # [1, 246, 2], m
+>>> states = network.track([[1e-5, 0, 1e-5, 0]], turns=500)
+>>> tmlattice.tunes(states, tmlattice.one_turn_optics(network)).fraction
+
+Where things are
+----------------
+`lattice` rings and their files; `effects` what can be wrong, `CATALOGUE`; `measurement` what was
+read; `importers` other programs' files; `machine` the virtual machine; `diagnosis`, `fitting`;
+`optics`, `harmonics`; `plots`; `report`. Each is there after `import tmlattice`, and each says in
+its own `help` what it holds. On the command line: `tmlattice --help`.
+
+Names and rooms are imported when they are first used: `import tmlattice` itself loads neither torch
+nor OCELOT, which take seconds.
 """
 
 from importlib import import_module
@@ -22,6 +51,22 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from tmlattice import challenge as challenge
+    from tmlattice import diagnosis as diagnosis
+    from tmlattice import effects as effects
+    from tmlattice import errors as errors
+    from tmlattice import fitting as fitting
+    from tmlattice import harmonics as harmonics
+    from tmlattice import importers as importers
+    from tmlattice import lattice as lattice
+    from tmlattice import machine as machine
+    from tmlattice import maps as maps
+    from tmlattice import measurement as measurement
+    from tmlattice import network as network
+    from tmlattice import optics as optics
+    from tmlattice import plots as plots
+    from tmlattice import report as report
+    from tmlattice import systems as systems
     from tmlattice.diagnosis import Diagnosis as Diagnosis
     from tmlattice.diagnosis import diagnose as diagnose
     from tmlattice.effects import CATALOGUE as CATALOGUE
@@ -67,10 +112,18 @@ _HOME = {
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
+_ROOMS = (
+    "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
+    "inference", "observe", "diagnosis", "importers", "fitting", "machine", "challenge", "systems",
+    "plots", "report", "errors",
+)  # fmt: skip
+
 __all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604  (they are strings)
 
 
 def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        return import_module(f"tmlattice.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'tmlattice' has no attribute '{name}'")
     value = getattr(import_module(f"tmlattice.{_MODULE_OF[name]}"), name)
@@ -79,4 +132,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, *_ROOMS]

@@ -16,6 +16,7 @@ from tmlattice.beam.aperture import APERTURE, check_alive
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.beam.sweeps import curved
+from tmlattice.by_name import by_name
 from tmlattice.errors import BeamLostError, UnstableRingError
 from tmlattice.lattice.ring import Ring
 from tmlattice.maps import RingMaps, TaylorMap, ring_maps
@@ -256,6 +257,7 @@ class Chain(LayerChain):
         self.maps = maps
 
     @classmethod
+    @by_name
     def from_ring(cls, ring: Ring, dimension: int = 4) -> Self:
         """The chain of a ring's design, from OCELOT's maps.
 

@@ -19,13 +19,36 @@ from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, plain
 
 BAD_INPUT = 2
 STOPPED = 130  # as the shell has it for Ctrl-C
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+class Sections(click.Group):
+    """A group whose help lists its commands by what they are for."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """In the order of `SECTIONS`."""
+        limit = formatter.width - 6 - max(map(len, self.commands))
+        for title, commands in SECTIONS.items():
+            rows = [(c.name or "", c.get_short_help_str(limit)) for c in commands]
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
+SECTIONS: dict[str, tuple[click.Command, ...]] = {
+    "Measure": (info, simulate, import_files, check),
+    "Fit": (tune_fit, predict),
+    "Diagnose": (diagnose, effects),
+    "Study": (study, challenge, reproduce),
+}
+
+
+@click.group(
+    cls=Sections,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
 @click.version_option(__version__, prog_name="tmlattice")
 def tmlattice() -> None:
     """The gap between the model of a storage ring and the ring itself.
@@ -37,17 +60,9 @@ def tmlattice() -> None:
     """
 
 
-tmlattice.add_command(tune_fit)
-tmlattice.add_command(info)
-tmlattice.add_command(study)
-tmlattice.add_command(import_files)
-tmlattice.add_command(simulate)
-tmlattice.add_command(effects)
-tmlattice.add_command(check)
-tmlattice.add_command(diagnose)
-tmlattice.add_command(predict)
-tmlattice.add_command(reproduce)
-tmlattice.add_command(challenge)
+for _commands in SECTIONS.values():
+    for _command in _commands:
+        tmlattice.add_command(_command)
 
 
 def main() -> NoReturn:
@@ -75,8 +90,13 @@ def main() -> NoReturn:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    click.echo(f"tmlattice: {message}", err=True)
+    click.echo(f"tmlattice: {_shown(message)}", err=True)
     sys.exit(code)
+
+
+def _shown(message: str) -> str:
+    """Names of files, elements and keys may hold what steers a terminal; lines stay lines."""
+    return "\n".join(plain(line) for line in message.splitlines())
 
 
 def _show_warning(
@@ -87,4 +107,5 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    click.echo(f"tmlattice: warning: {message}", err=True)
+    if not issubclass(category, RuntimeWarning):  # numpy's, of numbers that are judged elsewhere
+        click.echo(f"tmlattice: warning: {_shown(str(message))}", err=True)

@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
@@ -47,6 +48,7 @@ SPIKE = 20.0
 """Sigma from which one reading is wrong for once, where its neighbours agree without it."""
 
 
+@by_name
 def check_data(
     ring: Ring,
     data: Measurement | OrbitResponse,
@@ -139,7 +141,10 @@ def _stated(ring: Ring, data: Measurement | OrbitResponse) -> Check:
 # --- first turns ----------------------------------------------------------------------------------
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
     flat = data.readings.reshape(-1, len(data.monitors), 2)
-    checks = [*signals.monitors(ring, data.monitors, flat), *signals.first_turns(ring, data)]
+    moved = bool(np.ptp(data.launches, axis=0).any()) or any(data.settings)
+    checks = [
+        *signals.monitors(ring, data.monitors, flat, moved), *signals.first_turns(ring, data)
+    ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
     judge = Judge(ring, data, known)
@@ -286,6 +291,8 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
 # --- an orbit response ----------------------------------------------------------------------------
 def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     checks = signals.monitors(ring, data.monitors, data.response)
+    if any(check.status == "wrong" for check in checks):
+        return checks
     judge = ResponseJudge(ring, data)
     verdicts = judge.verdicts()
     for verdict in verdicts:

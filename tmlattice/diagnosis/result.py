@@ -12,8 +12,10 @@ from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
+from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference.among import Known
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
@@ -57,8 +59,8 @@ class Member:
         return dict(vars(self))
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, repr=False)
+class Finding(ShownFinding):
     """One thing that is wrong.
 
     Attributes:
@@ -215,14 +217,16 @@ class JointView:
     Attributes:
         explanation: the search.
         parts: the measurements.
+        known: of the small errors, beyond what was found; None: there are none.
     """
 
     explanation: Explanation
     parts: tuple[PartView, ...]
+    known: Known | None = None
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(ShownDiagnosis):
     """What a measurement says of a ring. See `as_json` for the file format.
 
     Attributes:

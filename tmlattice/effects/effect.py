@@ -18,6 +18,7 @@ from tmlattice.effects.cause import Cause
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
+from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
 
@@ -344,7 +345,23 @@ class Monitors:
         return np.asarray(readings)
 
 
-CATALOGUE: dict[str, Effect] = {}
+class Catalogue(dict[str, Effect], Speaks):
+    """Effects by name; a name that is not there is answered with the nearest ones."""
+
+    def __missing__(self, name: str) -> Effect:
+        """UnknownNameError: no such effect."""
+        raise unknown_name("effect", name, self)
+
+    __repr__ = Speaks.__repr__
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        groups: dict[str, list[str]] = {}
+        for name, effect in self.items():
+            groups.setdefault(effect.group, []).append(name)
+        return f"of {len(self)} effects", {g: ", ".join(own) for g, own in groups.items()}
+
+
+CATALOGUE = Catalogue()
 """Every effect by its name, in the order in which reports list them."""
 
 
@@ -360,12 +377,10 @@ def find(name: str) -> Effect:
     Raises:
         UnknownNameError: with the nearest names.
     """
-    if name in CATALOGUE:
-        return CATALOGUE[name]
-    try:
-        return CATALOGUE[name.strip().casefold()]
-    except KeyError:
-        raise unknown_name("effect", name, CATALOGUE) from None
+    for spelling in (name, name.strip().casefold()):
+        if spelling in CATALOGUE:
+            return CATALOGUE[spelling]
+    raise unknown_name("effect", name, CATALOGUE)
 
 
 def names(chosen: Iterable[str] | None = None) -> list[str]:

@@ -17,6 +17,7 @@ from tmlattice.fitting.launches import FreeLaunches
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork, symplectic_penalty
 from tmlattice.network.symplectic import symplectic_coefficients
+from tmlattice.speaks import Speaks
 
 
 class Regularization(StrEnum):
@@ -28,8 +29,8 @@ class Regularization(StrEnum):
     L2 = "l2"
 
 
-@dataclass(frozen=True)
-class FitResult:
+@dataclass(frozen=True, repr=False)
+class FitResult(Speaks):
     """A fine-tuned network and how it came about.
 
     Attributes:
@@ -59,6 +60,19 @@ class FitResult:
     tune_sigma: NDArray[np.float64] | None = None
     changes: dict[str, tuple[float, float]] = field(default_factory=dict)
     launches: NDArray[np.float64] | None = None
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        largest = sorted(self.changes.items(), key=lambda own: -abs(own[1][0]))[:3]
+        changed = (f"{name} {100 * amount:+.3g} %" for name, (amount, _) in largest)
+        tunes = "" if self.tunes is None else " ".join(f"{q:.6f}" for q in self.tunes)
+        return str(self.options.get("method", "adam")), {
+            "layers": str(len(self.network.layers)),
+            "steps": str(len(self.loss)),
+            "loss": f"{self.loss[0]:.3g} to {min(self.loss):.3g} m²",
+            "tunes": tunes,
+            "changes": ", ".join(changed),
+            "seconds": f"{self.seconds:.2f}",
+        }
 
 
 def fit_adam(

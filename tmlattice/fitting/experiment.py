@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.by_name import by_name
 from tmlattice.errors import (
     MeasurementError,
     TmlatticeError,
@@ -100,6 +101,7 @@ def changed_ring(ring: Ring, magnet: str, change: float | None) -> tuple[Ring, A
     )
 
 
+@by_name
 def tune_fit(
     ring: Ring,
     magnet: str | None = None,
@@ -165,6 +167,7 @@ def tune_fit(
     )
 
 
+@by_name
 def tune_fit_measurement(
     ring: Ring,
     measurement: Measurement,

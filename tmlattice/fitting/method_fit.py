@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.fitting.adam import FitResult
+from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
 
@@ -18,8 +19,8 @@ BY_CHANCE = 5.0
 """Standard errors by which a misfit may exceed the noise before it is more than noise."""
 
 
-@dataclass(frozen=True)
-class MethodFit:
+@dataclass(frozen=True, repr=False)
+class MethodFit(Speaks):
     """One method's fit of the readings. Tunes are fractions (x, y); None where there is none.
 
     Attributes:
@@ -51,6 +52,16 @@ class MethodFit:
     chi2: float | None
     seconds: float
     problem: str | None = None
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        tunes = "none" if self.tunes is None else " ".join(f"{q:.6f}" for q in self.tunes)
+        return self.method, {
+            "tunes": tunes,
+            "leaves": f"{1e6 * self.rms:.4g} µm",
+            "noise": f"{1e6 * self.noise:.4g} µm",
+            "named": ", ".join(self.named),
+            "problem": self.problem or "",
+        }
 
     @property
     def named(self) -> dict[str, tuple[float, float]]:

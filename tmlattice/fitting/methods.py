@@ -3,6 +3,7 @@
 from enum import StrEnum
 from typing import Any
 
+from tmlattice.by_name import by_name
 from tmlattice.errors import unknown_choice
 from tmlattice.fitting.adam import FitResult, fit_adam
 from tmlattice.fitting.few import fit_sparse
@@ -20,6 +21,7 @@ class Method(StrEnum):
     TOLD = "told"
 
 
+@by_name
 def fine_tune(
     network: TaylorNetwork | SymplecticNetwork,
     measurement: Measurement,

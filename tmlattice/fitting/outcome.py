@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.advice import advice
 from tmlattice.fitting.method_fit import MethodFit, errors, pair, trusted
+from tmlattice.late import Method
 from tmlattice.lattice import Ring
+from tmlattice.speaks import Speaks, last_part
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class TuneFit:
+@dataclass(frozen=True, repr=False)
+class TuneFit(Speaks):
     """What `tune_fit` found. Tunes are fractions (x, y); None where there is no tune.
 
     `fit`, `network_tunes`, `tune_signal`, `growth`, `after`, `orbit_rms` and `problem` are those of
@@ -61,6 +63,22 @@ class TuneFit:
     shots: int = 1
     source: str | None = None
     noise_estimated: bool = False
+
+    plot = Method(
+        "tmlattice.plots.orbit",
+        "plot_orbit_fit",
+        "Draw the readings and what each method leaves of them: a matplotlib Figure.",
+    )
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        def both(tunes: Array | None) -> str:
+            return "" if tunes is None else " ".join(f"{q:.6f}" for q in tunes)
+
+        rows = {"design tunes": both(self.design_tunes), "true tunes": both(self.true_tunes)}
+        rows |= {f"tunes of {m.method}": both(m.tunes) or "none" for m in self.methods}
+        rows["trusted"] = "none" if self.trusted is None else self.trusted.method
+        what = self.source if self.change is None else f"{self.magnet} {100 * self.change:+g} %"
+        return f"of {last_part(self.ring.name)}, {what}", rows
 
     @property
     def _first(self) -> MethodFit:

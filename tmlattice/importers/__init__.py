@@ -7,5 +7,6 @@
 
 from tmlattice.importers.bring_in import Options, bring_in
 from tmlattice.importers.imported import Imported, described, write_imported
+from tmlattice.importers.told import Told, read_told
 
-__all__ = ["Imported", "Options", "bring_in", "described", "write_imported"]
+__all__ = ["Imported", "Options", "Told", "bring_in", "described", "read_told", "write_imported"]

@@ -10,6 +10,8 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.late import Method
+from tmlattice.speaks import Speaks, last_part, shown
 
 Kind = Literal[
     "drift",
@@ -189,8 +191,8 @@ PROTON_GEV = 0.93827208943
 PARTICLES = {"electron": ELECTRON_GEV, "proton": PROTON_GEV}
 
 
-@dataclass(frozen=True)
-class Ring:
+@dataclass(frozen=True, repr=False)
+class Ring(Speaks):
     """Elements in beam order, and the beam: its energy and its particle's mass.
 
     Attributes:
@@ -206,6 +208,23 @@ class Ring:
     energy: float
     changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mass: float = ELECTRON_GEV
+
+    plot = Method(
+        "tmlattice.plots.speaking",
+        "plot_ring",
+        "Draw its betas and its magnets: a matplotlib Figure; span=(from, to) in m for a part.",
+    )
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in self.elements)
+        return last_part(self.name), {
+            "length": f"{self.length:.3f} m",
+            "energy": f"{self.energy:g} GeV",
+            "magnets": str(len(self.magnets)),
+            "monitors": str(len(self.monitors)),
+            "correctors": str(correctors),
+            "changed": shown(self.changes),
+        }
 
     def __post_init__(self) -> None:
         if not self.energy > self.mass > 0:

@@ -11,11 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, beams, check, monitors_with
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.shots import Shots, stream
+from tmlattice.workers import Caught, caught, heard
 
 Array = NDArray[np.float64]
 
@@ -79,6 +81,7 @@ class Machine:
         TmlatticeError: another engine, or negative noise.
     """
 
+    @by_name
     def __init__(
         self,
         ring: Ring,
@@ -170,13 +173,13 @@ class Machine:
         setup = pickle.dumps((self.ring, self.causes, self._made_of, shots, turns, seed))
         size = min(jobs, len(chunks))
         with ProcessPoolExecutor(size, get_context("spawn"), _start, (setup,)) as pool:
-            waiting: deque[Future[Array]] = deque()
+            waiting: deque[Future[Caught]] = deque()
             for chunk in chunks:  # no more in flight than the processes need
-                waiting.append(pool.submit(_work, chunk))
+                waiting.append(pool.submit(caught, _work, chunk))
                 if len(waiting) > 2 * jobs:
-                    yield waiting.popleft().result()
+                    yield heard(waiting.popleft().result())
             while waiting:
-                yield waiting.popleft().result()
+                yield heard(waiting.popleft().result())
 
 
 _worker: tuple[Machine, Shots, int, int] | None = None

@@ -10,6 +10,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import rf_of
+from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, apply, background_rms, check, monitors_with
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
@@ -61,6 +62,7 @@ class ResponseSimulation:
         }
 
 
+@by_name
 def simulate_response(
     ring: Ring,
     causes: Sequence[Cause] = (),

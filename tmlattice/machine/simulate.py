@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
+from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, background_rms
 from tmlattice.lattice import Ring
 from tmlattice.machine.machine import Machine, true_causes
@@ -102,6 +103,7 @@ class Simulation:
         }
 
 
+@by_name
 def simulate(
     ring: Ring,
     causes: Sequence[Cause] = (),

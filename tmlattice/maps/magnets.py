@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice import cache
+from tmlattice.by_name import by_name
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Ring
 from tmlattice.maps.quadratic import (
@@ -265,6 +266,7 @@ def _moves(element: Element) -> bool:
     return not thin or element.errors != NO_ERRORS
 
 
+@by_name
 def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -> RingMaps:
     """Second-order maps of all magnets of a ring, and the read-outs of its monitors.
 

@@ -17,13 +17,14 @@ from tmlattice.measurement.checks import (
     spread,
 )
 from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.shown import Shown
 from tmlattice.measurement.trajectory import Settings
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedOrbit:
+@dataclass(frozen=True, eq=False, repr=False)
+class ClosedOrbit(Shown):
     """Closed orbits, absolute: what the monitors read, offsets and all.
 
     Attributes:

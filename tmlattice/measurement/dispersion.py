@@ -10,12 +10,13 @@ from tmlattice.errors import MeasurementError
 from tmlattice.measurement.checks import check_energy, check_values, keep, monitor_places, spread
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import RfStep, check_rf
+from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Dispersion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Dispersion(Shown):
     """Orbit changes for one or more steps of the RF.
 
     Attributes:

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.checks import check_energy, checked_shots, keep
+from tmlattice.measurement.shown import Shown
 from tmlattice.measurement.trajectory import Settings
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class TuneReading:
+@dataclass(frozen=True, eq=False, repr=False)
+class TuneReading(Shown):
     """Tunes, and chromaticities where they were measured, of one or more settings.
 
     A tune is the fraction of the full tune, in [0, 1): 37.87 is 0.87. A spectrum shows 0.13 for it:

@@ -17,6 +17,7 @@ from tmlattice.measurement.checks import (
     spread,
 )
 from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.shown import Shown
 from tmlattice.measurement.trajectory import Settings
 
 Array = NDArray[np.float64]
@@ -25,8 +26,8 @@ FEWEST, MOST = 16, 10_000
 """Turns: fewer have no line, more have lines that no decohering beam keeps."""
 
 
-@dataclass(frozen=True, eq=False)
-class TurnByTurn:
+@dataclass(frozen=True, eq=False, repr=False)
+class TurnByTurn(Shown):
     """Readings of a stored beam that was kicked before turn 0, on each of many turns.
 
     Attributes:

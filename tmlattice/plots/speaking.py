@@ -1,0 +1,142 @@
+"""The figure of an object that is asked to draw itself: `ring.plot()`, `diagnosis.plot()`, ..."""
+
+from collections.abc import Iterator
+from os import PathLike
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from tmlattice.beam.chain import Chain
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.errors import unknown_choice
+from tmlattice.lattice import Ring, load_ring
+from tmlattice.measurement import (
+    ClosedOrbit,
+    Dispersion,
+    Measurement,
+    OrbitResponse,
+    TuneReading,
+    TurnByTurn,
+    in_words,
+)
+from tmlattice.optics import twiss
+from tmlattice.plots.diagnosis import figures
+from tmlattice.plots.optics import plot_betas
+from tmlattice.plots.strip import lattice_strip
+
+Array = NDArray[np.float64]
+MOST = 8
+"""Shots that are drawn."""
+
+
+def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
+    """Betas along the ring, its lattice below.
+
+    Args:
+        ring: with a closed orbit and tunes.
+        span: from and to which s, m; else the whole ring.
+
+    Raises:
+        UnstableRingError: it has no betas.
+    """
+    figure = plot_betas(ring, twiss(Chain.from_ring(ring)), span=span)
+    figure.axes[0].set_title(ring.name, loc="right", fontsize="medium")
+    return figure
+
+
+def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
+    """One of the figures of the report.
+
+    Args:
+        diagnosis: of `diagnose`.
+        name: of the figure, such as "scan", "readings" or "gap"; else the scan along the ring, or
+            the maps of an orbit response.
+
+    Raises:
+        ChoiceError: no such figure; names those that there are.
+    """
+    found: dict[str, Figure] = {}
+    wanted = name or ("maps" if diagnosis.by_steps else "scan")
+    for own, _, figure in figures(diagnosis):
+        found[own] = figure
+        if own == wanted:
+            break
+    chosen = found.pop(wanted, None)
+    for figure in found.values():
+        plt.close(figure)
+    if chosen is not None:
+        return chosen
+    if name is None:  # a kind without a scan: its first
+        return next(iter(figures(diagnosis)))[2]
+    raise unknown_choice("figure", name, found)
+
+
+def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = None) -> Figure:
+    """What was read, x above y.
+
+    Args:
+        measured: of any kind.
+        ring: along which, with its lattice below; else by the number of the monitor.
+    """
+    known = ring if ring is None or isinstance(ring, Ring) else load_ring(ring)  # type: ignore[arg-type]
+    if isinstance(measured, TuneReading):
+        return _tunes(measured)
+    heights = [3, 3, 0.8] if known is not None else [3, 3]
+    figure, axes = plt.subplots(
+        len(heights), 1, figsize=(11, 6), sharex=True, height_ratios=heights, layout="constrained"
+    )
+    s = np.arange(len(measured.monitors), dtype=float)
+    if known is not None:
+        s = np.array([known[name].s for name in measured.monitors])
+        lattice_strip(known, axes[2])
+    order = np.argsort(s)
+    for label, values in _lines(measured):
+        for plane in range(2):
+            axes[plane].plot(
+                s[order], 1e3 * values[order, plane], ".-", linewidth=0.8, markersize=3, label=label
+            )
+    for plane in range(2):
+        axes[plane].set_ylabel(f"{'xy'[plane]} [mm]")
+        axes[plane].grid(alpha=0.25)
+    if known is None:
+        axes[1].set_xlabel("monitor")
+    if len(axes[0].lines) <= MOST:
+        axes[0].legend(fontsize="small", ncols=4, loc="upper right")
+    axes[0].set_title(in_words(measured), loc="left", fontsize="medium")
+    return figure
+
+
+def _lines(measured: Any) -> Iterator[tuple[str, Array]]:
+    """Label and values [monitor, 2], m."""
+    if isinstance(measured, Measurement | TurnByTurn):
+        for shot, readings in list(zip(measured.shots, measured.readings, strict=True))[:MOST]:
+            if isinstance(measured, TurnByTurn):
+                yield f"shot {shot}, rms over turns", np.sqrt(np.nanmean(readings**2, axis=0))
+            else:
+                yield f"shot {shot}", readings[0]
+    elif isinstance(measured, ClosedOrbit):
+        for shot, orbit in list(zip(measured.shots, measured.orbit, strict=True))[:MOST]:
+            yield f"shot {shot}", orbit
+    elif isinstance(measured, Dispersion):
+        for step in measured.steps:
+            if step.orbit is not None:
+                yield f"RF {step.step:+g} Hz", step.orbit
+    elif isinstance(measured, OrbitResponse):
+        rows = zip(measured.correctors, measured.planes, measured.response, strict=True)
+        for name, plane, orbit in rows:
+            yield f"{name} ({plane})", orbit
+
+
+def _tunes(measured: TuneReading) -> Figure:
+    figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
+    error = measured.tune_error
+    for plane, ax in enumerate(axes):
+        bars = None if error is None else error[:, plane]
+        ax.errorbar(measured.shots, measured.tune[:, plane], bars, fmt="o", capsize=3)
+        ax.set_ylabel(f"Q{'xy'[plane]}")
+        ax.grid(alpha=0.25)
+    axes[1].set_xlabel("shot")
+    return figure
