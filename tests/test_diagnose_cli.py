@@ -184,7 +184,7 @@ def test_reference_and_single_shot(folders, tmp_path, schema):
         (["petra4", "weak"], "no lattice 'petra4'; did you mean 'petra3'"),
         (["nowhere/ring.py", "weak"], "no lattice file"),
         ([SMALL, "response"], "the noise of the readings is not stated"),
-        ([SMALL, "weak", "--reference", "response"], "the reference an orbit response"),
+        ([SMALL, "weak", "--reference", "response"], "give a reference of the same kind"),
         ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
         ([SMALL, "strange"], "no monitor 'last_c'; did you mean"),
         ([SMALL, "weak", "--effects", "quadrupole_gradiant"], "did you mean 'quadrupole_gradient'"),

@@ -327,6 +327,9 @@ def _quickly(
     blocks: dict[int, tuple[Linear, float]] = {}
     for trial in trials:
         progress(f"is {_title(trial)} needed")
+        if not any(state.values[family.variable].any() for family in trial.families):
+            worth[trial], against[trial] = -LEAST, False  # held at zero: nothing is lost without
+            continue
         block = trial.families[0].block
         if block not in blocks:
             there = linear(state, block)
