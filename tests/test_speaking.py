@@ -128,7 +128,7 @@ def test_objects_draw_themselves(small_ring, measured, diagnosis):
     first = [small_ring[name].s for name in measured.monitors]
     np.testing.assert_allclose(x.get_xdata(), np.sort(first))
     np.testing.assert_allclose(np.sort(x.get_ydata()), np.sort(1e3 * measured.readings[0, 0, :, 0]))
-    with pytest.raises(ChoiceError, match="no figure 'moon'; there are .*readings, scan"):
+    with pytest.raises(ChoiceError, match=r"no figure 'moon'; there are .*readings, scan"):
         diagnosis.plot("moon")
     for figure in (scan, gap, betas, *drawn):
         plt.close(figure)
