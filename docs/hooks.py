@@ -80,9 +80,11 @@ def example(name: str) -> str:
     from tmlattice.measurement import Measurement, OrbitResponse, RfStep, write_measurement
 
     monitors, noise = ("bpm_1", "bpm_2"), np.full((2, 2), 2e-5)
-    readings = 1e-6 * np.array([[[1230, -450], [980, 120]], [[-310, 890], [455, np.nan]]])
+    readings = np.array(
+        [[[1.23e-3, -4.5e-4], [9.8e-4, 1.2e-4]], [[-3.1e-4, 8.9e-4], [4.55e-4, np.nan]]]
+    )
     written: Any = OrbitResponse(
-        ("h1",), ("x",), np.array([1e-4]), monitors, readings[:1], noise / 10,
+        ("h1",), ("x",), np.array([1e-4]), monitors, readings[:1], np.full((2, 2), 2e-6),
         RfStep(499.65e6, 3840, 100.0, readings[1]), "my_ring.mat", 6.0,
     )  # fmt: skip
     if name == "trajectory":

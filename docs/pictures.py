@@ -8,6 +8,7 @@ import os
 import sys
 from functools import cache
 from pathlib import Path
+from textwrap import wrap
 
 import matplotlib as mpl
 
@@ -143,7 +144,85 @@ def before_and_after(result):
     return figure
 
 
-MAKERS = (diagnosis, credible, tunes, optics, response, real_ring)
+def report():
+    """The top of the page of a diagnosis, as Chromium shows it; needs playwright."""
+    import shutil
+    from tempfile import TemporaryDirectory
+
+    from playwright.sync_api import sync_playwright
+
+    from tmlattice.report.page import draw, page
+
+    faults = [
+        Cause("quadrupole_gradient", "qd::12", -0.05),
+        Cause("corrector_kick_x", "hcor_a4_3", 1e-4),
+        Cause("monitor_gain_x", "bpm_a6_u1_6", 0.2),
+    ]
+    result = tmlattice.diagnose(petra3(), tmlattice.simulate(petra3(), faults).measurement())
+    with TemporaryDirectory() as place, sync_playwright() as driver:
+        file = Path(place) / "report.html"
+        shown = {**result.provenance, "measurement": "day_1"}
+        file.write_text(page(result, draw(result, file.parent), shown), encoding="utf-8")
+        browser = driver.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
+        tab = browser.new_page(viewport={"width": 1100, "height": 760})
+        tab.goto(file.as_uri())
+        tab.wait_for_timeout(500)
+        tab.screenshot(path=file.with_suffix(".png"))
+        figure = plt.figure(figsize=(11, 7.6))
+        figure.figimage(plt.imread(file.with_suffix(".png")))
+        yield "report", figure
+
+
+def table(page, first):
+    """The rows of the table of a results page whose head begins so: lists of texts, head first."""
+    text = (FOLDER.parent / "results" / page).read_text(encoding="utf-8")
+    lines = text[text.index(f"| {first} |") :].split("\n\n")[0].splitlines()
+    return [
+        [cell.strip().strip("*`") for cell in line.strip("|").split("|")]
+        for line in lines
+        if not line.startswith("|---")
+    ]
+
+
+def tables():
+    """Tables of measured figures as plots: blind cases, steps of PETRA III's response."""
+    head, *rows = table("trajectories.md", "single faults (tier A)")
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), sharey=True, layout="constrained")
+    blocks = [i for i, row in enumerate(rows) if row[0].startswith("signal to noise")]
+    for ax, start in zip(axes, blocks, strict=True):
+        own = [row for row in rows[start + 1 : start + 7] if row[0] != "detected"]
+        for k, method in enumerate(head[1:]):
+            rates = [float(row[1 + k].rstrip(" %")) for row in own]
+            ax.bar(np.arange(len(own)) + 0.16 * (k - 2), rates, 0.15, label=method)
+        ax.set_xticks(range(len(own)), ["\n".join(wrap(row[0], 10)) for row in own], fontsize=7)
+        ax.set_title(rows[start][0], fontsize="medium")
+        ax.grid(axis="y", alpha=0.25)
+        ax.set_axisbelow(True)
+    axes[0].set_ylabel("share of cases [%]")
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=5, loc="outside upper center",
+                  fontsize="small", frameon=False)  # fmt: skip
+    yield "blind-rates", figure
+
+    head, *rows = table("orbit_responses.md", "step")
+    steps = [row for row in rows if "/" in row[2]]
+    figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
+    for k in range(2, len(head)):
+        values = np.array([[float(v) for v in row[k].split("/")] for row in steps])
+        for seed, style in enumerate(("o-", "o:")):
+            label = head[k] if seed == 0 else None
+            ax.plot(values[:, seed], style, ms=3, lw=1, color=f"C{k - 2}", label=label)
+    ax.set_yscale("log")
+    ax.set_ylabel("held-out rms [µm], seeds 1 and 2")
+    names = [row[0].replace(", ", ",\n").replace(" (", "\n(") for row in steps]
+    ax.set_xticks(range(len(steps)), names, rotation=30, ha="right", fontsize=8)
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize="small", frameon=False)
+    yield "petra3-steps", figure
+
+
+MAKERS = (diagnosis, credible, tunes, optics, response, report, real_ring, tables)
 
 
 def main(names):

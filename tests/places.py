@@ -40,7 +40,7 @@ PLACES = {
     "energy_spread": [None],
     "radiation_loss_bends": [None],
     "radiation_loss_wigglers": [None],
-    "vertical_focusing": ["wiggler::3", "a3"],
+    "vertical_focusing": ["wiggler::3", "a3", "b_in::0"],
     "wake_kick_x": ["wiggler::3", "a3"],
     "wake_kick_y": ["wiggler::3", "a3"],
 }

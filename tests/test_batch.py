@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from tmlattice.batch import finished, run_batch
+from tmlattice.batch import fingerprint, finished, run_batch
 from tmlattice.errors import TmlatticeError
 
 
@@ -50,6 +50,22 @@ def test_two_processes_and_a_scheduler_by_its_address(tmp_path):
 def test_no_scheduler_is_one_sentence(tmp_path):
     with pytest.raises(TmlatticeError, match="no Dask scheduler answers"):
         run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)
+
+
+def test_results_of_other_data_or_of_nobody_are_done_again(tmp_path):
+    marks = {name: fingerprint("lattice", name) for name in "abc"}
+
+    def once(value, marks):
+        some = cases(**{name: {"n": value} for name in "abc"})
+        return run_batch(dict, some, tmp_path, jobs=1, progress=False, made_by=marks)
+
+    once(1, marks)
+    marks["a"] = fingerprint("another lattice", "a")
+    (tmp_path / "b.json").write_text("null")
+    again = once(2, marks)
+    assert {name: result["n"] for name, result in again.items()} == {"a": 2, "b": 2, "c": 1}
+    (tmp_path / "c.json").write_text("[" * 100_000)
+    assert once(3, marks)["c"]["n"] == 3
 
 
 def loud(case):

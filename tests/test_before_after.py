@@ -172,4 +172,4 @@ def test_measured_pairs(tmp_path, null):
     signs = {name: np.sign(b - a) for name, (a, b) in currents.items() if a != b}
     assert {own.element: np.sign(own.amount) for own in result.findings} == signs
     assert all(own.effect == "family_gradient" for own in result.findings)
-    assert min(abs(own.amount) / own.amount_sigma for own in result.findings) > 5
+    assert min(own.detection.statistic for own in result.findings) > 25  # five sigma

@@ -7,6 +7,7 @@ from importlib import resources
 import jsonschema
 import numpy as np
 import pytest
+from command import tmlattice
 from conftest import SMALL
 
 from tmlattice.challenge import make, read_case, read_truth, run, score
@@ -358,3 +359,37 @@ def test_a_fixed_set_of_unknown_faults_is_refused(tmp_path):
     found = scored(tmp_path, "D", 6, "petra3", signal=(50.0, 100.0))
     kinds = [row for row in found["rows"] if row["unknown"]["kind"] != "taken_out"]
     assert sum(row["refused"] for row in kinds) >= len(kinds) - 1
+
+
+def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(SMALL, "ring.py")
+    folder, options = tmp_path / "set", {"lattice": "ring.py", "shots": 2, "progress": False}
+    make("A", 1, 1, folder, **options)
+    with pytest.raises(TmlatticeError, match="holds another challenge"):
+        make("A", 2, 2, folder, **options)
+    ring = (tmp_path / "ring.py").read_text()
+    (tmp_path / "ring.py").write_text(ring.replace("k = 0.9\n", "k = 0.91\n"))
+    ring_of.cache_clear()
+    for again in (run, score):
+        with pytest.raises(TmlatticeError, match=r"was made with another 'ring\.py'"):
+            again(folder, jobs=1, progress=False, lattice="ring.py")
+    ring_of.cache_clear()
+
+
+def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):
+    folder = tmp_path / "set"
+    shutil.copytree(made, folder)
+    run(folder, jobs=1, progress=False, lattice=LATTICE)
+    (folder / "results" / "0000.json").write_text('{"verdict": null}')
+    (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
+    found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
+    assert set(found["failed"]) == {"0000", "0001"}
+    assert len(found["rows"]) == 1
+    (folder / "results" / "0002.json").unlink()
+    found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
+    assert found["not_run"] == ["0002"]
+    (folder / "cases" / "0002" / "case.json").write_text("[]")
+    done = tmlattice("challenge", "run", folder, "--jobs", 1, "--lattice", LATTICE, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "case 0002" in done.stdout

@@ -35,6 +35,7 @@ MADX = {
     "calls a device": 'call, file="/dev/zero";',
     "calls a pipe": 'call, file="pipe";',
     "has a number of 5000 digits": f"x = {'9' * 5000};",
+    "goes round in a circle": "a = b; b = c; c = a; qq: quadrupole, l=a, k1=0; ring: line=(qq);",
     "is nested": f"x = {'(' * 300}1{')' * 300};",
     "has no end of a statement": "x\n" * 20_000,
 }

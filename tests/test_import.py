@@ -17,9 +17,12 @@ from numpy.testing import assert_allclose
 from tmlattice import load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import LatticeError, TmlatticeError
+from tmlattice.harmonics import frequency
 from tmlattice.importers import Options, bring_in
 from tmlattice.lattice import mat_file, save_ring
 from tmlattice.lattice.mat_file import read_mat
+from tmlattice.measurement import Measurement, TurnByTurn
+from tmlattice.observe.spectra import lines
 
 DATA = Path(os.environ.get("TMLATTICE_DATA", ""), "real_rings")
 real = pytest.mark.skipif(
@@ -648,13 +651,19 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
     names = ["bpm::0", "bpm::5", "bpm::6"]
     x, y = (pd.DataFrame(turns[..., p].T, index=names) for p in range(2))
     tbt.write(tmp_path / "a.sdds", tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 20), datatype="lhc")
+    few = tbt.TbtData([tbt.TransverseData(X=x.iloc[:, :15], Y=y.iloc[:, :15])], 15)
+    tbt.write(tmp_path / "few.sdds", few, datatype="lhc")
     done = tmlattice("import", "a.sdds", "--lattice", lattice[0], "--out", "m", cwd=tmp_path,
                      check=0)  # fmt: skip
     assert "readings are in mm" in done.stdout
     data = read_measurement(tmp_path / "m")
     assert data.monitors == tuple(names)
     assert_allclose(data.readings[0], 1e-3 * turns, rtol=1e-6)
-    assert np.isinf(data.launch_sigma[0, :4]).all()
+    assert isinstance(data, TurnByTurn)
+    assert "20 turns are those of a stored beam" in done.stdout
+    few = bring_in([tmp_path / "few.sdds"], Options(lattice=lattice[0])).measurement
+    assert isinstance(few, Measurement)  # 15 turns have no line
+    assert np.isinf(few.launch_sigma[0, :4]).all()
     x, y = (frame.rename(index={"bpm::5": "BPM.OF.ANOTHER"}) for frame in (x, y))
     tbt.write(tmp_path / "c.sdds", tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 20), datatype="lhc")
     found = bring_in([tmp_path / "c.sdds"], Options(lattice=lattice[0]))
@@ -774,3 +783,9 @@ def test_turns_of_the_sps():
     found = bring_in([DATA / "sps" / "sps_200turns.sdds"])
     assert found.measurement.readings.shape[1] == 201
     assert "201 of one plane" in " ".join(found.assumed)
+    spectrum = lines(found.measurement)
+    for plane in (0, 1):  # each monitor's own strongest line, by NAFF
+        read = found.measurement.readings[0, ..., plane].T
+        own = [frequency((v - v.mean()).astype(complex))[0] for v in read if np.ptp(v) > 0]
+        own = np.median(np.minimum(own, 1 - np.array(own)))
+        assert abs(spectrum.tune[0, plane] - own) < 2e-4

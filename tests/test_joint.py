@@ -9,6 +9,7 @@ from tests.command import tmlattice
 from tmlattice import Cause, diagnose, simulate, write_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
+from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
@@ -158,3 +159,64 @@ def test_what_has_no_meaning_is_a_sentence(small_ring):
     unknown = ClosedOrbit(orbit=orbit.orbit, monitors=orbit.monitors)
     with pytest.raises(MeasurementError, match="noise of a closed orbit is not known"):
         diagnose(small_ring, unknown)
+
+
+# --- a model that learns --------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def monday(small_ring):
+    """Small errors of a machine, and what its turns and dispersion say of them."""
+    small = _small_errors(small_ring, 21)
+    both = {"turns": _turns(small_ring, small), "dispersion": _dispersion(small_ring, small)}
+    return small, diagnose(small_ring, both)
+
+
+def test_what_is_known_of_small_errors_holds(monday):
+    small, diagnosis = monday
+    known = known_of(diagnosis)
+    truth = {(cause.effect, cause.element): cause.amount for cause in small}
+    left = np.array([truth[h] for h in known.hypotheses]) - known.amounts
+    assert 0.85 < np.sqrt(np.mean((left / known.errors) ** 2)) < 1.15  # 700 errors
+    # along what was seen, where nearly nothing is left open, it holds as well
+    along = known.seen @ (left / known.rms) / np.sqrt(1 - known.share)
+    assert 0.8 < np.sqrt(np.mean(along**2)) < 1.3
+    gains = [i for i, (name, _) in enumerate(known.hypotheses) if name == "monitor_gain_x"]
+    assert known.errors[gains].mean() < 0.2 * known.rms[gains].mean()
+
+
+def test_tuesday_is_sharper_for_monday(small_ring, monday):
+    """A gradient that hides among small errors is found beside what an earlier day left known."""
+    small, diagnosis = monday
+    fault = Cause("quadrupole_gradient", "QD::3", -0.02)
+    turns = simulate(small_ring, [*small, fault], shots=6, seed=52).measurement()
+    alone = diagnose(small_ring, turns)
+    with_monday = diagnose(diagnosis.as_found, turns, known=known_of(diagnosis))
+    assert _found(with_monday) == {("quadrupole_gradient", "QD::3")}
+    (found,) = with_monday.findings
+    assert abs(found.amount - fault.amount) < 4 * found.amount_sigma
+    assert all(f.detection.statistic < found.detection.statistic for f in alone.findings)
+    sound = simulate(small_ring, small, shots=4, seed=53).measurement()
+    assert diagnose(diagnosis.as_found, sound, known=known_of(diagnosis)).verdict == "nothing"
+
+
+def test_what_is_known_is_written_beside_the_lattice(small_ring, monday, tmp_path):
+    small, _ = monday
+    from tmlattice.lattice import save_ring
+
+    save_ring(small_ring, tmp_path / "ring.json")
+    write_measurement(tmp_path / "monday", _orbit(small_ring, small))
+    write_measurement(tmp_path / "tuesday", _orbit(small_ring, small, seed=99))
+    tmlattice(
+        "diagnose", "ring.json", "monday", "--lattice-out", "twin.json", "-q", cwd=tmp_path, check=0
+    )
+    assert (tmp_path / "twin.json.known.json").is_file()
+    told = tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=0)
+    assert told.stdout.startswith("NOTHING")
+    file = tmp_path / "twin.json.known.json"
+    document = json.loads(file.read_text())
+    document["small_errors"][0]["element"] = "nowhere"
+    file.write_text(json.dumps(document))
+    told = tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=2)
+    assert "it is of another ring" in told.stderr
+    document["seen"]["float32"] = "AAAA"
+    file.write_text(json.dumps(document).replace("nowhere", small_ring.monitors[0].name))
+    tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=2)

@@ -56,7 +56,7 @@ def measurements(draw):
     monitors = draw(st.lists(name, min_size=1, max_size=3, unique_by=str.casefold))
     readings = draw(arrays(float, (shots, turns, len(monitors), 2), elements=reading))
     readings[0, 0, 0, 0] = draw(st.floats(-0.2, 0.2))
-    known = st.one_of(positive, st.just(math.nan))
+    known = st.one_of(st.floats(1e-15, 1.0), st.just(math.nan))
     sigma = st.one_of(st.just(math.inf), st.just(0.0), positive)
     setting = st.fixed_dictionaries({"kick": anything}, optional={"k1_relative": anything})
     return Measurement(
@@ -72,7 +72,7 @@ def measurements(draw):
             draw(st.lists(st.integers(0, 2**53), min_size=shots, max_size=shots, unique=True))
         ),
         lattice=draw(st.none() | st.text(st.characters(codec="utf-8"))),
-        energy=draw(st.none() | positive),
+        energy=draw(st.none() | st.floats(5e-324, 1e6, exclude_max=True, allow_subnormal=True)),
     )
 
 
@@ -218,6 +218,7 @@ def test_launch_sigma_missing_is_unknown_but_missing_delta_is_exact(folder, sigm
         ({"bpm_dead": {"x": 1e-5, "y": 1e-5}}, None),
     ],
 )
+@pytest.mark.filterwarnings("ignore:the noise names")  # a monitor without rows is told of
 def test_noise_as_a_pair_a_table_or_nothing(folder, noise, expected):
     m = read_measurement(folder({"noise": noise}))
     if expected is None:

@@ -5,10 +5,15 @@ Debian's package `chromium` and `pip install '.[test]'` are all that it takes.
 
 import shutil
 
+import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import StoredBeam
+from tmlattice.effects import apply
 from tmlattice.machine.response import simulate_response
+from tmlattice.measurement import TuneReading
 from tmlattice.report.page import draw, page
 
 playwright = pytest.importorskip(
@@ -45,6 +50,18 @@ def response(small_ring, tmp_path_factory):
     found = diagnose(small_ring, data, effects=["quadrupole_gradient", "monitor_gain_x",
                                                 "corrector_calibration"])  # fmt: skip
     return written(found, tmp_path_factory.mktemp("response"))
+
+
+@pytest.fixture(scope="module")
+def together(small_ring, tmp_path_factory):
+    """First turns and the tunes of the same machine."""
+    turns = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
+                     noise=2e-6).measurement()  # fmt: skip
+    beam = StoredBeam(ResponseModel(apply(small_ring, [WEAK])))
+    tunes = TuneReading(tune=beam.tunes[None], tune_error=np.full((1, 2), 1e-4))
+    return written(
+        diagnose(small_ring, {"turns": turns, "tunes": tunes}), tmp_path_factory.mktemp("together")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +173,14 @@ def test_a_response_has_tables_that_are_sorted_and_copied(opened, response):
     assert any(line.startswith("QD::5,") for line in copied)
 
 
-@pytest.mark.parametrize("kind", ["first_turns", "response"])
+def test_several_measurements_are_told_and_drawn_one_by_one(opened, together):
+    tab = opened(together)
+    assert "QD::5" in tab.inner_text("#answer")
+    assert tab.locator('.figure[data-figure="data-readings"] .main-svg').first.is_visible()
+    assert "tune" in tab.inner_text("#gap ~ .scroll")
+
+
+@pytest.mark.parametrize("kind", ["first_turns", "response", "together"])
 def test_page_fits_a_phone_dark_paper_and_a_reader_without_scripts(opened, kind, request):
     address = request.getfixturevalue(kind)
     tab = opened(address, viewport=PHONE, color_scheme="dark")

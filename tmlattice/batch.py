@@ -4,6 +4,7 @@ Every case has a JSON file of its own, which appears when the case is done. A se
 is missing, and what has failed, again.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -21,6 +22,11 @@ from tmlattice.workers import caught, heard
 
 log = logging.getLogger(__name__)
 
+MADE_BY = "made_by"
+"""Key of a result's fingerprint."""
+PATIENCE = 60.0
+"""s; a scheduler without workers is given that long to find some."""
+
 Work = Callable[[Any], dict[str, Any]]
 
 
@@ -29,8 +35,12 @@ def finished(folder: Path) -> dict[str, dict[str, Any]]:
     results = {}
     for path in sorted(folder.glob("*.json")):
         try:
-            results[path.stem] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # another program's, or cut off: done again
+            result = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):  # another program's, or cut off: done again
+            result = None
+        if isinstance(result, dict):
+            results[path.stem] = result
+        else:
             log.warning("%s is no result; it is left aside", path)
     return results
 
@@ -43,6 +53,7 @@ def run_batch(
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: bool = True,
+    made_by: Mapping[str, str] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """The result of every case.
 
@@ -54,9 +65,11 @@ def run_batch(
         jobs: local processes, one thread each; 1: this process; None: one a core.
         scheduler: address of a Dask scheduler, instead of local processes.
         progress: show a bar where there is a terminal.
+        made_by: what each result depends on, see `fingerprint`; one that depends on anything else
+            is done again.
 
     Returns:
-        By case; a failed one has only "error" and "seconds".
+        By case, with "made_by" where that is given; a failed one has only "error" and "seconds".
 
     Raises:
         OutputError: the folder cannot be written.
@@ -67,11 +80,17 @@ def run_batch(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write to '{folder}': {error.strerror or error}") from error
-    done = {n: r for n, r in finished(folder).items() if n in cases and "error" not in r}
+    marks = made_by or {}
+    there = {n: r for n, r in finished(folder).items() if n in cases and "error" not in r}
+    done = {n: r for n, r in there.items() if n not in marks or r.get(MADE_BY) == marks[n]}
+    if len(done) < len(there):
+        log.warning("%d results are of other data or options; done again", len(there) - len(done))
     todo = [name for name in cases if name not in done]
     bar = tqdm(total=len(cases), initial=len(done), unit="case", disable=None if progress else True)
     with bar:
         for name, result in _results(work, cases, todo, jobs, scheduler):
+            if name in marks and "error" not in result:
+                result = {**result, MADE_BY: marks[name]}  # noqa: PLW2901
             with output_file(folder / f"{name}.json") as path:
                 write_json(path, result)
             done[name] = result
@@ -115,7 +134,7 @@ def _results(
         failed: dict[str, dict[str, Any]] = {}
         for _ in range(2 * workers):  # no more in flight than the workers need
             feed()
-        for future in running:
+        for future in _arriving(running, client):
             name = names.pop(future.key)
             try:
                 result = heard(future.result())
@@ -124,6 +143,41 @@ def _results(
             feed()
             yield name, result
         yield from failed.items()
+
+
+def _arriving(running: Any, client: Any) -> Iterator[Any]:
+    """Futures as they are done.
+
+    Raises:
+        TmlatticeError: there has been no worker for long.
+    """
+    alone = looked = time.monotonic()
+    while not running.is_empty():
+        if running.has_ready():
+            yield next(running)
+            continue
+        time.sleep(0.02)
+        now = time.monotonic()
+        if now - looked > 1.0:
+            looked = now
+            alone = alone if not client.scheduler_info()["workers"] else now
+        if now - alone > PATIENCE:
+            raise TmlatticeError(
+                f"all workers are gone, and none came back in {PATIENCE:.0f} s; start some and go "
+                "on: what is done is kept"
+            )
+
+
+def fingerprint(*parts: object) -> str:
+    """Of everything that a result depends on: values by their repr, files by their content."""
+    digest = hashlib.sha256()
+    for part in parts:
+        try:
+            content = part.read_bytes() if isinstance(part, Path) else repr(part).encode()
+        except OSError:
+            content = b"absent"
+        digest.update(b"%d:" % len(content) + content)
+    return digest.hexdigest()[:32]
 
 
 def guarded(work: Work, argument: Any) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from tmlattice.diagnosis.families import (
     EnergySpread,
     MonitorGain,
     MonitorRoll,
-    QuadrupoleGradient,
-    SkewGradient,
 )
+from tmlattice.diagnosis.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 

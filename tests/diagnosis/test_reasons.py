@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.families import CorrectorCalibration, MonitorGain, QuadrupoleGradient
+from tmlattice.diagnosis.families import CorrectorCalibration, MonitorGain
+from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import magnets
 from tmlattice.diagnosis.reasons import candidates, explain_gradients
 from tmlattice.diagnosis.rounds import settle

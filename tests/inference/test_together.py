@@ -11,7 +11,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.background import background_signatures
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import apply, background_rms, find, monitors_with
-from tmlattice.inference.among import Among, _signatures, small_errors_of
+from tmlattice.inference.among import Among, Known, _signatures, small_errors_of
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
 from tmlattice.inference.together import Together
@@ -89,8 +89,8 @@ def test_small_errors_among_any_rows_are_those_of_trajectories(turns):
     own = fit(replace(turns, spread=spread, white=None), (), start.nuisances)
     rows = scale[:, None] * _signatures(turns, start.point, which)
     among = Among(
-        places={}, inner=turns, hypotheses=tuple(which), rms=scale,
-        spread=rows.reshape(-1, *turns.valid.shape), amounts_now=np.zeros(len(scale)),
+        places={}, inner=turns, known=Known.usual(which, rms),
+        spread=rows.reshape(-1, *turns.valid.shape), shift=np.zeros(turns.valid.shape),
     )  # fmt: skip
     other = fit(among, (), start.nuisances)
     assert own.chi2 < 0.9 * start.chi2
@@ -108,7 +108,7 @@ def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):
     ]
     everywhere = [(cause.effect, cause.element) for cause in small]
     problem = closed_orbits(small_ring, _orbit(small_ring, small, 2), {})
-    learnt = small_errors_of(problem, everywhere, usual, problem.first)
+    learnt = small_errors_of(problem, Known.usual(everywhere, usual), problem.first)
     assert learnt.log_evidence > 1e3
     assert 0.5 < learnt.before.chi2 / problem.valid.sum() < 1.5  # 70 readings: +- 0.17
     assert 0.5 < learnt.sizes["quadrupole_offset_x"] / usual["quadrupole_offset_x"] < 2

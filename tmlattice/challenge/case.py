@@ -15,14 +15,17 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.batch import fingerprint
 from tmlattice.effects import Cause
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, plain
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring, load_ring
+from tmlattice.lattice.load import contents
 from tmlattice.measurement import Measurement, read_measurement, write_measurement
 
 Array = NDArray[np.float64]
@@ -140,9 +143,18 @@ def read_set(folder: Path) -> dict[str, Any]:
     """The public description of a challenge.
 
     Raises:
-        TmlatticeError: the folder is none.
+        TmlatticeError: the folder is none, or the description is damaged.
     """
-    return _read(folder / "challenge.json", SET)
+    path = folder / "challenge.json"
+    found = _read(path, SET)
+    missing = [
+        key for key in ("tier", "lattice", "reference", "shots", "amount") if key not in found
+    ]
+    if missing or found["tier"] not in TIERS:
+        raise TmlatticeError(
+            f"{path} has no valid {(missing or ['tier'])[0]}; make the challenge anew"
+        )
+    return found
 
 
 def case_names(folder: Path) -> list[str]:
@@ -171,6 +183,24 @@ def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
     return lattice
 
 
+CONTENTS = "lattice_contents"
+"""Key of the fingerprint of the lattice in the public description."""
+
+
+def check_contents(folder: Path, described: Mapping[str, Any]) -> None:
+    """Whether the lattice is still the one that the challenge was made with, where that is known.
+
+    Raises:
+        TmlatticeError: it is another.
+    """
+    known = described.get(CONTENTS)
+    if known not in (None, fingerprint(contents(ring_of(described["lattice"])))):
+        raise TmlatticeError(
+            f"'{folder}' was made with another '{described['lattice']}' than the one that is there "
+            "now; put that back, or make the challenge anew"
+        )
+
+
 def trusted_case(folder: Path, name: str, trusted: str | None) -> Case:
     """A case whose lattice may be loaded, see `check_lattice`."""
     case = read_case(folder, name)
@@ -178,14 +208,31 @@ def trusted_case(folder: Path, name: str, trusted: str | None) -> Case:
     return case
 
 
+PARTS = ("fit", "heldout", "reference")
+TABLES = ("measurement.json", "readings.csv")
+
+
+def made_by(folder: Path, name: str, lattice: str) -> str:
+    """The fingerprint of what a case's results depend on: lattice, data, options, version."""
+    from tmlattice import __version__
+
+    own = folder / "cases" / name
+    files = [own / "case.json", *(own / part / table for part in PARTS for table in TABLES)]
+    return fingerprint(__version__, contents(ring_of(lattice)), *files)
+
+
 def read_case(folder: Path, name: str) -> Case:
     """The public part of a case."""
     own = folder / "cases" / name
     public = _read(own / "case.json", PUBLIC)
+    good = isinstance(public.get("options"), dict) and isinstance(public.get("reference"), bool)
+    if not good or "lattice" not in public:
+        raise TmlatticeError(f"{own / 'case.json'} is damaged; make the challenge anew")
 
     def part(which: str) -> Measurement:
         measurement = read_measurement(own / which)
-        assert isinstance(measurement, Measurement)
+        if not isinstance(measurement, Measurement):
+            raise TmlatticeError(f"'{own / which}' is no trajectory; make the challenge anew")
         return measurement
 
     return Case(
@@ -199,7 +246,21 @@ def read_case(folder: Path, name: str) -> Case:
 
 
 def read_truth(folder: Path, name: str) -> Truth:
-    """The secret part of a case: for `score` alone."""
+    """The secret part of a case: for `score` alone.
+
+    Raises:
+        TmlatticeError: it is not there, or damaged.
+    """
+    try:
+        return _truth(folder, name)
+    except (OSError, LookupError, TypeError, ValueError, BadZipFile) as error:
+        said = plain(str(error), 100)
+        raise TmlatticeError(
+            f"the truth of case {name} in '{folder}' cannot be read ({said}); make it anew"
+        ) from error
+
+
+def _truth(folder: Path, name: str) -> Truth:
     secret = _read(folder / "truth" / f"{name}.json", TRUTH)
     launches: dict[str, Array] = {}
     clean: dict[str, Array] = {}
@@ -234,8 +295,8 @@ def _read(path: Path, kind: str) -> dict[str, Any]:
         raise TmlatticeError(
             f"{path}: {error.strerror}; name a folder that `tmlattice challenge make` made"
         ) from error
-    except ValueError as error:
-        raise TmlatticeError(f"{path} is no JSON: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise TmlatticeError(f"{path} is no JSON: {error}; make the challenge anew") from error
     if not isinstance(document, dict) or document.get("format") != kind:
         raise TmlatticeError(f"{path} is not of the format '{kind}'; make the challenge anew")
     return document

@@ -1,5 +1,6 @@
 """Cases with a withheld cause: AT is the real machine, every case has random numbers of its own."""
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from tmlattice.batch import fingerprint
 from tmlattice.challenge.case import (
+    CONTENTS,
     SET,
     TIERS,
     Case,
@@ -33,6 +36,7 @@ from tmlattice.effects import (
 from tmlattice.errors import TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
+from tmlattice.lattice.load import contents
 from tmlattice.machine import Machine, Shots, draw_background, draw_shots
 from tmlattice.machine.shots import stream
 from tmlattice.measurement import Measurement
@@ -112,6 +116,7 @@ def make(
         "version": 1,
         "tier": tier,
         "lattice": lattice,
+        CONTENTS: fingerprint(contents(ring)),
         "reference": reference,
         "shots": shots,
         "effects": None if effects is None else chosen,
@@ -122,7 +127,8 @@ def make(
     if tier == "B":
         public["told"] = told
     if (folder / "challenge.json").exists():
-        if read_set(folder) != public:
+        described = read_set(folder)
+        if {CONTENTS: public[CONTENTS], **described} != public or _seed(folder) not in (None, seed):
             raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
     else:
         folder.mkdir(parents=True, exist_ok=True)
@@ -155,6 +161,15 @@ def make(
     with output_file(folder / "truth" / "made.json") as path:
         write_json(path, {"format": "tmlattice-challenge-made", "version": 1, **made})
     return dict(unreachable)
+
+
+def _seed(folder: Path) -> int | None:
+    """The seed that a challenge was made with, where that is known."""
+    try:
+        made = json.loads((folder / "truth" / "made.json").read_text(encoding="utf-8"))
+        return int(made["seed"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
 
 
 class CaseDraw:

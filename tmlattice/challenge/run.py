@@ -9,7 +9,9 @@ from tmlattice.batch import run_batch
 from tmlattice.challenge.case import (
     Case,
     case_names,
+    check_contents,
     check_lattice,
+    made_by,
     read_set,
     ring_of,
     trusted_case,
@@ -52,16 +54,20 @@ def run(
     Returns:
         Results by case; a failed one has "error".
     """
-    check_lattice(folder / "challenge.json", read_set(folder)["lattice"], lattice)
+    public = read_set(folder)
+    described = check_lattice(folder / "challenge.json", public["lattice"], lattice)
+    check_contents(folder, public)
 
     def load(name: str) -> Any:
         return lambda: trusted_case(folder, name, lattice)
 
     cases = {name: load(name) for name in case_names(folder)}
+    marks = {name: made_by(folder, name, described) for name in cases}
     return run_batch(
         diagnose_case,
         cases,
         folder / "results",
+        made_by=marks,
         jobs=jobs,
         scheduler=scheduler,
         progress=progress,

@@ -1,5 +1,6 @@
 """The figures of merit of a challenge: the diagnosis beside the oracle and plain baselines."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from tmlattice.challenge.case import (
     Case,
     Truth,
     case_names,
+    check_contents,
     check_lattice,
     read_case,
     read_set,
@@ -38,12 +40,14 @@ from tmlattice.challenge.record import (
     stated,
 )
 from tmlattice.effects import Cause, find
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, plain
 from tmlattice.inference.judge import held_out_gap
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged
+
+log = logging.getLogger(__name__)
 
 FORMAT = "tmlattice-challenge"
 
@@ -72,11 +76,21 @@ def score(
 
     described = read_set(folder)
     check_lattice(folder / "challenge.json", described["lattice"], lattice)
+    check_contents(folder, described)
     results = finished(folder / "results")
     names = [name for name in case_names(folder) if name in results]
     if not names:
         raise TmlatticeError(f"'{folder}' has no results; `tmlattice challenge run` makes them")
-    truths = {name: read_truth(folder, name) for name in names}
+    failed, truths = dict[str, str](), dict[str, Truth]()
+    for name in names:
+        try:
+            truths[name] = read_truth(folder, name)
+        except TmlatticeError as error:
+            failed[name] = str(error)
+    if not truths:
+        raise TmlatticeError(failed[names[0]])
+    others = sorted(set(case_names(folder)) - set(names))
+    names = list(truths)
     judged: dict[str, dict[str, Any]] = {}
     guessed: dict[str, dict[str, Any]] = {}
     if oracle:
@@ -98,10 +112,15 @@ def score(
     for name in names:
         if "error" in results[name]:
             continue
-        row = row_of(results[name], truths[name], judged.get(name), guessed.get(name), places)
-        row |= clean_gap(ring, read_case(folder, name).heldout, truths[name], results[name])
+        try:
+            row = row_of(results[name], truths[name], judged.get(name), guessed.get(name), places)
+            row |= clean_gap(ring, read_case(folder, name).heldout, truths[name], results[name])
+        except (LookupError, TypeError, ValueError, AttributeError, TmlatticeError) as error:
+            log.info("case %s", name, exc_info=True)
+            failed[name] = f"its result cannot be scored ({plain(str(error), 100)}); run it again"
+            continue
         rows.append(row)
-    failed = {n: results[n]["error"] for n in names if "error" in results[n]}
+    failed |= {n: str(results[n]["error"]) for n in names if "error" in results[n]}
     failed |= {f"oracle {n}": r["error"] for n, r in judged.items() if "error" in r}
     failed |= {f"baselines {n}": r["error"] for n, r in guessed.items() if "error" in r}
     return {
@@ -111,6 +130,7 @@ def score(
         **{key: described[key] for key in ("tier", "lattice", "reference", "shots", "amount")},
         "cases": len(names),
         "failed": failed,
+        "not_run": others,
         **summary(rows, described["tier"]),
         "rows": rows,
     }

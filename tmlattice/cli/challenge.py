@@ -19,6 +19,8 @@ from tmlattice.cli.options import (
 if TYPE_CHECKING:
     from rich.console import Console
 
+FAILED = 1
+
 METHODS = {
     "tool": "diagnose",
     "oracle": "oracle",
@@ -107,10 +109,19 @@ def make(
 @click.argument("folder", type=FILE)
 @_cluster_options
 @quiet_option
+@click.pass_context
 def run(
-    folder: Path, jobs: int | None, scheduler: str | None, lattice: str | None, quiet: bool
+    context: click.Context,
+    folder: Path,
+    jobs: int | None,
+    scheduler: str | None,
+    lattice: str | None,
+    quiet: bool,
 ) -> None:
-    """Diagnose every case in FOLDER that has no result yet; the truth is not read."""
+    """Diagnose every case in FOLDER that has no result yet; the truth is not read.
+
+    The exit code is 1 where a case failed.
+    """
     from tmlattice.challenge import run as run_cases
 
     results = run_cases(folder, jobs=jobs, scheduler=scheduler, progress=not quiet, lattice=lattice)
@@ -120,6 +131,8 @@ def run(
         screen.print(f"{len(results) - len(failed)} of {len(results)} cases diagnosed")
         for name, error in failed.items():
             screen.print(f"case {name}: {error}")
+    if failed:
+        context.exit(FAILED)
 
 
 @challenge.command("score", cls=Careful)
@@ -187,6 +200,11 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
     screen.print(f"tier {result['tier']}{more}: {result['cases']} cases, "
                  f"{len(result['failed'])} failed; median "
                  f"{_number(result['seconds']['median'])} s a case")  # fmt: skip
+    if result["not_run"]:
+        screen.print(
+            f"{len(result['not_run'])} more cases have no result and count for nothing here; "
+            "`tmlattice challenge run` makes them"
+        )
     verdicts = ", ".join(f"{name} {count}" for name, count in result["verdicts"].items())
     screen.print(f"verdicts: {verdicts}")
     for key, title in (

@@ -12,6 +12,7 @@ from tmlattice.cli.options import (
     console,
     json_option,
     lattice_options,
+    no_numbers,
     open_ring,
     quiet_option,
     read_data,
@@ -74,6 +75,8 @@ def check(
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
         except (MeasurementError, UnknownNameError) as error:
             raise MeasurementError(f"{measurement}: {error}") from error
+        except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:
+            raise MeasurementError(f"{measurement}: {no_numbers(error)}") from error
         if path:
             document = found.as_json()
             document["provenance"] = {**document["provenance"], "measurement": str(measurement)}

@@ -19,7 +19,7 @@ from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, plain
 
 BAD_INPUT = 2
 STOPPED = 130  # as the shell has it for Ctrl-C
@@ -90,8 +90,13 @@ def main() -> NoReturn:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    click.echo(f"tmlattice: {message}", err=True)
+    click.echo(f"tmlattice: {_shown(message)}", err=True)
     sys.exit(code)
+
+
+def _shown(message: str) -> str:
+    """Names of files, elements and keys may hold what steers a terminal; lines stay lines."""
+    return "\n".join(plain(line) for line in message.splitlines())
 
 
 def _show_warning(
@@ -102,4 +107,5 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    click.echo(f"tmlattice: warning: {message}", err=True)
+    if not issubclass(category, RuntimeWarning):  # numpy's, of numbers that are judged elsewhere
+        click.echo(f"tmlattice: warning: {_shown(str(message))}", err=True)

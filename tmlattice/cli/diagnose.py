@@ -1,5 +1,6 @@
 """`tmlattice diagnose`: where the gap lies, what causes it, how far it shrinks."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ from tmlattice.cli.options import (
     console,
     json_option,
     lattice_options,
+    no_numbers,
     open_ring,
     quiet_option,
     read_data,
@@ -26,8 +28,11 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
+    from tmlattice.inference.among import Known
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
+
+log = logging.getLogger(__name__)
 
 
 @click.command("diagnose", cls=Careful)
@@ -159,6 +164,8 @@ def diagnose(
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
         turns = isinstance(first, Measurement) and not more
+        if not response and (known := _known(ring, lattice)) is not None:
+            options["known"] = known
         if response:
             _refuse("an orbit response", background=background)
         if not turns:
@@ -222,6 +229,14 @@ def _read(
     return found, said
 
 
+def _known(ring: "Ring", lattice: str) -> "Known | None":
+    """What an earlier diagnosis left known beside the ring as it found it."""
+    from tmlattice.diagnosis.twin import known_beside, read_known
+
+    beside = known_beside(Path(lattice))
+    return read_known(beside, ring) if beside.is_file() else None
+
+
 def _write(
     result: "Diagnosis",
     source: dict[str, Any],
@@ -245,6 +260,8 @@ def _write_rings(
     result: "Diagnosis", lattice_out: Path | None, repaired_out: Path | None
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
+    from tmlattice.diagnosis.twin import known_beside, known_document, known_of
+    from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
     from tmlattice.report.remedies import by_hand_text
@@ -256,6 +273,10 @@ def _write_rings(
             beside = calibration_beside(lattice_out)
             write_calibration(beside, result.calibration)
             written[str(beside)] = ()
+        if (known := known_of(result)) is not None:
+            with output_file(known_beside(lattice_out)) as temporary:
+                write_json(temporary, known_document(known))
+            written[str(known_beside(lattice_out))] = ()
     if repaired_out:
         ring, by_hand = result.repair()
         told = write_ring(ring, repaired_out)
@@ -337,6 +358,9 @@ def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
         return run(ring, data, **options)
     except (MeasurementError, UnknownNameError) as error:
         raise MeasurementError(f"{where}: {error}") from error
+    except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:  # singular, lost
+        log.info("the numbers of a measurement", exc_info=True)
+        raise MeasurementError(f"{where}: {no_numbers(error)}") from error
 
 
 @contextmanager

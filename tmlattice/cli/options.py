@@ -53,6 +53,7 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
 LAUNCH = Numbers(
     "x,px,y,py", " is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0"
 )
+EMITTANCE = Numbers("X,Y", ": give two emittances in m rad, such as 1e-9,1e-11", least=0.0)
 LAUNCH_SIGMA = Numbers(
     "X,PX,Y,PY,DELTA", ": give five rms values, such as 1e-4,2e-5,1e-4,2e-5,0", least=0.0
 )
@@ -164,6 +165,17 @@ def _identities(path: Path) -> set[Any]:
         return set()
     names: set[Any] = {os.path.realpath(path)}
     return names if status is None else names | {(status.st_dev, status.st_ino)}
+
+
+def no_numbers(error: Exception) -> str:
+    """What to say of data whose numbers end a calculation: singular, without end, too many."""
+    from tmlattice.errors import plain
+
+    said = plain(str(error), 100) or type(error).__name__
+    return (
+        f"with these numbers nothing can be worked out ({said}); check launches, settings, noise "
+        "and readings for units and for values that are far off (`tmlattice check`)"
+    )
 
 
 def _remember(context: click.Context, option: click.Parameter, value: Any) -> None:

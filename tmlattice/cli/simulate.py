@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from tmlattice.cli.options import (
+    EMITTANCE,
     FILE,
     LAUNCH_SIGMA,
     Careful,
@@ -18,6 +19,7 @@ from tmlattice.cli.options import (
     quiet_option,
     table,
 )
+from tmlattice.cli.simulate_stored import KINDS, simulate_stored
 
 
 class CauseText(click.ParamType):  # type: ignore[type-arg]
@@ -58,14 +60,25 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
 @background_option("Random small errors everywhere")
 @click.option(
     "--kind",
-    type=click.Choice(["trajectory", "orbit-response"]),
+    type=click.Choice(list(KINDS)),
     default="trajectory",
     show_default=True,
-    help="First turns, or the stored beam's orbit for steps of the correctors and of the RF.",
+    help="First turns; or of the stored beam: its orbit for steps of the correctors and of the RF, "
+    "its turns after a kick, its orbit, its orbit for a step of the RF, its tunes.",
 )
-@click.option("--shots", type=click.IntRange(1), default=6, show_default=True)
 @click.option(
-    "--turns", type=click.IntRange(1), default=1, show_default=True, help="Read in each shot."
+    "--shots",
+    type=click.IntRange(1),
+    default=6,
+    show_default="6 of first turns, else 1",
+    help="How many.",
+)
+@click.option(
+    "--turns",
+    type=click.IntRange(1),
+    default=1,
+    show_default="1, and 1000 turn by turn",
+    help="Read in each shot.",
 )
 @click.option(
     "--amplitude",
@@ -77,7 +90,8 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--noise",
     type=click.FloatRange(0),
-    help="Rms of one reading, m; else 2e-5, and of an orbit change 2e-6 in x and 1.2e-6 in y.",
+    help="Rms of one reading, m; else 2e-5, and of an orbit or its change 2e-6 in x and 1.2e-6 in "
+    "y. Tunes: of a tune, else 2e-5.",
 )
 @click.option(
     "--engine",
@@ -139,12 +153,33 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     "--rf-step",
     type=float,
     default=None,
-    help="Orbit response: the step of the RF, Hz; 0 for none; else 1.3 mm of orbit.",
+    help="Orbit response, dispersion: the step of the RF, Hz; 0 for none; else 1.3 mm of orbit.",
 )
 @click.option(
     "--one-sided",
     is_flag=True,
-    help="Orbit response: step from the setting, not from half below it to half above.",
+    help="Orbit response, dispersion: step from the setting, not from half below it to half above.",
+)
+@click.option(
+    "--particles",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Turn by turn: 1 is the middle of the beam; some hundreds decohere.",
+)
+@click.option(
+    "--emittance",
+    type=EMITTANCE,
+    default="1e-9,1e-11",
+    show_default=True,
+    help="Turn by turn: of many particles, m rad.",
+)
+@click.option(
+    "--spread",
+    type=click.FloatRange(0),
+    default=1e-3,
+    show_default=True,
+    help="Turn by turn: rms relative energy of many particles.",
 )
 @click.option("--out", type=FILE, required=True, metavar="DIR", help="The measurement folder.")
 @click.option(
@@ -176,6 +211,9 @@ def simulate(
     truth: Path | None,
     force: bool,
     quiet: bool,
+    particles: int,
+    emittance: tuple[float, ...],
+    spread: float,
     **options: Any,
 ) -> None:
     """Measure a machine whose errors are known.
@@ -183,7 +221,9 @@ def simulate(
     The virtual machine is LATTICE with effects of the catalogue in it, tracked by
     accelerator-toolbox (or by OCELOT's maps). Each shot has a launch of its own, with random
     betatron phases; monitors read with noise. With `--kind orbit-response` the stored beam's
-    closed orbit is read for a step of every corrector and of the RF. The folder holds no truth.
+    closed orbit is read for a step of every corrector and of the RF; `turn-by-turn` kicks the
+    stored beam, `closed-orbit`, `dispersion` and `tunes` read it as it is. The folder holds no
+    truth.
     """
     from tmlattice.effects import Cause, find
     from tmlattice.files import output_file
@@ -198,13 +238,24 @@ def simulate(
     ring = open_ring(lattice, sequence, energy)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
-    if kind == "orbit-response":
-        _response(
-            ring, causes, out, truth, force, quiet,
-            background=dict(background), correctors=correctors or None, kick=kick, rf_step=rf_step,
-            one_sided=one_sided, engine=options["engine"], seed=options["seed"],
-            machine_seed=options["machine_seed"], **({} if noise is None else {"noise": noise}),
-        )  # fmt: skip
+    if kind != "trajectory":
+        chosen = {
+            **options, "background": dict(background), "correctors": correctors or None,
+            "kick": kick, "rf_step": rf_step, "one_sided": one_sided, "noise": noise,
+            "particles": particles, "emittance": emittance, "spread": spread,
+            "settings": _settings(settings_file),
+        }  # fmt: skip
+        for name in ("shots", "turns"):  # first turns' own defaults
+            if context.get_parameter_source(name) != click.core.ParameterSource.COMMANDLINE:
+                del chosen[name]
+        table_of, sentence, rms = simulate_stored(
+            kind, ring, causes, out, truth, force, quiet, chosen
+        )
+        if not quiet:
+            console().print(sentence)
+            _print_causes(ring, causes)
+            _print_background(rms)
+            _print_written(out, table_of, truth)
         return
     options["noise"] = 2e-5 if noise is None else noise
     simulation = run(
@@ -220,69 +271,33 @@ def simulate(
         simulation.write(out, jobs, progress=not quiet, force=force)
     if quiet:
         return
-    screen = console()
-    screen.print(
+    console().print(
         f"{ring.name}: {options['shots']} shots of {options['turns']} turn(s), "
         f"{len(ring.monitors)} monitors, {1e3 * options['amplitude']:g} mm rms, noise "
         f"{1e6 * options['noise']:g} µm, engine {options['engine']}, seed {options['seed']}"
     )
     _print_causes(ring, causes)
     _print_background(simulation.background)
-    screen.print(
-        f"written: {out}/: measurement.json, readings.csv" + (f"; {truth}" if truth else "")
-    )
-
-
-_OF_TRAJECTORIES = (
-    "shots", "turns", "amplitude", "radiation", "launch_sigma", "kicks", "settings_file", "jobs",
-)  # fmt: skip
-_OF_RESPONSES = ("correctors", "kick", "rf_step", "one_sided")
+    _print_written(out, "readings.csv", truth)
 
 
 def _check_options(context: click.Context, kind: str) -> None:
-    """Refuse what the other kind of measurement has."""
-    response = kind == "orbit-response"
+    """Refuse what other kinds of measurement have."""
+    of_kinds = set().union(*KINDS.values())
     for option in context.command.params:
-        given = context.get_parameter_source(option.name or "")
-        others = _OF_TRAJECTORIES if response else _OF_RESPONSES
-        if option.name in others and given == click.core.ParameterSource.COMMANDLINE:
-            mend = "take it out" if response else "add --kind orbit-response"
-            raise click.UsageError(f"{option.opts[0]} has no meaning for --kind {kind}; {mend}")
+        name = option.name or ""
+        given = context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE
+        if given and name in of_kinds and name not in KINDS[kind]:
+            kinds = [other for other, own in KINDS.items() if name in own]
+            raise click.UsageError(
+                f"{option.opts[0]} has no meaning for --kind {kind}; take it out, or give "
+                f"--kind {' or '.join(kinds)}"
+            )
 
 
-def _response(
-    ring: Any,
-    causes: list[Any],
-    out: Path,
-    truth: Path | None,
-    force: bool,
-    quiet: bool,
-    **options: Any,
-) -> None:
-    from tmlattice.files import output_file
-    from tmlattice.machine.response import simulate_response
-    from tmlattice.measurement import write_measurement, write_truth
-
-    with ExitStack() as both:
-        file = None if truth is None else both.enter_context(output_file(truth))
-        simulation = simulate_response(ring, causes, progress=not quiet, **options)
-        if file is not None:
-            write_truth(file, **simulation.truth())
-        write_measurement(out, simulation.measured, force)
-    if quiet:
-        return
-    measured, screen = simulation.measured, console()
-    rf = "" if measured.rf is None else f", RF step {measured.rf.step:g} Hz"
-    sides = "one-sided" if options["one_sided"] else "two-sided"
-    screen.print(
-        f"{ring.name}: {len(measured.correctors)} correctors, {len(measured.monitors)} monitors, "
-        f"{sides} steps of {1e6 * options['kick']:g} µrad{rf}, engine {options['engine']}, seed "
-        f"{options['seed']}"
-    )
-    _print_causes(ring, causes)
-    _print_background(simulation.background)
-    screen.print(
-        f"written: {out}/: measurement.json, response.csv" + (f"; {truth}" if truth else "")
+def _print_written(out: Path, table_of: str, truth: Path | None) -> None:
+    console().print(
+        f"written: {out}/: measurement.json, {table_of}" + (f"; {truth}" if truth else "")
     )
 
 

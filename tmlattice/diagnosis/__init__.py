@@ -22,7 +22,7 @@ __all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"
 _OPTIONS = {
     "first turns": ("reference", "background", "heldout", "radiation"),
     "an orbit response": ("reference", "missing"),
-    "several measurements, or those of a stored beam": ("reference", "background"),
+    "several measurements, or those of a stored beam": ("reference", "background", "known"),
 }
 _OWN = {name for names in _OPTIONS.values() for name in names}
 
@@ -41,13 +41,16 @@ def diagnose(
             also background, heldout and radiation, see `diagnosis.procedure.diagnose`; for an orbit
             response alone missing, see `diagnosis.response.diagnose_response`, and with a reference
             `diagnosis.before_after.diagnose_change`; for several, and for those of a stored beam,
-            background, see `diagnosis.joint.diagnose_together`.
+            background, and known, what an earlier diagnosis left known of the ring as it found it
+            (`diagnosis.twin`; first turns take it too), see `diagnosis.joint.diagnose_together`.
 
     Raises:
         MeasurementError: data that cannot be used, or an option without meaning for them.
         UnknownNameError: a monitor or an effect that does not exist.
     """
     measurement = _alone(measurement)
+    if options.get("known") is not None and isinstance(measurement, Measurement):
+        measurement = {kind_of(measurement): measurement}  # beside what another kind left known
     if isinstance(measurement, Measurement):
         of = "first turns"
     elif isinstance(measurement, OrbitResponse):

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families import STEPS, Told, Trial
+from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
 from tmlattice.diagnosis.state import (
     State,

@@ -141,7 +141,10 @@ def _stated(ring: Ring, data: Measurement | OrbitResponse) -> Check:
 # --- first turns ----------------------------------------------------------------------------------
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
     flat = data.readings.reshape(-1, len(data.monitors), 2)
-    checks = [*signals.monitors(ring, data.monitors, flat), *signals.first_turns(ring, data)]
+    moved = bool(np.ptp(data.launches, axis=0).any()) or any(data.settings)
+    checks = [
+        *signals.monitors(ring, data.monitors, flat, moved), *signals.first_turns(ring, data)
+    ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
     judge = Judge(ring, data, known)
@@ -288,6 +291,8 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
 # --- an orbit response ----------------------------------------------------------------------------
 def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     checks = signals.monitors(ring, data.monitors, data.response)
+    if any(check.status == "wrong" for check in checks):
+        return checks
     judge = ResponseJudge(ring, data)
     verdicts = judge.verdicts()
     for verdict in verdicts:

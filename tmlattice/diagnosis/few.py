@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import DenseFit, Step, score
-from tmlattice.diagnosis.families import Told
+from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin

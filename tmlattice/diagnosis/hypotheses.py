@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.families import QuadrupoleGradient
+from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.state import State
 from tmlattice.effects import apply

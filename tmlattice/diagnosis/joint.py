@@ -23,7 +23,7 @@ from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.inference import chi2
-from tmlattice.inference.among import MOST, Among, Learnt, small_errors_of
+from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome, fit, settled
@@ -50,6 +50,7 @@ def diagnose_together(
     *,
     reference: Mapping[str, Measured] | None = None,
     background: Mapping[str, float | None] | None = None,
+    known: Known | None = None,
     holdout: float = 0.33,
     effects: Sequence[str] | None = None,
     max_effects: int = 8,
@@ -65,6 +66,8 @@ def diagnose_together(
         measured: by the names that the result calls them.
         reference: of the same machine before the fault, of any kinds: static errors cancel.
         background: small errors, as of `diagnose`.
+        known: of the small errors beforehand, from an earlier diagnosis whose ring as found this
+            is: see `twin`. Then no background is asked for.
         holdout: share of shots, or of correctors, that judge.
         effects: names of those that may be the cause; else all usual ones.
         max_effects: findings at most.
@@ -98,7 +101,7 @@ def diagnose_together(
     )
     problem = replace(
         Together.of(first, then),
-        places=places, judgement=judgement, fixed=(),
+        places=places, judgement=judgement, fixed=() if known is None else known.causes,
     )  # fmt: skip
     hypotheses = [
         (name, place) for name in chosen for place in find(name).places(ring)
@@ -113,7 +116,7 @@ def diagnose_together(
         (name, place) for name in (rms or background_rms({"all": None}))
         for place in find(name).places(ring)
     ]  # fmt: skip
-    found, small = _sought(search, everywhere, rms)
+    found, small = _sought(search, everywhere, rms, known)
     progress("report")
     return _told(
         ring, parts, problem, found, small, judgement,
@@ -148,7 +151,10 @@ def _chosen(ring: Ring, effects: Sequence[str] | None) -> list[str]:
 
 # --- the search ----
 def _sought(
-    search: Search, everywhere: Sequence[Hypothesis], told: Mapping[str, float] | None
+    search: Search,
+    everywhere: Sequence[Hypothesis],
+    told: Mapping[str, float] | None,
+    known: Known | None,
 ) -> tuple[Explanation, Learnt | None]:
     """Few causes alone, or a few among small errors everywhere: what the data speak for."""
     problem = search.problem
@@ -157,7 +163,8 @@ def _sought(
     if start.point.lost:
         raise MeasurementError(f"{start.point.lost} in the design: is it this machine's lattice?")
     few = None
-    if not told:
+    learn = told is None and known is None
+    if not told and known is None:
         narrow = replace(search, most=min(FEW, search.most))
         few = explain(replace(narrow, unnamed=False), start)
         if search.unnamed and not _explained(few) and not _crowded(few):
@@ -168,12 +175,14 @@ def _sought(
             return few, None
     search.progress("small errors")
     usual = background_rms({"all": None}) if told is None else told
+    seen = [h for h in everywhere if problem.sees(h)]
+    start_from = Known.usual(seen, usual) if known is None else known
 
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
-        return small_errors_of(problem, everywhere, usual, nuisances, causes, learn=told is None)
+        return small_errors_of(problem, start_from, nuisances, causes, learn=learn)
 
     small = learnt((), start.nuisances)
-    if told is None and small.log_evidence < CLEAR:
+    if learn and small.log_evidence < CLEAR:
         assert few is not None
         return (explain(search, start) if few.full else few), None
     # two findings say already whether the sizes have to be learnt again beside them
@@ -266,12 +275,15 @@ def _told(
     views = _views(parts, kept, stages)
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
-    heldout = _held_out(parts, stages, aside, since)
+    heldout = _held_out(parts, problem.fixed, stages, aside, since)
     if heldout is None:
         said = (*said, "nothing is held out, so nobody but the fit judges the gap")
     warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
+    learnt = None
+    if isinstance(found.problem, Among):
+        learnt = found.problem.learnt(found.fit if causes else found.before)
     return Diagnosis(
         verdict=verdict,
         findings=tuple(
@@ -297,7 +309,7 @@ def _told(
         errors=tuple(errors.tolist()),
         priors={} if small is None else dict(small.sizes),
         prior_errors={} if small is None else dict(small.errors),
-        view=JointView(found, views),
+        view=JointView(found, views, learnt),
     )
 
 
@@ -324,14 +336,18 @@ def _stages(
         inner = found.problem
         assert isinstance(inner, Among)
         for one in (found.before, found.fit)[: 1 + bool(causes)]:
-            amounts = zip(inner.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
+            amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
             models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
         if causes:
             models[-1] = (models[-1][0], causes)
     else:
         models += [((), causes[: i + 1]) for i in range(len(causes))]
     return [
-        _Stage(static, own, settled(replace(problem, fixed=static), own, problem.first))
+        _Stage(
+            static,
+            own,
+            settled(replace(problem, fixed=(*problem.fixed, *static)), own, problem.first),
+        )
         for static, own in models
     ]
 
@@ -387,7 +403,11 @@ def _pairs(parts: Sequence[Part], problem: Together, stage: _Stage) -> list[tupl
 
 
 def _held_out(
-    parts: Sequence[Part], stages: Sequence[_Stage], aside: set[str], since: int
+    parts: Sequence[Part],
+    fixed: tuple[Cause, ...],
+    stages: Sequence[_Stage],
+    aside: set[str],
+    since: int,
 ) -> Gap | None:
     """Half of the monitors gives a held-out shot its nuisances, the other half judges; monitors
     that were set aside do neither."""
@@ -402,7 +422,11 @@ def _held_out(
     for stage in stages:
         pairs, among = [], []
         for judge in judges:
-            seen = [c for c in (*stage.static, *stage.causes) if judge.sees((c.effect, c.element))]
+            seen = [
+                c
+                for c in (*fixed, *stage.static, *stage.causes)
+                if judge.sees((c.effect, c.element))
+            ]
             there = replace(judge, fixed=tuple(seen))
             scored = there.owner() % 2 == 1
             gives = settled(there.without(scored), (), there.first)

@@ -31,6 +31,10 @@ millimetre and 7e-5 of one of three, the same in every reading of a turn. A faul
 this is found with less."""
 ROUGH = 1e-4
 """m; stands for a noise that is not known yet, while the launches are fitted for the first time."""
+COPIES = 3
+"""Of all tangents, which are held at once: they, their inverses, and products of them."""
+MEMORY = 8e9
+"""Bytes that these may take."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ def prepare(
     data = of_measurement(ring, measurement)
     if reference is not None:
         data = joined(of_measurement(ring, reference, reference=True), data)
+    _check_size(ring, data)
     chosen = chosen_effects(ring, effects, data.launch_sigma)
     places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
     model = Model(ring, data.settings, data.turns, known, active=data.active)
@@ -95,6 +100,18 @@ def prepare(
     before = _on_its_way(fit(problem, (), start.nuisances), ring)
     hypotheses = tuple(model.hypotheses(chosen))
     return Prepared(problem, before, hypotheses, known, dead, noise, estimated, said)
+
+
+def _check_size(ring: Ring, data: Data) -> None:
+    """Whether trajectories of all shots, with their tangents, find room."""
+    steps = data.turns * (len(ring.magnets) + 1)
+    needed = COPIES * 8 * 36 * data.shots * steps
+    if needed > MEMORY:
+        raise MeasurementError(
+            f"{data.shots} shots of {data.turns} turns in {len(ring.magnets)} magnets take "
+            f"{needed / 1e9:.0f} GB of memory; give {max(int(data.shots * MEMORY / needed), 1)} of "
+            "the shots, or fewer turns (Measurement.select): they say as much"
+        )
 
 
 def _on_its_way(start: Fit, ring: Ring) -> Fit:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families import QuadrupoleGradient
+from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import families, magnets
 from tmlattice.diagnosis.rounds import linear, marginal
 from tmlattice.diagnosis.state import State

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families import STEPS, Told, Trial
+from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh

@@ -17,6 +17,8 @@ NAMED = 3
 """Names of monitors that a sentence has at most."""
 CUT = 3
 """Monitors without a reading, the last ones of a shot, from which the beam is said to be lost."""
+ALIKE = 0.5
+"""Share of the signals that never change, from which the data are no readings."""
 SAME_PLACE = 1e-6
 """m."""
 STRAY = 0.02
@@ -29,15 +31,19 @@ def some(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
-def monitors(ring: Ring, names: Sequence[str], values: Array) -> list[Check]:
+def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True) -> list[Check]:
     """Silent, frozen and copied monitors.
 
     Args:
         ring: that they are of.
         names: of the monitors.
         values: readings, [reading, monitor, 2], m; NaN where missing.
+        moved: the beam was another in each reading, so that not all of them can be alike.
     """
     there = np.isfinite(values)
+    if not np.count_nonzero(values[there]):
+        said = "every reading is zero: nothing was read; give the readings of a beam"
+        return [wrong("frozen monitors", said)]
     checks = []
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
@@ -60,7 +66,13 @@ def monitors(ring: Ring, names: Sequence[str], values: Array) -> list[Check]:
         for n, (x, y), both in zip(names, stuck, stuck.all(axis=1), strict=True)
         if x or y
     ]
-    if frozen:
+    if moved and stuck.sum() > ALIKE * max(int(many.sum()), 1):
+        said = (
+            f"{len(frozen)} of {len(names)} monitors read the same in every shot and turn: one "
+            "reading was copied over the others; give what was read each time"
+        )
+        checks.append(wrong("frozen monitors", said))
+    elif frozen:
         said = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
         checks.append(note("frozen monitors", said))
     else:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families import Family
+from tmlattice.diagnosis.family import Family
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
 

@@ -37,10 +37,10 @@ class InsertionDeviceFocusing(ErrorEffect):
 
 @register
 class VerticalFocusing(ThinKickEffect):
-    """What a planar undulator does: its field focuses vertically and leaves the other plane."""
+    """What a planar undulator does, and a dipole's edges: vertical focusing alone."""
 
     name = "vertical_focusing"
-    words = "vertical focusing of an insertion device"
+    words = "vertical focusing of an insertion device or of a dipole's edges"
     group = "insertion devices"
     unit = "1/m"
     sign = "thin, in the middle: py -= amount y"
@@ -49,14 +49,15 @@ class VerticalFocusing(ThinKickEffect):
     remedy = "make the vertical focusing at {} good"
     to_check = (
         "Read the gap of the insertion device that stands there, and make its focusing good with "
-        "the quadrupoles beside it."
+        "the quadrupoles beside it; of a dipole, compare edge angles and fringe integrals with the "
+        "lattice file's."
     )
     largest = 0.03
-    sits_on_text = "wigglers, markers, drifts of half a metre or more"
-    usual = False  # of a change between two measurements, or where somebody names it
+    sits_on_text = "dipoles, wigglers, markers, drifts of half a metre or more"
+    usual = False  # in responses, where a family of it is fitted, or where somebody names it
 
     def sits_on(self, element: Element) -> bool:
-        """Where an insertion device is, or may stand."""
-        return element.kind in ("wiggler", "marker") or (
+        """Where an insertion device is, or may stand; and dipoles."""
+        return element.kind in ("wiggler", "marker", "bend") or (
             element.kind == "drift" and element.length >= 0.5
         )

@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.batch import run_batch
+from tmlattice.batch import MADE_BY, fingerprint, run_batch
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.fitting.experiment import DEFAULT_LAUNCH, network_tunes, perturbed_ring
 from tmlattice.fitting.methods import fine_tune
 from tmlattice.lattice import Element, Ring, load_ring
 from tmlattice.lattice.checks import need_monitors
+from tmlattice.lattice.load import contents
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
@@ -250,7 +251,13 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
     stated = folder / "options.json"
     text = json.loads(json.dumps(identity))
     if stated.exists():
-        if json.loads(stated.read_text(encoding="utf-8")) != text:
+        try:
+            there = json.loads(stated.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as error:
+            raise TmlatticeError(
+                f"'{stated}' is damaged ({error}); name another folder with --out, or remove it"
+            ) from error
+        if there != text:
             raise TmlatticeError(
                 f"'{folder}' holds a study with other options; name another folder with --out"
             )
@@ -268,7 +275,9 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
 def _case(job: tuple[str, str, int], values: dict[str, Any]) -> Case:
     if "error" in values:  # not one of ours: the code, or the worker, broke
         return Case(job[0], float("nan"), job[1], job[2], problem=values["error"])
-    plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    plain: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != MADE_BY
+    }
     return Case(**plain)
 
 
@@ -323,6 +332,9 @@ def study_tune_fit(
     need_monitors(ring)
     names = faults(ring, magnets, kind)
     jobs = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
+    from tmlattice import __version__
+
+    made_from = (__version__, contents(ring), sorted(options.items(), key=str))
     with nullcontext() if folder is not None else TemporaryDirectory() as temporary:
         if folder is not None:
             _open_folder(folder, {**dict(zip(_LATTICE, where, strict=False)), **options})
@@ -333,6 +345,7 @@ def study_tune_fit(
             jobs=workers,
             scheduler=scheduler,
             progress=progress,
+            made_by=dict.fromkeys(map(_name_of, jobs), fingerprint(*made_from)),
         )
     return [_case(job, results[_name_of(job)]) for job in jobs]
 

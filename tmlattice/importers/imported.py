@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder
 from tmlattice.lattice import Ring, save_ring
-from tmlattice.measurement import Measurement, OrbitResponse, write_measurement
+from tmlattice.measurement import Measurement, OrbitResponse, TurnByTurn, write_measurement
 from tmlattice.measurement.write import check_free
 
 Array = NDArray[np.float64]
@@ -22,13 +22,13 @@ class Imported:
     """A measurement as the package has it.
 
     Attributes:
-        measurement: an orbit response, or first turns.
+        measurement: an orbit response, first turns, or turns of a stored beam.
         ring: the model that the files hold or that the caller named; None: neither.
         assumed: what the files do not prove: units, signs, steps; a sentence each.
         doubts: what the data contradict; a sentence each.
     """
 
-    measurement: OrbitResponse | Measurement
+    measurement: OrbitResponse | Measurement | TurnByTurn
     ring: Ring | None = None
     assumed: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -92,7 +92,8 @@ def described(brought: Imported) -> str:
             f"{planes[1]} y; {step}{noise}"
         )
     shots, turns, monitors, _ = data.readings.shape
-    return f"first turns: {shots} shots, {turns} turns, {monitors} monitors"
+    what = "turn by turn" if isinstance(data, TurnByTurn) else "first turns"
+    return f"{what}: {shots} shots, {turns} turns, {monitors} monitors"
 
 
 def write_imported(brought: Imported, folder: Path, force: bool = False) -> None:

@@ -19,11 +19,18 @@ from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse, read_table, read_turn_by_turn
+from tmlattice.measurement import (
+    Measurement,
+    OrbitResponse,
+    TurnByTurn,
+    read_table,
+    read_turn_by_turn,
+)
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
 from tmlattice.measurement.tables import Unit
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
+from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
 Array = NDArray[np.float64]
 
@@ -74,6 +81,8 @@ def bring_turns(
 ) -> Imported:
     """Turns of the beam, of a file that the package `turn_by_turn` reads.
 
+    Sixteen and more are those of a stored beam that was kicked, fewer are first turns.
+
     Args:
         path: the file.
         ring: the lattice, whose names the monitors then have; None: names as they are.
@@ -97,11 +106,17 @@ def bring_turns(
         single = int((read.sum(axis=1) == 1).sum())
         said = [
             f"read as '{one}' of turn_by_turn; readings are in {unit or 'mm'}",
-            "turn 0 is the first in the file; where the beam was launched is not known",
             f"monitors: {int(read[:, 0].sum())} in x, {int(read[:, 1].sum())} in y"
             + (f", {single} of one plane" if single else ""),
         ]
-        return Imported(_unlaunched(data, ring), ring, tuple(said), doubts)
+        turns = data.readings.shape[1]
+        if turns < FEWEST:
+            said.append("turn 0 is the first in the file; where the beam was launched is not known")
+            return Imported(_unlaunched(data, ring), ring, tuple(said), doubts)
+        said.append(f"{turns} turns are those of a stored beam that was kicked before the first")
+        if turns > MOST:
+            said.append(f"the first {MOST} turns are taken")
+        return Imported(_stored(data, ring), ring, tuple(said), doubts)
     assert failed is not None
     raise failed
 
@@ -129,6 +144,16 @@ def _unlaunched(data: Measurement, ring: Ring | None) -> Measurement:
         monitors=data.monitors,
         noise=None,
         launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(data.shots), 1)),
+        shots=data.shots,
+        lattice=None if ring is None else "lattice.json",
+        energy=None if ring is None else ring.energy,
+    )
+
+
+def _stored(data: Measurement, ring: Ring | None) -> TurnByTurn:
+    return TurnByTurn(
+        readings=data.readings[:, :MOST],
+        monitors=data.monitors,
         shots=data.shots,
         lattice=None if ring is None else "lattice.json",
         energy=None if ring is None else ring.energy,

@@ -33,8 +33,55 @@ ROUNDS = 2
 ROWS = 1600
 """Rows from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
 
+LEAST = 0.02
+"""Share of the variance of a direction that has to be known for it to be remembered."""
+
 MOST = 14_000
 """Rows that can be whitened: a matrix of 1.6 GB, and a minute of work."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of small errors beforehand: Gaussian, about some amounts.
+
+    The covariance is rms (1 - sum_d share_d v_d v_d^T) rms: of the directions v something was
+    measured already.
+
+    Attributes:
+        hypotheses: every small error.
+        amounts: the likeliest, [error].
+        rms: of each before anything was measured, [error].
+        seen: orthonormal directions in units of the rms, [direction, error].
+        share: of the variance of each that is known since, [direction].
+        causes: what is there besides, for certain.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    amounts: Array = field(repr=False)
+    rms: Array = field(repr=False)
+    seen: Array = field(repr=False)
+    share: Array = field(repr=False)
+    causes: tuple[Cause, ...] = ()
+
+    @classmethod
+    def usual(cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]) -> "Known":
+        """About zero, of sizes by effect; nothing was measured."""
+        scale = np.array([rms[name] for name, _ in hypotheses])
+        return cls(
+            tuple(hypotheses), np.zeros(len(scale)), scale, np.zeros((0, len(scale))), np.zeros(0)
+        )
+
+    def mixed(self, x: Array) -> Array:
+        """Coordinates [error, ...] of independent errors of size 1 as shares of the rms."""
+        left = 1 - np.sqrt(1 - self.share)
+        return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
+                          .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
+
+    @property
+    def errors(self) -> Array:
+        """Standard deviation of each, [error]."""
+        taken = self.share @ self.seen**2 if len(self.share) else 0.0
+        return np.asarray(self.rms * np.sqrt(np.maximum(1 - taken, 0.0)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,18 +90,18 @@ class Among(Problem):
 
     Attributes:
         inner: with the likeliest small errors among its fixed causes.
-        hypotheses, rms: of every small error.
-        spread: rms times d reading / d amount, [error, *shape of `valid`].
-        amounts_now: of the small errors in the model, [error].
+        known: of the small errors beforehand.
+        spread: d reading / d coordinate of `known.mixed`, [error, *shape of `valid`].
+        shift: what the amounts in the model, beyond the likeliest beforehand, make of the readings,
+            of the shape of `valid`.
         open: of which family each is, and the covariance of the logarithms of their sizes where
             those were learnt; or None.
     """
 
     inner: Problem = field(repr=False)
-    hypotheses: tuple[Hypothesis, ...] = field(repr=False)
-    rms: Array = field(repr=False)
+    known: Known = field(repr=False)
     spread: Array = field(repr=False)
-    amounts_now: Array = field(repr=False)
+    shift: Array = field(repr=False)
     open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
 
     @cached_property
@@ -101,10 +148,9 @@ class Among(Problem):
         point = self.inner.at(causes, nuisances, kicks)
         if point.projection is None:
             return replace(point, view=point)
-        moved = self.amounts_now / self.rms @ self.rows
         return replace(
             point,
-            residual=self.white(point.residual + moved),
+            residual=self.white(point.residual + self.inner.as_rows(self.shift)),
             projection=Projection(self._factor[None] @ point.projection.matrix()[None]),
             view=point,
         )
@@ -180,7 +226,23 @@ class Among(Problem):
     # --- the small errors -----------------------------------------------------------------------
     def estimate(self, clean: Array) -> Array:
         """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
-        return np.asarray(self.rms * (self.rows @ (clean @ self._factor)))
+        known = self.known
+        return known.amounts + known.rms * known.mixed(self.rows @ (clean @ self._factor))
+
+    def learnt(self, explained: Fit) -> Known:
+        """What is known of the small errors since, beside an explanation."""
+        seen = explained.projection.out(self.white(self.rows))
+        values, vectors = np.linalg.eigh(seen @ seen.T)
+        big = values > LEAST
+        # back from the coordinates of what was known to those of the first rms
+        left = np.eye(len(values)) - (vectors[:, big] * values[big]) @ vectors[:, big].T
+        whole = self.known.mixed(self.known.mixed(left).T)
+        share, directions = np.linalg.eigh(np.eye(len(values)) - whole)
+        big = share > LEAST
+        return replace(
+            self.known, amounts=self.estimate(explained.clean), seen=directions[:, big].T,
+            share=np.minimum(share[big], 1 - 1e-9),
+        )  # fmt: skip
 
 
 class _AmongMetric(Metric):
@@ -220,8 +282,7 @@ class Learnt:
 
 def small_errors_of(
     problem: Problem,
-    hypotheses: Sequence[Hypothesis],
-    rms: Mapping[str, float],
+    known: Known,
     nuisances: Array,
     causes: Sequence[Cause] = (),
     *,
@@ -231,46 +292,49 @@ def small_errors_of(
 
     Args:
         problem: of the design.
-        hypotheses: every small error.
-        rms: their usual size by effect; what is learnt starts there.
+        known: of the small errors beforehand; where sizes are learnt they start there.
         nuisances: first guess.
         causes: what was found already: small errors are taken beside it.
-        learn: the sizes are learnt; else they are as given.
+        learn: the sizes are learnt; else they are as known.
+
+    Raises:
+        UnstableRingError: the likeliest small errors leave no stored beam.
     """
-    hypotheses = tuple(h for h in hypotheses if problem.sees(h))
-    names = list(dict.fromkeys(name for name, _ in hypotheses))
-    belongs = np.array([names.index(name) for name, _ in hypotheses])
-    sizes = {name: rms[name] for name in names}
-    amounts = np.zeros(len(hypotheses))
+    names = list(dict.fromkeys(name for name, _ in known.hypotheses))
+    belongs = np.array([names.index(name) for name, _ in known.hypotheses])
+    amounts, factor = known.amounts, np.ones(len(names))
     evidence, errors, opened = 0.0, dict[str, float](), None
     for turn in range(ROUNDS):
-        known = [Cause(*h, a) for h, a in zip(hypotheses, amounts.tolist(), strict=True) if a]
-        inner = replace(problem, fixed=(*problem.fixed, *known))
+        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+        there = [Cause(*h, a) for h, a in own if a]
+        inner = replace(problem, fixed=(*problem.fixed, *there))
         alone = settled(inner, causes, nuisances)
         if alone.projection is None:
             raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
-        scale = np.array([sizes[name] for name, _ in hypotheses])
-        spread = scale[:, None] * _signatures(inner, alone, hypotheses)
+        slopes = _signatures(inner, alone, known.hypotheses)
+        shift = (amounts - known.amounts) @ slopes
+        spread = known.mixed(known.rms[:, None] * slopes)
         if learn:
             rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
-            moved = alone.residual + amounts / scale @ rows
+            moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
             found = _sizes(moved, alone.projection, rows, belongs, len(names))
             evidence = found.log_evidence if turn == 0 else evidence
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
-            factor = found.scale[belongs]
-            scale, spread = factor * scale, factor[:, None] * spread
-            sizes = {n: s * float(found.scale[i]) for i, (n, s) in enumerate(sizes.items())}
+            factor = factor * found.scale
+            known = replace(known, rms=known.rms * found.scale[belongs])
+            spread = found.scale[belongs][:, None] * spread
         among = Among(
             places=problem.places, fixed=(), amounts=problem.amounts, judgement=problem.judgement,
-            inner=inner, hypotheses=hypotheses, rms=scale,
-            spread=spread.reshape(-1, *inner.valid.shape), amounts_now=amounts, open=opened,
+            inner=inner, known=known, spread=spread.reshape(-1, *inner.valid.shape),
+            shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
         point = settled(among, causes, alone.nuisances)
         assert point.projection is not None
         nuisances = point.nuisances
         amounts = among.estimate(point.projection.out(point.residual))
     before = fit(among, (), nuisances)
+    sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
     return Learnt(among, before, sizes, errors, evidence)
 
 

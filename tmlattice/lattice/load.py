@@ -63,6 +63,14 @@ def load_ring(
     return replace(ring, mass=PARTICLES[particle])
 
 
+def contents(ring: Ring) -> tuple[object, ...]:
+    """All that a ring is, but for its name: what results depend on."""
+    elements = tuple(
+        (e.name, e.kind, e.length, e.k1, e.k2, e.angle, e.tilt, e.errors) for e in ring.elements
+    )
+    return (ring.energy, ring.mass, elements)
+
+
 def _loaded(name_or_path: str | Path, sequence: str | None, energy: float | None) -> Ring:
     path = _find(str(name_or_path))
     name = str(name_or_path)

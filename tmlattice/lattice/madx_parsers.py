@@ -69,6 +69,7 @@ class _Bounded:
     # what AT's parsers are asked for; they are known at run time alone
     env: dict[str, Any]
     bases: list[Path]
+    postponed: list[tuple[Any, ...]]
     _format_command: Callable[[str], str]
     _delimiter: str | None
     _linecomment: str | tuple[str, ...]
@@ -138,6 +139,13 @@ class _Bounded:
                         f"'{path}' has no '{end.strip() or 'end of a statement'}' in "
                         f"{LONGEST_STATEMENT} lines"
                     )
+
+    def _missing(self) -> set[Any]:
+        """What postponed statements lack; AT's own follows definitions in a circle for ever."""
+        return {command[0] for command in self.postponed}
+
+    def _analyse(self, key: str | None) -> None:
+        """AT's own prints such a circle."""
 
     def expand(self, key: str) -> Any:
         """AT's elements of a line or sequence."""

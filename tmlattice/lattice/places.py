@@ -154,5 +154,4 @@ def _check(source: Any) -> None:
             stacklevel=4,
         )
     if length < 0:
-        level = logging.DEBUG if length > -1e-6 else logging.WARNING
-        log.log(level, "element '%s' has the negative length %.3g m", source.id, length)
+        log.debug("element '%s' has the negative length %.3g m", source.id, length)

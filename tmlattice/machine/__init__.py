@@ -3,6 +3,7 @@
 >>> simulation = simulate(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)], shots=6, seed=1)
 >>> measurement = simulation.measurement()
 >>> simulation.write("day_1")                                   # the measurement folder
+>>> stored_beam.simulate_turns(ring, shots=4).measured          # of a stored beam
 >>> Machine(ring, engine="ocelot").beam(launches)               # [shot, turn, monitor, 2], m
 """
 

@@ -35,7 +35,9 @@ _TAKES: Mapping[str, frozenset[str]] = {
     "sextupole": _STRAIGHT,
     "octupole": _STRAIGHT,
     "multipole": _STRAIGHT,
-    "bend": frozenset({"scale", "dx", "dy", "roll", "kick_x", "kick_y", "loss", "entrance"}),
+    "bend": frozenset(
+        {"scale", "dx", "dy", "roll", "kick_x", "kick_y", "loss", "entrance", "middle"}
+    ),
     "hcorrector": _CORRECTOR,
     "vcorrector": _CORRECTOR,
     "wiggler": frozenset({"loss", "entrance", "middle"}),
@@ -324,11 +326,13 @@ class Builder:
             )
 
         entrance, exit_ = source.fint * source.gap, source.fintx * source.gap
-        if entrance == exit_:
+        thin = self._thin(element, wrong, "middle")
+        if entrance == exit_ and not thin:
             made = [body(1.0, EntranceAngle=source.e1, ExitAngle=source.e2, gK=entrance)]
         else:  # AT's exact bend has one fringe integral for both edges
             made = [
                 body(0.5, EntranceAngle=source.e1, gK=entrance, FringeBendExit=0),
+                *thin,
                 body(0.5, ExitAngle=source.e2, gK=exit_, FringeBendEntrance=0),
             ]
         if wrong.dx or wrong.dy:

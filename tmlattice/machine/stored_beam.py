@@ -298,7 +298,7 @@ def simulate_tunes(
     """
     machine = _machine(ring, causes, background, seed, machine_seed)
     each = _settings(settings, shots)
-    found = {repr(s): tunes_of(machine.engine, s) for s in each}
+    found = {key: tunes_of(machine.engine, s) for key, s in {repr(s): s for s in each}.items()}
     values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
     for i, value in enumerate(values):
         value += np.reshape(noise, (2, 1)) * stream(seed, "tunes", i).standard_normal((2, 2))  # noqa: PLW2901

@@ -1,15 +1,21 @@
 """JSON documents that carry `format` and `version`: read strictly, checked by their schema."""
 
+import difflib
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.errors import MeasurementError, UnknownNameError, plain
+
+MOST_DIGITS = 300
+"""Of a whole number: as a float it would be beyond all of them."""
+NEAR = 0.8
+"""Likeness of a key to a known one from which it is taken for a slip of the pen."""
 
 
 @cache
@@ -40,7 +46,9 @@ def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[
     except UnicodeDecodeError as error:
         raise not_utf8(path, error) from error
     try:
-        document = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
+        document = json.loads(
+            text, object_pairs_hook=_once, parse_constant=_no_constant, parse_int=_whole
+        )
     except json.JSONDecodeError as error:
         raise MeasurementError(
             f"{path}, line {error.lineno}: not JSON ({error.msg}); mend it, or write it anew"
@@ -60,7 +68,26 @@ def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[
     wrong = best_match(_validator(schema).iter_errors(document))
     if wrong is not None:
         raise MeasurementError(f"{path}: {_explain(wrong)}")
+    if said := _misspelt(document, _validator(schema).schema):
+        raise MeasurementError(f"{path}: {said}")
     return document
+
+
+def _misspelt(document: dict[str, Any], schema: dict[str, Any]) -> str | None:
+    """What to say of a key that is all but a known one; others are whoever wrote them's own."""
+    parts = [schema, schema.get("then", {}), schema.get("else", {})]
+    known = {name: rule for part in parts for name, rule in part.get("properties", {}).items()}
+    places: list[tuple[str, dict[str, Any], Iterable[str]]] = [("it", document, known)]
+    for name, rule in known.items():
+        own = rule.get("items", {}).get("properties", {})
+        if own and isinstance(document.get(name), list):
+            places += [(f"{name}[{i}]", item, own) for i, item in enumerate(document[name])]
+    for place, found, names in places:
+        for key in found.keys() - set(names):
+            near = difflib.get_close_matches(key.casefold(), list(names), 1, NEAR)
+            if near and near[0] not in found:
+                return f'{place} has the key "{plain(key, 60)}"; did you mean "{near[0]}"?'
+    return None
 
 
 class Digest:
@@ -130,6 +157,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _no_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON; a number that is not finite is written as null")
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits; write it with an exponent")
+    return int(digits)
 
 
 def _short(value: Any) -> str:

@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 AnyMeasurement = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion | TuneReading
 RESPONSE = ("corrector", "monitor", "x", "y")
 RF = "rf"
+FEWEST, MOST_UNREAD = 100, 10
+"""Shots that may be listed without a reading: so many, and so many times those that were read."""
 
 _WORDS = {
     Measurement: "first turns",
@@ -108,6 +110,12 @@ def _trajectory(
     rows.check("shot", "turn", "monitor")
     order = places_of(rows, "shot", shots)
     names, place = match_names(rows, "monitor", monitors)
+    read = len(np.unique(order))
+    if len(shots) > FEWEST + MOST_UNREAD * read:  # before anything is laid out for them
+        raise MeasurementError(
+            f"{file}: it lists {len(shots)} shots, and {rows.path.name} has readings of {read}; "
+            "take the others out"
+        )
     readings = dense(rows, order, len(shots), place, len(names))
     check_table(document, rows.path)  # what is wrong in a line is told with the line
     with located(file):

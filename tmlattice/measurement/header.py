@@ -1,11 +1,13 @@
 """What measurement.json says for every kind: format, kind, lattice, energy and noise."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.errors import plain
 from tmlattice.measurement.monitors import Names, noise_table
 
 Array = NDArray[np.float64]
@@ -53,6 +55,13 @@ def read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) -> 
             every[name]  # an UnknownNameError where the ring has no such monitor
     names = Names("monitor", read)
     there = {name: _pair(entry) for name, entry in noise.items() if names.find(name) is not None}
+    unread = [name for name in table.names if names.find(name) is None]
+    if unread and known is None:
+        warnings.warn(
+            f"the noise names {len(unread)} monitors of which nothing was read, such as "
+            f"'{plain(unread[0], 60)}'; mend the name where it should be another",
+            stacklevel=2,
+        )
     return noise_table(there, read)
 
 

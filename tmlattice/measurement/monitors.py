@@ -13,6 +13,11 @@ from tmlattice.errors import MeasurementError, unknown_name
 
 Array = NDArray[np.float64]
 
+LARGEST_NOISE, SMALLEST_NOISE = 1.0, 1e-15
+"""m; what is beyond is no noise of a reading in metres."""
+HIGHEST_ENERGY = 1e6
+"""GeV; above every ring's: an energy in eV is one."""
+
 
 class Names:
     """Places by name.
@@ -102,6 +107,12 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
         raise MeasurementError(
             "the noise is neither a pair (x, y) in m nor one such pair a monitor"
         ) from None
+    if (table > LARGEST_NOISE).any() or ((table > 0) & (table < SMALLEST_NOISE)).any():
+        low, high = np.nanmin(table), np.nanmax(table)
+        raise MeasurementError(
+            f"the noise is stated as {low:g} to {high:g} m, which no monitor has; it is the rms of "
+            "one reading in metres"
+        )
     wrong = ~(np.isnan(table) | ((table > 0) & np.isfinite(table)))
     if wrong.any():
         place, plane = (int(i) for i in np.argwhere(wrong)[0])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]
@@ -116,8 +116,10 @@ class OrbitResponse(Shown):
                         f"the RF step's orbit has the shape {orbit.shape}, not [{monitors}, 2]"
                     )
                 keep(rf=replace(rf, orbit=orbit))
-        if self.energy is not None and not 0 < self.energy < np.inf:
-            raise MeasurementError(f"an energy of {self.energy:g} GeV cannot be; it is above zero")
+        if self.energy is not None and not 0 < self.energy < HIGHEST_ENERGY:
+            raise MeasurementError(
+                f"an energy of {self.energy:g} GeV cannot be; it is above zero, and in GeV"
+            )
         everything = [response] if self.rf is None or self.rf.orbit is None else [
             response, self.rf.orbit
         ]  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]
@@ -116,8 +116,10 @@ class Measurement(Shown):
         settings = tuple(self.settings)
         if settings and len(settings) != number:
             raise MeasurementError(f"{len(settings)} settings for {number} shots; one a shot")
-        if self.energy is not None and not 0 < self.energy < np.inf:
-            raise MeasurementError(f"an energy of {self.energy:g} GeV cannot be; it is above zero")
+        if self.energy is not None and not 0 < self.energy < HIGHEST_ENERGY:
+            raise MeasurementError(
+                f"an energy of {self.energy:g} GeV cannot be; it is above zero, and in GeV"
+            )
         for shot, changed in zip(shots, settings, strict=False):
             check_settings(shot, changed)
         keep(

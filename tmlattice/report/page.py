@@ -68,16 +68,14 @@ def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Pic
     return pictures
 
 
-COLOURS = 96
-"""Of a picture: lines and their soft edges need no more, and it is a third as large."""
-
-
 def shrink(path: Path) -> None:
-    """A PNG file with a palette."""
+    """A PNG file with a palette, a third as large; a rare colour keeps its place in it."""
     from PIL import Image
 
     with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        few = picture.convert("RGB").quantize(
+            method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
     few.save(path, optimize=True)
 
 
@@ -99,10 +97,12 @@ def page(
         provenance: where it should state more than the diagnosis' own.
     """
     parts = files("tmlattice.report")
+    stated = diagnosis.provenance if provenance is None else provenance
     return render(
         "diagnosis.html",
-        diagnosis.provenance if provenance is None else provenance,
+        stated,
         diagnosis=diagnosis,
+        told=list(tables.notes(diagnosis, stated)),
         report=report,
         dense=response_text,
         tables=tables,

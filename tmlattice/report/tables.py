@@ -3,8 +3,9 @@
 >>> [table.title for table in error_tables(diagnosis)]
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -138,8 +139,13 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     ]
 
 
-def notes(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
-    """All that limits what was said, in one place: (what, text)."""
+def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """All that limits what was said, in one place: (what, text).
+
+    Args:
+        diagnosis: of `diagnose`.
+        provenance: its own, or one that also says what was assumed of files.
+    """
     for warning in diagnosis.warnings:
         yield "warning", warning
     if diagnosis.bad_monitors:
@@ -154,5 +160,7 @@ def notes(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
         yield "readings left out", ", ".join(places[:MOST]) + more
     for name in diagnosis.provenance["options"].get("assume", ()):
         yield "assumed of the data", f"{name}: {ASSUMPTIONS[name].words}"
+    for said in provenance.get("assumed_of_files", ()):
+        yield "assumed of the files", said
     for said in diagnosis.degenerate:
         yield "not settled by the data", said

@@ -1,0 +1,188 @@
+"""The contract of every reader, in one place.
+
+A damaged file is accepted, with some meaning, or refused: one sentence that begins with
+`tmlattice: `, exit code 2, within `SECONDS`, with less than `BYTES` of memory, nothing printed that
+steers a terminal, nothing left behind, and the process alive. A verdict's exit code is 0 or 1.
+"""
+
+import contextlib
+import io
+import json
+import re
+import resource
+import signal
+import sys
+import time
+import traceback
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from unittest import mock
+
+from damage import damaged_bytes, damaged_json
+
+SECONDS = 5.0
+HANG = 60
+BYTES = 6 << 30
+STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+class Hang(BaseException):
+    """No `except Exception` keeps it."""
+
+
+@dataclass
+class Tally:
+    """What became of the inputs, by format."""
+
+    accepted: int = 0
+    refused: int = 0
+    slow: int = 0
+    longest: float = 0.0
+    broken: list[str] = field(default_factory=list)
+
+
+def called(words, folder):
+    """Exit code, output and seconds of a command, in this process."""
+    from tmlattice.cli.command import main
+
+    out, errors = io.StringIO(), io.StringIO()
+    begun = time.perf_counter()
+
+    def late(*_):
+        raise Hang
+
+    old = signal.signal(signal.SIGALRM, late)
+    signal.alarm(HANG)
+    try:
+        with (
+            contextlib.chdir(folder),
+            mock.patch.object(sys, "argv", ["tmlattice", *words]),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(errors),
+            warnings.catch_warnings(),
+        ):
+            warnings.resetwarnings()
+            for library in (DeprecationWarning, PendingDeprecationWarning, ImportWarning):
+                warnings.simplefilter("ignore", library)
+            try:
+                main()
+            except SystemExit as end:
+                code = end.code
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, old)
+    return code, out.getvalue(), errors.getvalue(), time.perf_counter() - begun
+
+
+def broken(words, folder, tally):
+    """What of the contract a command breaks, or None."""
+    before = set(folder.rglob("*"))
+    try:
+        code, out, errors, seconds = called(words, folder)
+    except Hang:
+        return f"no end in {HANG} s"
+    except BaseException:
+        return traceback.format_exc(limit=-4)
+    tally.longest = max(tally.longest, seconds)
+    tally.slow += seconds > SECONDS
+    if left := {p.name for p in folder.rglob("*")} - {p.name for p in before}:
+        return f"left behind: {left}"
+    if code not in (0, 1, 2, None):
+        return f"exit code {code}"
+    if code == 2:
+        sentences = [s for s in errors.splitlines() if not s.startswith("tmlattice: warning")]
+        if not sentences or not sentences[0].startswith("tmlattice: "):
+            return f"no sentence: {errors[:300]!r}"
+    if found := STEERS.search(out + errors):
+        return f"{found.group()!r} reaches the terminal"
+    tally.refused += code == 2
+    tally.accepted += code != 2
+    return None
+
+
+def tried(seed, folder, inputs, rng):
+    """One damaged input: (format, what of the contract it breaks or None)."""
+    name = inputs.names[seed % len(inputs.names)]
+    words, path = inputs.of(name)
+    whole = path.read_bytes()
+    tally = inputs.tallies.setdefault(name, Tally())
+    document = path.suffix == ".json" and rng.integers(3)
+    try:
+        content = damaged_json(rng, whole) if document else damaged_bytes(rng, whole)
+        if content == whole:
+            return name, None
+        path.write_bytes(content)
+        said = broken(words, folder, tally)
+        if said is not None:
+            tally.broken.append(f"seed {seed}: {said}")
+        return name, said
+    finally:
+        path.write_bytes(whole)
+        inputs.put_back()
+
+
+def limit_memory():
+    """A command that asks for more ends with a MemoryError, which it has to put into words."""
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_AS, (BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
+@dataclass
+class Inputs:
+    """Files of every format in a folder, and the command that reads each."""
+
+    folder: Path
+    commands: dict[str, tuple[list[str], str]]
+    tallies: dict[str, Tally] = field(default_factory=dict)
+    kept: dict[Path, bytes] = field(default_factory=dict)
+
+    def put_back(self):
+        """Results that a damaged case has changed: as they were."""
+        for path, content in self.results.items():
+            path.write_bytes(content)
+
+    @property
+    def results(self):
+        """What a command writes because it is asked to."""
+        if not self.kept:
+            self.kept.update({p: p.read_bytes() for p in self.folder.glob("set/results/*")})
+        return self.kept
+
+    @property
+    def names(self):
+        """Of the formats."""
+        return list(self.commands)
+
+    def of(self, name):
+        """The command that reads a format, and its file."""
+        words, file = self.commands[name]
+        return words, self.folder / file
+
+
+def made(folder):
+    """Every format, on a ring of ten magnets."""
+    from inputs import write_all
+
+    inputs = Inputs(folder, write_all(folder))
+    inputs.put_back()
+    return inputs
+
+
+def report(inputs):
+    """A table of what became of the inputs."""
+    rows = [
+        f"{'format':24} {'inputs':>7} {'refused':>8} {'accepted':>9} {'> 5 s':>6} {'broken':>7}"
+    ]
+    for name, t in inputs.tallies.items():
+        count = t.accepted + t.refused + len(t.broken)
+        rows.append(
+            f"{name:24} {count:7} {t.refused:8} {t.accepted:9} {t.slow:6} {len(t.broken):7}"
+            f"   longest {t.longest:.1f} s"
+        )
+    return "\n".join(rows)
+
+
+def dumped(inputs, path):
+    """The same as JSON."""
+    path.write_text(json.dumps({n: vars(t) for n, t in inputs.tallies.items()}, indent=1))
