@@ -214,6 +214,21 @@ def test_a_table_that_says_too_little_is_a_sentence(small_ring, tmp_path, text, 
         bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
 
 
+def test_many_turns_are_those_of_a_stored_beam(small_ring, tmp_path, rng):
+    readings = 1e-4 * rng.standard_normal((20, 3, 2))
+    names = ["end_1", "end_2", "end_3"]
+    lines = [",".join(["turn", *(f"{m} {p} [mm]" for m in names for p in "xy")])]
+    for turn, values in enumerate(1e3 * readings):
+        lines.append(",".join([str(turn), *(repr(float(v)) for v in values.ravel())]))
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    brought = bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
+    assert type(brought.measurement).__name__ == "TurnByTurn"
+    np.testing.assert_allclose(brought.measurement.readings[0], readings, rtol=1e-9)
+    (tmp_path / "b.csv").write_text("\n".join(lines[:6]))
+    brought = bring_in([tmp_path / "b.csv"], Options(ring=small_ring))
+    assert type(brought.measurement).__name__ == "Measurement"
+
+
 def test_a_plane_is_a_word_of_its_own():
     assert place_of("SR:C01-BPM:1:X-I").plane == 0
     assert place_of("bpm_3_ver").plane == 1

@@ -109,3 +109,15 @@ def test_a_fit_that_leaves_more_than_the_noise_says_so(small_ring):
     assert "Trust none" in outcome.advice
     assert "more than the noise of 1 µm" in outcome.advice
     assert "tmlattice diagnose" in outcome.advice
+
+
+def test_one_method_alone_takes_its_own_options(small_ring):
+    """`told` knows which magnets may have changed, which no other method asks for."""
+    outcome = tune_fit(
+        small_ring, "QD::5", -0.03, launch=(1e-4, 0, 1e-4, 0), noise=1e-6, method="told",
+        candidates=["QD::5", "QD::6"], progress=False,
+    )  # fmt: skip
+    assert [m.method for m in outcome.methods] == ["told"]
+    assert set(outcome.best.named) == {"QD::5"}
+    assert outcome.fit.options["candidates"] == ["QD::5", "QD::6"]
+    assert outcome.advice.startswith("Trust told")

@@ -30,10 +30,11 @@ def _trust(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
             return f"Trust map: {why}, most strengths nearly right and a few far off."
         if not best.named:
             return (
-                f"Trust sparse: {why} without any changed magnet, so that no fault is seen; what "
-                "one too small to be seen would do to the tunes is not known."
+                f"Trust {best.method}: {why} without any changed magnet, so that no fault is seen; "
+                "what one too small to be seen would do to the tunes is not known."
             )
-        return f"Trust sparse: {why} with {changes(best)} alone, and states the error of its tunes."
+        who = f"Trust {best.method}: {why} with {changes(best)} alone"
+        return f"{who}, and states the error of its tunes."
     others = [m for m in methods if m.method != "adam" and m.fit is not None]
     if not others:
         return "Nothing here is to be trusted: add --method sparse, which names magnets."

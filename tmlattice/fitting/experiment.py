@@ -127,7 +127,8 @@ def tune_fit(
         seed: of the noise.
         methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map".
         progress: show a bar where there is a terminal.
-        options: of the recipe, passed to `fitting.adam.fit_adam`.
+        options: of the recipe, passed to `fitting.adam.fit_adam`; or method=, of `fine_tune`,
+            alone, and its own.
 
     Raises:
         UnstableRingError: the design or the perturbed ring has no tune.
@@ -140,7 +141,7 @@ def tune_fit(
     start = np.asarray(launch, dtype=float)
     if start.shape != (4,) or not np.isfinite(start).all():
         raise TmlatticeError("a launch has four finite numbers: x, px, y, py in m and rad")
-    work = _Work(_ordered(methods), _enough(turns), start, progress, options)
+    work = _Work(_ordered(methods, options), _enough(turns), start, progress, options)
     name = middle_of_first_arc(ring).name if magnet is None else ring[magnet].name
     with work.watch.stage("compile"):
         for element in {e.kind: e for e in ring.elements}.values():
@@ -191,7 +192,8 @@ def tune_fit_measurement(
         methods: some of `METHODS`.
         source: where the data are from, for the report.
         progress: show a bar where there is a terminal.
-        options: of the recipe, passed to `fitting.adam.fit_adam`.
+        options: of the recipe, passed to `fitting.adam.fit_adam`; or method=, of `fine_tune`,
+            alone, and its own.
 
     Raises:
         MeasurementError: nothing of the first turn was read, every launch is on the axis exactly,
@@ -200,7 +202,7 @@ def tune_fit_measurement(
         UnstableRingError: the design has no tune.
         BeamLostError: a launch is lost on the first turn, or the fit diverged.
     """
-    names, turns = _ordered(methods), _enough(turns)
+    names, turns = _ordered(methods, options), _enough(turns)
     dimension = 6 if measurement.launches[:, 4].any() else 4
     sigma = launch_errors(measurement, dimension)
     if not (measurement.launches.any() or sigma.any()):
@@ -253,8 +255,11 @@ class _Work:
         self.watch, self.begun = _Stopwatch(), time.perf_counter()
 
 
-def _ordered(methods: Sequence[str]) -> tuple[str, ...]:
-    """In the order of `METHODS`, each once."""
+def _ordered(methods: Sequence[str], options: dict[str, Any]) -> tuple[str, ...]:
+    """In the order of `METHODS`, each once; the one of `method=` alone, whose the options then
+    are."""
+    if "method" in options:
+        return (str(options["method"]),)
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise unknown_choice("method", unknown[0], METHODS)
@@ -313,7 +318,8 @@ def _column(
     read, noise = measurement.readings[:, 0], measurement.noise
     assert noise is not None
     begun = time.perf_counter()
-    options = dict(work.options) if name == "adam" else {}
+    alone = "method" in work.options
+    options = {k: v for k, v in work.options.items() if k != "method" and (alone or name == "adam")}
     if sigma.any():
         options["launch_sigma"] = sigma
     tune, signal, growth, problem = None, None, None, None

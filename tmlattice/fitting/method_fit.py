@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 METHODS = ("adam", "sparse", "map")
 """The paper's recipe first; of the others the one that names magnets."""
 
+NAMING = ("sparse", "told")
+"""Those that name a few magnets; the second knows which might have changed."""
+
 BY_CHANCE = 5.0
 """Standard errors by which a misfit may exceed the noise before it is more than noise."""
 
@@ -66,7 +69,7 @@ class MethodFit(Speaks):
     @property
     def named(self) -> dict[str, tuple[float, float]]:
         """The magnets that `sparse` names, with their relative change and its error."""
-        return self.fit.changes if self.fit is not None and self.method == "sparse" else {}
+        return self.fit.changes if self.fit is not None and self.method in NAMING else {}
 
     @property
     def explains(self) -> bool:
@@ -99,7 +102,7 @@ def trusted(methods: Sequence[MethodFit]) -> MethodFit | None:
     """The method whose tunes to take: one that leaves the noise alone and states its error, the
     one of fewest magnets first; None where none does."""
     good = [m for m in methods if m.method != "adam" and m.tunes is not None and m.explains]
-    return min(good, key=lambda m: m.method != "sparse", default=None)
+    return min(good, key=lambda m: m.method not in NAMING, default=None)
 
 
 def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array | None]:

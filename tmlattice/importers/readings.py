@@ -20,8 +20,9 @@ from tmlattice.importers.columns import Column, read_columns
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement
+from tmlattice.measurement import Measurement, TurnByTurn
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
+from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
 Array = NDArray[np.float64]
 
@@ -95,21 +96,26 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
     taken[:, :, sorted(finder.bad)] = False
     read = np.flatnonzero(taken.any(axis=(0, 1, 3)))
     noise = None if told.noise is None else np.full((len(read), 2), told.noise)
-    data = Measurement(
+    hints = ring.name, ring.energy
+    data: Measurement | TurnByTurn = Measurement(
         launches=np.zeros((len(order), 5)),
         readings=readings[:, :, read],
         monitors=tuple(names[i] for i in read),
         noise=noise,
         launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(order), 1)),
-        lattice=ring.name,
-        energy=ring.energy,
+        lattice=hints[0],
+        energy=hints[1],
     )
     of_noise = (
         "no noise is given: a diagnosis estimates it from the readings"
         if told.noise is None
         else f"the noise is {1e6 * told.noise:g} µm, as told"
     )
-    said = [of_unit, "where the beam was launched is not known", of_noise, *finder.said]
+    beam = "where the beam was launched is not known"
+    if isinstance(data, Measurement) and data.readings.shape[1] >= FEWEST:  # as of other files
+        beam = f"{data.readings.shape[1]} turns are those of a stored beam that was kicked before"
+        data = TurnByTurn(data.readings[:, :MOST], data.monitors, noise, (), (), *hints)
+    said = [of_unit, beam, of_noise, *finder.said]
     if bad:
         said.append(f"bad monitors, left out as told: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()

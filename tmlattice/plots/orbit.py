@@ -51,11 +51,11 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
         fitted = [m for m in reversed(outcome.methods) if m.fit is not None]  # the first on top
         for method in fitted:
             plot_orbit(outcome.s, method.after[:, plane], orbit, method.method)
-            orbit.lines[-1].set_color(METHOD_COLOURS[method.method])
+            orbit.lines[-1].set_color(METHOD_COLOURS.get(method.method, "C4"))
         orbit.set_ylabel(f"{name} [mm]")
         rms = []
         models = [("before", outcome.before, "C0")]
-        models += [(m.method, m.after, METHOD_COLOURS[m.method]) for m in fitted]
+        models += [(m.method, m.after, METHOD_COLOURS.get(m.method, "C4")) for m in fitted]
         for what, model, colour in models:
             left = measured - model[:, plane]
             if np.isfinite(left).any():

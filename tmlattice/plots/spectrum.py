@@ -54,7 +54,7 @@ def plot_tune_fit_spectrum(outcome: "TuneFit", axes: "tuple[Axes, Axes]") -> Non
         (outcome.true_tunes, "true", "k", "--"),
     ]
     for method in reversed(outcome.methods):  # the first on top
-        colour = METHOD_COLOURS[method.method]
+        colour = METHOD_COLOURS.get(method.method, "C4")
         tunes.append((method.tunes, method.method, colour, "-"))
         if method.signal is not None and method.fit is not None:
             optics = one_turn_optics(method.fit.network)
