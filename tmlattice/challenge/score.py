@@ -117,7 +117,9 @@ def score(
         try:
             row = row_of(results[name], truths[name], judged.get(name), guessed.get(name), places)
             row |= clean_gap(ring, read_case(folder, name).heldout, truths[name], results[name])
-        except (LookupError, TypeError, ValueError, AttributeError, TmlatticeError) as error:
+        except (
+            ArithmeticError, LookupError, TypeError, ValueError, AttributeError, TmlatticeError
+        ) as error:  # fmt: skip
             log.info("case %s", name, exc_info=True)
             failed[name] = f"its result cannot be scored ({plain(str(error), 100)}); run it again"
             continue
