@@ -380,7 +380,7 @@ def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
         one_sided=True,
     ).measured  # fmt: skip
     row = weigh(fitted(small_ring, measured), ["one_sided_steps"])[1]
-    assert row.amount_sigma < 0.1  # families that evidence keeps take up some of the curvature
+    assert row.amount_sigma < 0.15  # families that evidence keeps take up some of the curvature
     assert abs(row.amount - 1) < 4 * row.amount_sigma  # two-sided ones: 0
 
 
