@@ -29,7 +29,7 @@ from tmlattice.diagnosis.stages import (
 from tmlattice.diagnosis.strategy import CLEAR, DOUBT, FEW, freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
-from tmlattice.errors import EffectError, MeasurementError
+from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -42,6 +42,9 @@ from tmlattice.observe.stored import Kept, Stored
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+MOST_OF_IT = 0.5
+"""Share of the gap that one cause has to make to be put aside before sizes are learnt."""
 
 CROWDED = 1.5
 """What half of the monitors leave at least of their noise where a few causes with names were tried,
@@ -185,7 +188,10 @@ def _sought(
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
         return small_errors_of(problem, start_from, nuisances, causes, learn=learn)
 
-    small = learnt((), start.nuisances)
+    try:
+        small = learnt(_outstanding(few), start.nuisances)
+    except UnstableRingError:  # the readings are none of small errors
+        return (few if few is not None else explain(search, start)), None
     if learn and small.log_evidence < CLEAR:
         assert few is not None
         return (explain(search, start) if few.full else few), None
@@ -196,7 +202,10 @@ def _sought(
         beside = (*found.fit.causes, *_doubted(found))
         if not beside:
             break
-        about = learnt(beside, found.fit.nuisances)
+        try:
+            about = learnt(beside, found.fit.nuisances)
+        except UnstableRingError:  # a cause that is no cause
+            break
         again = explain(replace(narrow, problem=about.problem), about.before)
         if not found.named and not again.named:
             break  # it was a small error after all
@@ -208,6 +217,15 @@ def _sought(
         whole = replace(search, unnamed=False, problem=small.problem)
         found = explain(whole, small.before)
     return found, small
+
+
+def _outstanding(few: Explanation | None) -> tuple[Cause, ...]:
+    """A cause that alone makes most of the gap: it would make all small errors too large."""
+    if few is None or not few.named:
+        return ()
+    clear = [named.detection.statistic for named in few.named]
+    gap = few.before.chi2 - few.problem.freedom
+    return (few.fit.causes[int(np.argmax(clear))],) if max(clear) > MOST_OF_IT * gap else ()
 
 
 def _explained(found: Explanation) -> bool:

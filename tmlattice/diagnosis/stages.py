@@ -52,14 +52,23 @@ def stages_of(
             models[-1] = (models[-1][0], causes)
     else:
         models += [((), causes[: i + 1]) for i in range(len(causes))]
-    return [
-        Stage(
-            static,
-            own,
-            settled(replace(problem, fixed=(*problem.fixed, *static)), own, problem.first),
-        )
-        for static, own in models
-    ]
+    return [_settled(problem, static, own) for static, own in models]
+
+
+HALVES = 4
+"""How often small errors are halved with which no beam is stored."""
+
+
+def _settled(problem: Together, static: tuple[Cause, ...], own: tuple[Cause, ...]) -> Stage:
+    for _ in range(HALVES):
+        there = replace(problem, fixed=(*problem.fixed, *static))
+        point = settled(there, own, problem.first)
+        if not point.lost or not static:
+            break
+        static = tuple(replace(cause, amount=cause.amount / 2) for cause in static)
+    if point.lost:
+        raise MeasurementError(f"{point.lost}, with what was found: too much to be explained")
+    return Stage(static, own, point)
 
 
 def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
@@ -107,8 +116,6 @@ def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = (
 
 def pairs_of(parts: Sequence[Part], problem: Together, stage: Stage) -> list[tuple[Problem, Point]]:
     """Of the measurements themselves, not of their reference."""
-    if stage.point.lost:
-        raise MeasurementError(f"{stage.point.lost}, with what was found: too much to be explained")
     return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
 
 
