@@ -569,17 +569,12 @@ def test_what_at_cannot_build_is_named(tmp_path, element):
         engine_of(tmp_path, element)
 
 
-@pytest.mark.parametrize(
-    ("kind", "wrong"), [("solenoid", "dx"), ("hcorrector", "dy"), ("bend", "middle")]
-)
+@pytest.mark.parametrize(("kind", "wrong"), [("solenoid", "dx"), ("hcorrector", "dy")])
 def test_what_at_cannot_make_wrong_is_not_passed_over(small_ring, kind, wrong):
     builder = Builder(6e9, 10, 0.05, False, 0.0)
     bend = next(e for e in small_ring.elements if e.kind == "bend")
     element = replace(bend, kind=kind, name="it")
     build = Build()
-    if wrong == "middle":
-        build.add_gradient("middle", normal=1e-3)
-    else:
-        setattr(build, wrong, 1e-3)
+    setattr(build, wrong, 1e-3)
     with pytest.raises(LatticeError, match=f"'it' with another {wrong}"):
         builder.pieces(element, build, {})

@@ -121,6 +121,8 @@ def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
     asked = {}
 
     def found(ring, measured, **options):  # the work is another test's
+        (measured,) = measured.values()
+        (options["reference"],) = options["reference"].values()
         asked.update(options, correctors=measured.correctors)
         return change
 

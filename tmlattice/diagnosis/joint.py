@@ -188,16 +188,22 @@ def _sought(
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
         return small_errors_of(problem, start_from, nuisances, causes, learn=learn)
 
-    try:
-        small = learnt(_outstanding(few), start.nuisances)
-    except UnstableRingError:  # the readings are none of small errors
+    # two findings say already whether the sizes have to be learnt again beside them
+    narrow = replace(search, unnamed=False, most=min(2, search.most))
+    tried: list[tuple[float, Explanation, Learnt]] = []
+    for aside in dict.fromkeys(((), _outstanding(few))):
+        try:
+            small = learnt(aside, start.nuisances)
+        except UnstableRingError:  # a fault among them makes them too large
+            continue
+        found = explain(replace(narrow, problem=small.problem), small.before)
+        tried.append((small.problem.log_scale + found.fit.log_evidence, found, small))
+    if not tried:  # the readings are none of small errors
         return (few if few is not None else explain(search, start)), None
+    _, found, small = max(tried, key=lambda one: one[0])
     if learn and small.log_evidence < CLEAR:
         assert few is not None
         return (explain(search, start) if few.full else few), None
-    # two findings say already whether the sizes have to be learnt again beside them
-    narrow = replace(search, unnamed=False, most=min(2, search.most))
-    found = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(problem.judgement.retaken):
         beside = (*found.fit.causes, *_doubted(found))
         if not beside:

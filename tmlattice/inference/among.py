@@ -36,6 +36,10 @@ ROWS = 1600
 HALVES = 4
 """How often a step to the likeliest errors is halved where no beam is stored."""
 
+BEST = 0.9999
+"""Share that is known at most: what is linear about the likeliest errors is no better than a
+hundredth of their size."""
+
 LEAST = 0.02
 """Share of the variance of a direction that has to be known for it to be remembered."""
 
@@ -121,6 +125,12 @@ class Among(Problem):
         inverse, failed = dtrtri(factor, lower=1, overwrite_c=1)
         assert failed == 0
         return np.asarray(np.tril(inverse))
+
+    @property
+    def log_scale(self) -> float:
+        """Of the rows' density beside the exponential of chi-square: -1/2 log det of their
+        covariance, by which explanations among other small errors compare."""
+        return float(np.log(np.diagonal(self._factor)).sum())
 
     def white(self, rows: Array) -> Array:
         """Rows [..., row] of the inner problem in the covariance of all."""
@@ -244,7 +254,7 @@ class Among(Problem):
         big = share > LEAST
         return replace(
             self.known, amounts=self.estimate(explained.clean), seen=directions[:, big].T,
-            share=np.minimum(share[big], 1 - 1e-9),
+            share=np.minimum(share[big], BEST),
         )  # fmt: skip
 
 

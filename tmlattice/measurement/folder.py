@@ -52,7 +52,7 @@ _WORDS = {
 
 def in_words(measured: AnyMeasurement) -> str:
     """What a measurement is, for a sentence."""
-    return _WORDS[type(measured)]
+    return _WORDS.get(type(measured), type(measured).__name__)
 
 
 def read_measurement(
