@@ -19,7 +19,9 @@ def test_at_engine_builds_what_the_ring_itself_has(small_ring, name):
     """The engine once passed over the errors of a loaded ring without a word."""
     effect = CATALOGUE[name]
     amount = 1.0 if effect.one_sign else effect.largest / 20  # as much radiation as is expected
-    cause = Cause(name, effect.places(small_ring)[-1], amount)
+    behind = {e.name for e in small_ring.elements if e.s > small_ring.monitors[-1].s}
+    place = [p for p in effect.places(small_ring) if p not in behind][-1]
+    cause = Cause(name, place, amount)
     settings = None
     if effect.group == "correctors":  # those of calibration and roll need a kick to be seen
         settings = [{cause.element: {"kick": 1e-4}}] * 2

@@ -205,7 +205,8 @@ def headline(diagnosis: Diagnosis) -> str:
         return verdict_sentence(diagnosis)
     several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "equivalent"]
     unnamed = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "located"]
-    text = f"{len(found)} findings."
+    since = "Since the reference: " if since_reference(diagnosis) else ""
+    text = f"{since}{len(found)} findings."
     if several:
         text += f" More than one explanation fits: {', '.join(several)}."
     if unnamed:
