@@ -198,15 +198,6 @@ class Among(Problem):
         """As the inner one."""
         return self.inner.neighbours(hypothesis, among)
 
-    @property
-    def kick_places(self) -> Sequence[str]:
-        """None: see `Together`."""
-        return ()
-
-    def kick_rows(self, point: Point, place: int) -> Array:
-        """None."""
-        raise NotImplementedError
-
     # --- readings -------------------------------------------------------------------------------
     @property
     def monitors(self) -> Sequence[str]:

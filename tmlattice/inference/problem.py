@@ -134,13 +134,14 @@ class Problem(ABC):
 
     # --- what has no name -----------------------------------------------------------------------
     @property
-    @abstractmethod
     def kick_places(self) -> Sequence[str]:
-        """Names of where a free kick may sit; empty where the kind knows none."""
+        """Names of where a free kick may sit; empty where the kind knows none: a stored beam closes
+        on itself, and several measurements have no kick in common."""
+        return ()
 
-    @abstractmethod
     def kick_rows(self, point: Point, place: int) -> Array:
         """d rows / d parameters of a free kick, [parameter, row]."""
+        raise NotImplementedError("this kind of measurement knows no free kick")
 
     @property
     @abstractmethod

@@ -175,16 +175,6 @@ class Together(Problem):
         found = [h for part in self.parts for h in part.neighbours(hypothesis, among)]
         return list(dict.fromkeys(found))
 
-    # --- what has no name -----------------------------------------------------------------------
-    @property
-    def kick_places(self) -> Sequence[str]:
-        """A free kick of a shot is no cause of the ring: measurements have none in common."""
-        return ()
-
-    def kick_rows(self, point: Point, place: int) -> Array:
-        """None."""
-        raise NotImplementedError
-
     @property
     def monitors(self) -> Sequence[str]:
         """Of all parts."""

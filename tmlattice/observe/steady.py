@@ -123,16 +123,6 @@ class Steady(Problem):
         """A stored beam is linear enough in all of them."""
         return []
 
-    # --- what has no name -----------------------------------------------------------------------
-    @property
-    def kick_places(self) -> Sequence[str]:
-        """A stored beam knows no free kick: it closes on itself."""
-        return ()
-
-    def kick_rows(self, point: Point, place: int) -> Array:
-        """None."""
-        raise NotImplementedError
-
     # --- readings -------------------------------------------------------------------------------
     @property
     def valid(self) -> Flags:
