@@ -350,7 +350,7 @@ def _noise(parts: Sequence[Part]) -> tuple[float, float]:
     for part in parts:
         own = part.problem.valid & (part.problem.owner() >= 0)
         if own.any():
-            sigma = 1 / part.problem.as_rows(np.ones(own.shape))
-            rms = float(np.sqrt(np.mean(sigma[np.isfinite(sigma)] ** 2)))
+            rows = part.problem.as_rows(own.astype(float))
+            rms = float(np.sqrt(np.mean(rows[rows > 0] ** -2.0)))
             return rms, rms
     return float("nan"), float("nan")
