@@ -80,8 +80,7 @@ def test_tune_fit_has_a_column_for_each_method_and_says_which_to_trust(outcome):
 
 def test_a_method_alone_does_not_pay_for_the_others(tmp_path):
     code = (
-        "import signal, sys, tmlattice.fitting.adam as adam\n"
-    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's `&` ignores it
+        "import sys, tmlattice.fitting.adam as adam\n"
         "from tmlattice.cli.command import main\n"
         "adam._adam = None\n"  # whoever fits by it fails
         "main()\n"
@@ -283,7 +282,8 @@ def test_command_offers_the_regularizations_there_are():
 
 
 TELLS_WHEN_IT_FITS = (
-    "import sys, tmlattice.fitting.adam as adam\n"
+    "import signal, sys, tmlattice.fitting.adam as adam\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's `&` ignores it
     "from tmlattice.cli.command import main\n"
     "make = adam._adam\n"
     "def told(*arguments):\n"
