@@ -26,7 +26,14 @@ from tmlattice.diagnosis.stages import (
     stages_of,
     views_of,
 )
-from tmlattice.diagnosis.strategy import CLEAR, DOUBT, FEW, freedom
+from tmlattice.diagnosis.strategy import (
+    CLEAR,
+    DOUBT,
+    FEW,
+    explained,
+    freedom,
+    strongest,
+)
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
@@ -41,7 +48,6 @@ from tmlattice.lattice import Ring
 from tmlattice.observe.stored import Kept, Stored
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MOST_OF_IT = 0.5
 """Share of the gap that one cause has to make to be put aside before sizes are learnt."""
@@ -174,10 +180,10 @@ def _sought(
     if not told and known is None:
         narrow = replace(search, most=min(FEW, search.most))
         few = explain(replace(narrow, unnamed=False), start)
-        if search.unnamed and not _explained(few) and not _crowded(few):
+        if search.unnamed and not explained(few) and not _crowded(few):
             few = explain(narrow, start)
-        if told is not None or _explained(few) or len(start.residual) > MOST:
-            if few.full and not _explained(few) and search.most > FEW:
+        if told is not None or explained(few) or len(start.residual) > MOST:
+            if few.full and not explained(few) and search.most > FEW:
                 few = explain(search, start)
             return few, None
     search.progress("small errors")
@@ -229,15 +235,9 @@ def _outstanding(few: Explanation | None) -> tuple[Cause, ...]:
     """A cause that alone makes most of the gap: it would make all small errors too large."""
     if few is None or not few.named:
         return ()
-    clear = [named.detection.statistic for named in few.named]
+    clear = max(named.detection.statistic for named in few.named)
     gap = few.before.chi2 - few.problem.freedom
-    return (few.fit.causes[int(np.argmax(clear))],) if max(clear) > MOST_OF_IT * gap else ()
-
-
-def _explained(found: Explanation) -> bool:
-    """Whether few causes leave nothing but noise."""
-    more, _ = found.problem.judgement.noise
-    return bool(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)) >= more)
+    return (strongest(few),) if clear > MOST_OF_IT * gap else ()
 
 
 def _crowded(found: Explanation) -> bool:

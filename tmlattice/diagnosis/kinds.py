@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.model import Model
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.errors import MeasurementError
@@ -47,7 +48,6 @@ class How:
         holdout: share of shots, or of correctors, that the fit does not see.
         assume: what was written down wrongly everywhere.
         seed: of the split.
-        effects: names of those that may be the cause; None: all usual ones.
     """
 
     ring: Ring
@@ -56,7 +56,6 @@ class How:
     holdout: float = 0.0
     assume: Sequence[str] = ()
     seed: int = 0
-    effects: Sequence[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -106,11 +105,11 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
     measured = mended(ring, measured, how.assume)
     said = consulted(ring, measured, False)
     fitted, held = measured.split(how.holdout, how.seed) if how.holdout else (measured, None)
-    ready = prepare(ring, fitted, None, False, how.effects, how.judgement)
+    ready = prepare(ring, fitted, None, False, None, how.judgement)
     other = None
     if held is not None:
         data = of_measurement(ring, held).with_sigma(np.array(ready.noise))
-        model = ready.problem.model.__class__(ring, data.settings, data.turns, active=data.active)
+        model = Model(ring, data.settings, data.turns, active=data.active)
         other = FirstTurns(model=model, data=data, places=how.places)
     return Part(
         label, kind, ready.problem, other, ready.estimated, ready.dead, (*said, *ready.said)
@@ -143,11 +142,7 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
         shots = list(measured.shots)
         count = round(how.holdout * len(shots))
-        if how.assume:
-            raise MeasurementError(
-                f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
-                "mend the data themselves"
-            )
+        _check_assumed(label, kind, how)
         held = None
         if len(shots) > 2 and count:
             drawn = np.random.default_rng(how.seed).permutation(shots).tolist()
@@ -164,9 +159,18 @@ def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]
     """A kind of which nothing is held out."""
 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
+        _check_assumed(label, kind, how)
         return Part(label, kind, make(how.ring, measured, how.places))
 
     return made
+
+
+def _check_assumed(label: str, kind: str, how: How) -> None:
+    if how.assume:
+        raise MeasurementError(
+            f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: mend the "
+            "data themselves"
+        )
 
 
 KINDS: Mapping[str, tuple[type, Callable[[str, str, Any, How], Part]]] = {

@@ -74,11 +74,11 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
     if not _crowded(ready):
         search.progress("scan")
         few = explain(replace(search, most=min(FEW, search.most)), ready.before)
-        if _explained(few, ready):
+        if explained(few):
             return Found(few)
     search.progress("small errors")
     start = ready.before if few is None else few.fit
-    about = [] if few is None or not few.named else [_strongest(few)]
+    about = [] if few is None or not few.named else [strongest(few)]
     usual = background_rms({"all": None})
     small: SmallErrors | None = None
     with suppress(BeamLostError):  # then they are none that anybody learns
@@ -103,11 +103,10 @@ def _crowded(ready: Prepared) -> bool:
     return len(left) > 20 and float(np.median(left)) > CROWDED
 
 
-def _explained(found: Explanation, ready: Prepared) -> bool:
+def explained(found: Explanation) -> bool:
     """Whether few causes leave nothing but noise."""
-    more, _ = ready.problem.judgement.noise
-    p_value = chi2.sf(found.fit.chi2, freedom(found.problem, found.fit))
-    return bool(p_value >= more)
+    more, _ = found.problem.judgement.noise
+    return bool(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)) >= more)
 
 
 def _among(
@@ -164,7 +163,8 @@ def _settled(
     return settled, replace(about, open=small.open, evidence=small.evidence)
 
 
-def _strongest(explanation: Explanation) -> Cause:
+def strongest(explanation: Explanation) -> Cause:
+    """The named cause that was seen most clearly."""
     clear = [named.detection.statistic for named in explanation.named]
     return explanation.fit.causes[int(np.argmax(clear))]
 
@@ -193,7 +193,7 @@ def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Caus
     if not (explanation.monitors or (found.causes and (explanation.count > 1 or left < 0.01))):
         return None
     # the others may be the background's
-    return found, (_strongest(explanation),) if explanation.named else ()
+    return found, (strongest(explanation),) if explanation.named else ()
 
 
 def freedom(problem: Problem, result: Fit) -> int:

@@ -306,7 +306,7 @@ def small_errors_of(
     """
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     belongs = np.array([names.index(name) for name, _ in known.hypotheses])
-    amounts, factor = known.amounts, np.ones(len(names))
+    amounts = known.amounts
     evidence, errors, opened = 0.0, dict[str, float](), None
     for turn in range(ROUNDS):
         for _ in range(HALVES):
@@ -329,7 +329,6 @@ def small_errors_of(
             evidence = found.log_evidence if turn == 0 else evidence
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
-            factor = factor * found.scale
             known = replace(known, rms=known.rms * found.scale[belongs])
             spread = found.scale[belongs][:, None] * spread
         among = Among(

@@ -64,10 +64,8 @@ class Kept:
                 if at == frequency:
                     return beam
                 near = beam
-        if near is not None:
-            made = StoredBeam(near.model.at_frequency(frequency))
-        else:
-            made = StoredBeam(self._model(ring, settings, causes).at_frequency(frequency))
+        model = self._model(ring, settings, causes) if near is None else near.model
+        made = StoredBeam(model if model.frequency == frequency else model.at_frequency(frequency))
         self._beams.append((key, frequency, causes, made))
         return made
 
