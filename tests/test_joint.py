@@ -1,6 +1,7 @@
 """Several measurements of one machine, and those of a stored beam, in one diagnosis."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,6 +94,15 @@ def test_turns_name_a_magnet_and_an_exchanged_monitor(small_ring):
     diagnosis = diagnose(small_ring, _turns(small_ring, [WEAK, SWAPPED]))
     assert diagnosis.kind == "turn_by_turn"
     assert _found(diagnosis) == {("monitor_swap", "end_1"), (WEAK.effect, WEAK.element)}
+
+
+def test_a_beam_that_is_lost_early_is_told(small_ring):
+    turns = _turns(small_ring, [WEAK])
+    readings = turns.readings.copy()
+    readings[1, 120:] = np.nan
+    diagnosis = diagnose(small_ring, replace(turns, readings=readings))
+    assert any("shot 1" in said and "turn" in said for said in diagnosis.warnings)
+    assert (WEAK.effect, WEAK.element) in _found(diagnosis)
 
 
 @pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])

@@ -31,7 +31,7 @@ from tmlattice.observe.orbit_response import Errors, Predicted, response_data, s
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.tune_readings import tune_readings
-from tmlattice.observe.turn_by_turn import many_turns
+from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
 Array = NDArray[np.float64]
 Measured = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion | TuneReading
@@ -150,7 +150,8 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
         problem = make(how.ring, measured, how.places)
-        return Part(label, kind, problem, held and make(how.ring, held, how.places))
+        said = problem.said if isinstance(problem, ManyTurns) else ()
+        return Part(label, kind, problem, held and make(how.ring, held, how.places), said=said)
 
     return made
 

@@ -38,7 +38,12 @@ class ManyTurns(Stored):
     """Lines [shot, (monitor, plane, mode, re and im), then two tunes]; m, and 1.
 
     Nuisances are the complex amplitude of each shot and mode, re and im, [shot, 2, 2].
+
+    Attributes:
+        said: what could not be used of the turns, a sentence each.
     """
+
+    said: tuple[str, ...] = ()
 
     @property
     def first(self) -> Array:
@@ -128,5 +133,9 @@ def many_turns(
             + (f": {'; '.join(found.said)}" if found.said else "; kick the beam harder")
         )
     return replace(
-        blank, data=np.where(there, data, 0.0), errors=np.where(there, errors, 1.0), used=there
+        blank,
+        data=np.where(there, data, 0.0),
+        errors=np.where(there, errors, 1.0),
+        used=there,
+        said=found.said,
     )
