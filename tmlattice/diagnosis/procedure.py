@@ -265,7 +265,7 @@ def _held_out(
     seen_by = (small.problem, turns_of(explanation))
     fits = (explanation.before, explanation.fit)[: len(told.estimates)]
     for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
-        unknown = small.unknown(one, seen, problem(errors, ()))
+        unknown = small.unknown(one, seen, problem(errors, ()), errors)
         scored.append(judged(problem(errors, one.causes), other.launches, unknown))
     return held_out_gap(scored, since=max(len(scored) - 2, 0))
 

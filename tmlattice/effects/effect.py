@@ -28,6 +28,10 @@ Group = Literal[
 """Effects that a figure draws in one colour."""
 
 
+LEAST_LEFT = 0.01
+"""Share of a strength below which nothing is left of it."""
+
+
 class Effect(ABC):
     """One imperfection that the project knows.
 
@@ -108,6 +112,17 @@ class Effect(ABC):
         the quadrupole's own gradient. Most stand for themselves.
         """
         return self.name, 1.0
+
+    def chain(self, amount: float) -> float:
+        """d readings / d amount of what is there, over a signature, which is of more on top of it.
+
+        Where two amounts multiply, as (1 + a)(1 + b), nothing is left at a = -1 that more of the
+        effect could act on: near to it, `LEAST_LEFT` is taken.
+        """
+        if not self.multiplies:
+            return float(self.power * amount ** (self.power - 1))
+        left = 1 + amount
+        return float(1 / np.copysign(max(abs(left), LEAST_LEFT), left))
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.
