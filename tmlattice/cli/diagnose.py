@@ -61,8 +61,8 @@ log = logging.getLogger(__name__)
     "--max-effects",
     type=click.IntRange(1),
     default=None,
-    help="Findings at most; of an orbit response, steps that are kept at most. 8 where nothing is "
-    "said, 40 of a change between two responses.",
+    help="Findings at most: 8 where nothing is said, 40 of a change between two responses. Of an "
+    "orbit response, steps that are kept at most: all.",
 )
 @click.option(
     "--effects",
