@@ -142,6 +142,16 @@ def test_a_reference_cancels_what_was_there(small_ring):
     assert not same.findings
 
 
+@pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])
+def test_what_was_there_before_is_nothing_now(small_ring, make):
+    """A folder against itself, and the same faulty machine measured twice."""
+    fault = Cause("quadrupole_gradient", "QD::4", -0.05)
+    before, after = (make(small_ring, [fault], seed=seed) for seed in (70, 71))
+    for reference in (after, before) if make is not _turns else (after,):  # seconds each
+        found = diagnose(small_ring, after, reference=reference)
+        assert (found.verdict, found.findings) == ("nothing", ())
+
+
 def test_the_command_takes_many_folders(small_ring, tmp_path):
     from tmlattice.lattice import save_ring
 

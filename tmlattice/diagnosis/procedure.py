@@ -33,7 +33,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -123,7 +123,12 @@ def diagnose(
     small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
+    gap = None
+    if heldout is not None:
+        try:
+            gap = _held_out(ring, heldout, ready, told, small, explanation)
+        except BeamLostError as error:
+            said.append(f"{error}: the held-out shots do not judge the gap")
     repaired = apply(ring, told.causes)
     noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
