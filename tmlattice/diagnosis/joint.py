@@ -35,7 +35,7 @@ from tmlattice.diagnosis.strategy import (
     strongest,
 )
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
+from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled, rare
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
@@ -114,7 +114,8 @@ def diagnose_together(
     )
     problem = replace(
         Together.of(first, then),
-        places=places, judgement=judgement, fixed=() if known is None else known.causes,
+        places=places, rare=rare(ring, chosen), judgement=judgement,
+        fixed=() if known is None else known.causes,
     )  # fmt: skip
     hypotheses = [
         (name, place) for name in chosen for place in find(name).places(ring)

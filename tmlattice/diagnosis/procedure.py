@@ -108,7 +108,7 @@ def diagnose(
     progress("data")
     measurement = mended(ring, measurement, assume)
     reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
-    said = consulted(ring, measurement, radiation)
+    said = consulted(ring, measurement, radiation, reference)
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:

@@ -59,6 +59,9 @@ class Effect(ABC):
         remedy: what takes it away, of the element's name in {}: "turn {} upright".
         to_check: what to look at on the machine, one sentence.
         natural: no fault: known physics that the model leaves out, and nothing is to be repaired.
+        odds: how often it is the fault where it stands for itself (see `stands_for`), beside an
+            ordinary kind of fault: a field that no magnet there makes is rarer than a magnet whose
+            own field is wrong.
     """
 
     name: ClassVar[str]
@@ -86,6 +89,7 @@ class Effect(ABC):
     remedy: ClassVar[str] = "find out what acts at {}"
     to_check: ClassVar[str] = "Look at what stands there, and at what its record says."
     natural: ClassVar[bool] = False
+    odds: ClassVar[float] = 1.0
 
     @property
     def label(self) -> str:

@@ -332,8 +332,9 @@ def small_errors_of(
             known = replace(known, rms=known.rms * found.scale[belongs])
             spread = found.scale[belongs][:, None] * spread
         among = Among(
-            places=problem.places, fixed=(), amounts=problem.amounts, judgement=problem.judgement,
-            inner=inner, known=known, spread=spread.reshape(-1, *inner.valid.shape),
+            places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
+            judgement=problem.judgement, inner=inner, known=known,
+            spread=spread.reshape(-1, *inner.valid.shape),
             shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
         point = settled(among, causes, alone.nuisances)
