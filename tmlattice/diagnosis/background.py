@@ -94,9 +94,14 @@ class SmallErrors:
 
         Returns:
             [shot * reading * 2] twice, m^2.
+
+        Raises:
+            BeamLostError: the beam of the other shots is lost among these small errors.
         """
         assert self.problem.spread is not None
         point = other.at(explained.causes, other.data.launches)
+        if point.lost:
+            raise BeamLostError(f"{point.lost} among the small errors that were found")
         *_, there = background_signatures(other.model, point.view, point.nuisances, self.sizes)
         there = chained(estimate)[:, None] * there.reshape(len(there), -1)
         here = self.problem.spread.reshape(len(there), -1)

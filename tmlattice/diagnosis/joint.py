@@ -285,8 +285,8 @@ def _told(
     findings = findings_of(ring, found, dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
     verdict, findings, said = verdict_of(found, findings, p_value, estimated, judgement)
-    if verdict == "nothing" and small is not None and small.errors:
-        verdict = "distributed"  # the gap has a cause: many small ones
+    if verdict == "nothing" and small is not None and small.errors and all(problem.active):
+        verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes

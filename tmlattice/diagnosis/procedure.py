@@ -7,7 +7,8 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +34,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -123,7 +124,9 @@ def diagnose(
     small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
+    gap = None
+    with _unjudged(said):
+        gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
     repaired = apply(ring, told.causes)
     noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
@@ -237,6 +240,15 @@ def _told(
 def _noise(ready: Prepared, small: SmallErrors | None) -> tuple[float, float]:
     """Of a reading: where nobody states it, neighbours take small errors between them for noise."""
     return ready.noise if small is None else noise_of(small.problem.data)
+
+
+@contextmanager
+def _unjudged(said: list[str]) -> Iterator[None]:
+    """A beam that the held-out shots lose is told: then nobody judges."""
+    try:
+        yield
+    except BeamLostError as error:
+        said.append(f"{error}: the held-out shots do not judge the gap")
 
 
 def _held_out(

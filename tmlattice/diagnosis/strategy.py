@@ -62,7 +62,13 @@ class Found:
     small: SmallErrors | None = None
 
 
-def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float] | None) -> Found:
+def sought(
+    ring: Ring,
+    ready: Prepared,
+    search: Search,
+    told: Mapping[str, float] | None,
+    earlier: Found | None = None,
+) -> Found:
     """What explains the data.
 
     Args:
@@ -70,6 +76,8 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
         ready: the data.
         search: what is searched.
         told: rms of small errors by effect; empty: there are none; None: the data say.
+        earlier: what explains a reference by itself. Where the small errors that all shots ask for
+            lose the beam, for a fault is no small error, they start at the reference's.
     """
     if told is not None:
         if not told:
@@ -88,17 +96,29 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
     start = ready.before if few is None else few.fit
     about = [] if few is None or not few.named else [strongest(few)]
     usual = background_rms({"all": None})
+    starts: list[tuple[Mapping[str, float], list[Cause]]] = [(usual, [])]
+    if earlier is not None and earlier.small is not None:
+        starts.append((earlier.small.sizes, _errors(earlier, earlier.small)))
     small: SmallErrors | None = None
-    with suppress(BeamLostError):  # then they are none that anybody learns
-        small = small_errors(
-            ring, ready.problem, ready.known, usual, start.nuisances, about,
-            learn=True, noisy=ready.estimated,
-        )  # fmt: skip
+    for sizes, errors in starts:
+        with suppress(BeamLostError):  # then they are none that anybody learns
+            small = small_errors(
+                ring, ready.problem, ready.known, sizes, start.nuisances, about, errors,
+                learn=True, noisy=ready.estimated,
+            )  # fmt: skip
+            break
     if small is None or (small.evidence is not None and small.evidence < CLEAR):
-        if few is None or (few.full and search.most > FEW):
+        if few is None:  # errors all along the ring: a few names at most, nothing without one
+            few = explain(replace(search, most=min(FEW, search.most), unnamed=False), ready.before)
+        elif few.full and search.most > FEW:
             few = explain(search, ready.before)
         return Found(few)
     return Found(*_among(ring, ready, search, small))
+
+
+def _errors(found: Found, small: SmallErrors) -> list[Cause]:
+    """The likeliest small errors beside an explanation."""
+    return small.estimate(found.explanation.fit, turns_of(found.explanation).whitening)
 
 
 def _crowded(ready: Prepared) -> bool:
