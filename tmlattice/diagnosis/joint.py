@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
-from tmlattice.diagnosis.kinds import How, Measured, Part, part_of
+from tmlattice.diagnosis.kinds import How, Measured, Part, part_of, stacked
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
     held_out,
@@ -45,7 +45,6 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
-from tmlattice.observe.stored import Kept, Stored
 
 Array = NDArray[np.float64]
 
@@ -104,18 +103,7 @@ def diagnose_together(
     parts = [_named(label, one, how) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
-    kept = Kept()
-    first, then = (
-        [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
-            for part in some
-        ]
-        for some in (parts, before)
-    )
-    problem = replace(
-        Together.of(first, then),
-        places=places, judgement=judgement, fixed=() if known is None else known.causes,
-    )  # fmt: skip
+    problem = replace(stacked(parts, before, how), fixed=() if known is None else known.causes)
     hypotheses = [
         (name, place) for name in chosen for place in find(name).places(ring)
         if any(part.problem.sees((name, place)) for part in parts)
