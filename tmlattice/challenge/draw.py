@@ -64,11 +64,11 @@ class Draw:
             place = places[int(self.random.integers(len(places)))]
             sign = float(self.random.choice([-1.0, 1.0]))
             target = self.target()
-            if effect.discrete:
-                forms = int(effect.largest)
-                return Cause(name, place, float(self.random.integers(1, forms + 1)))
-            if effect.one_sign:
+            if effect.one_sign or effect.discrete:
                 sign = 1.0
+            if effect.discrete or effect.whole:
+                most = int(effect.largest)
+                return Cause(name, place, sign * float(self.random.integers(1, most + 1)))
             if self.amount is not None:
                 return Cause(name, place, sign * self.amount)
             found = self.sized(ruler, [Cause(name, place, sign * effect.largest)], target)

@@ -20,6 +20,7 @@ from tmlattice.effects import Cause, find, modelled
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.rivals import best_start
 from tmlattice.inference.scan import Scan, scan
 
 Array = NDArray[np.float64]
@@ -77,7 +78,10 @@ def weighed(case: Case, truth: Truth) -> Weighed:
         if discrete[h] or not amount[h]:
             continue
         name, place = hypotheses[h]
-        again = fit(problem, [Cause(name, place, float(amount[h]))], start.nuisances)
+        guess = Cause(name, place, float(amount[h]))
+        if find(name).whole:
+            guess = best_start(problem, start, hypotheses[h])
+        again = fit(problem, [guess], start.nuisances)
         if again.good and abs(again.causes[0].amount) <= find(name).largest:
             statistic[h] = start.chi2 - again.chi2
             amount[h] = again.causes[0].amount
@@ -87,7 +91,7 @@ def weighed(case: Case, truth: Truth) -> Weighed:
 def _hypotheses(case: Case, problem: Problem) -> list[Hypothesis]:
     ring = ring_of(case.lattice)
     return [
-        (name, place) for name in modelled(case.options.get("effects"))
+        (name, place) for name in modelled(case.options.get("effects"), turns=True)
         for place in find(name).places(ring) if problem.sees((name, place))
     ]  # fmt: skip
 

@@ -59,7 +59,7 @@ class Asked:
         lattice, ring: what `load_ring` takes, and what it makes of it.
         seed: of the challenge.
         kinds: see `TIER_KINDS`.
-        effects: drawn from these.
+        effects: drawn from these; None: from all usual ones.
         shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
         background: rms of small errors by effect.
@@ -71,7 +71,7 @@ class Asked:
     ring: Ring
     seed: int
     kinds: tuple[str, ...]
-    effects: tuple[str, ...]
+    effects: tuple[str, ...] | None
     shots: int
     signal: tuple[float, float]
     amount: float | None
@@ -129,7 +129,7 @@ def problem_of(
     background: Mapping[str, float],
 ) -> Problem:
     """Measurements as rows, among small errors of known sizes where there are any."""
-    places = {name: float(max(len(find(name).places(ring)), 1)) for name in modelled()}
+    places = {name: float(max(len(find(name).places(ring)), 1)) for name in modelled(turns=True)}
     how = How(ring, places, DEFAULT)
     first, then = (
         [part_of(label, one, how) for label, one in some.items()] for some in (measured, before)
@@ -230,10 +230,8 @@ def _single(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...]:
     def places(effect: Effect) -> Sequence[str | None]:
         return [p for p in effect.places(asked.ring) if ruler.problem.sees((effect.name, p))]
 
-    usual = [
-        name for name in asked.effects
-        if find(name).modelled and not isinstance(find(name), LaunchEffect)
-    ]  # fmt: skip
+    chosen = modelled(asked.effects, "turn_by_turn" in asked.kinds)
+    usual = [name for name in chosen if not isinstance(find(name), LaunchEffect)]
     return (draw.one(ruler, usual, places),)
 
 
@@ -242,7 +240,7 @@ def _pair(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...] | None:
     names = CHANGES[int(random.integers(len(CHANGES)))]
     effect = find(names[int(random.integers(len(names)))])
     places: list[str | None] = list(effect.places(ring))
-    if effect.name not in asked.effects or not places:
+    if effect.name not in (asked.effects or names) or not places:
         return None
     place = places[int(random.integers(len(places)))]
     some = [place]

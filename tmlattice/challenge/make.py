@@ -138,14 +138,7 @@ def make(
         public["told"] = told
     if kinds:
         public["kinds"] = list(kinds)
-    if (folder / "challenge.json").exists():
-        described = read_set(folder)
-        if {CONTENTS: public[CONTENTS], **described} != public or _seed(folder) not in (None, seed):
-            raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
-        with output_file(folder / "challenge.json") as path:
-            write_json(path, public)
+    _begin(folder, public, seed)
     unreachable: Counter[str] = Counter()
     there = set(case_names(folder))
     for number in tqdm(range(cases), unit="case", disable=None if progress else True):
@@ -154,7 +147,17 @@ def make(
             continue
         if kinds:
             asked = Asked(
-                tier, lattice, ring, seed, kinds, tuple(chosen), shots, signal, amount, rms, told
+                tier,
+                lattice,
+                ring,
+                seed,
+                kinds,
+                tuple(chosen) if effects else None,
+                shots,
+                signal,
+                amount,
+                rms,
+                told,
             )
             case, truth, lost = kinds_case(asked, number, name)
         else:
@@ -184,6 +187,18 @@ def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:
     if tier == "M" and len(set(asked)) < 2:
         raise TmlatticeError("tier M is of kinds together; name two of them or more")
     return tuple(dict.fromkeys(asked))
+
+
+def _begin(folder: Path, public: Mapping[str, Any], seed: int) -> None:
+    """The folder of a new challenge, or of the same one."""
+    if (folder / "challenge.json").exists():
+        described = read_set(folder)
+        if {CONTENTS: public[CONTENTS], **described} != public or _seed(folder) not in (None, seed):
+            raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with output_file(folder / "challenge.json") as path:
+        write_json(path, public)
 
 
 def _seed(folder: Path) -> int | None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
-from tmlattice.diagnosis.kinds import How, Measured, Part, part_of, stacked
+from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
     held_out,
@@ -96,7 +96,8 @@ def diagnose_together(
     """
     begun = time.perf_counter()
     judgement = Judgement(false_alarm=false_alarm)
-    chosen = _chosen(ring, effects)
+    turns = any(kind_of(one) == "turn_by_turn" for one in measured.values())
+    chosen = _chosen(ring, effects, turns)
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
     how = How(ring, places, judgement, holdout, assume, seed)
     progress("data")
@@ -141,8 +142,8 @@ def _named(label: str, measured: Measured, how: How) -> Part:
         raise MeasurementError(f"{label}: {error}") from error
 
 
-def _chosen(ring: Ring, effects: Sequence[str] | None) -> list[str]:
-    chosen = [name for name in modelled(effects) if find(name).places(ring)]
+def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
+    chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
     launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
     chosen = [name for name in chosen if name not in launch or find(name).responds]
     if not chosen:
