@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
-from tmlattice.diagnosis.kinds import How, Measured, Part, part_of
+from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
     held_out,
@@ -45,7 +45,6 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
-from tmlattice.observe.stored import Kept, Stored
 
 Array = NDArray[np.float64]
 
@@ -97,24 +96,16 @@ def diagnose_together(
     """
     begun = time.perf_counter()
     judgement = Judgement(false_alarm=false_alarm)
-    chosen = _chosen(ring, effects)
+    turns = any(kind_of(one) == "turn_by_turn" for one in measured.values())
+    chosen = _chosen(ring, effects, turns)
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
     how = How(ring, places, judgement, holdout, assume, seed)
     progress("data")
     parts = [_named(label, one, how) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
-    kept = Kept()
-    first, then = (
-        [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
-            for part in some
-        ]
-        for some in (parts, before)
-    )
     problem = replace(
-        Together.of(first, then),
-        places=places, rare=rare(ring, chosen), judgement=judgement,
+        stacked(parts, before, how), rare=rare(ring, chosen),
         fixed=() if known is None else known.causes,
     )  # fmt: skip
     hypotheses = [
@@ -154,8 +145,8 @@ def _named(label: str, measured: Measured, how: How) -> Part:
         raise MeasurementError(f"{label}: {error}") from error
 
 
-def _chosen(ring: Ring, effects: Sequence[str] | None) -> list[str]:
-    chosen = [name for name in modelled(effects) if find(name).places(ring)]
+def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
+    chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
     launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
     chosen = [name for name in chosen if name not in launch or find(name).responds]
     if not chosen:

@@ -57,6 +57,8 @@ class Effect(ABC):
         calibrates: a file of calibrations may hold it.
         headline: a short report states how little of it would be seen.
         usual: looked for, and drawn by the challenge, where nobody says which effects to take.
+        of_turns: seen in turns of a stored beam alone, and looked for there.
+        whole: its amounts on a machine are whole numbers; a fit finds what is near to one.
         responds: a closed orbit's response to a corrector sees it alone, to first order.
         multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
         quantity: what the amount is of, as a remedy says it ("integrated gradient"); else `words`.
@@ -87,6 +89,8 @@ class Effect(ABC):
     calibrates: ClassVar[bool] = False
     headline: ClassVar[bool] = False
     usual: ClassVar[bool] = True
+    of_turns: ClassVar[bool] = False
+    whole: ClassVar[bool] = False
     responds: ClassVar[bool] = False
     multiplies: ClassVar[bool] = False
     quantity: ClassVar[str] = ""
@@ -320,6 +324,7 @@ class Monitors:
     Attributes:
         gain, offset: [monitor, 2], relative and m.
         roll, coupling: [monitor], rad and 1.
+        late: how many turns after the beam's turn t comes what it calls turn t, [monitor].
         swapped, silent, frozen: [monitor], true or false.
     """
 
@@ -327,6 +332,7 @@ class Monitors:
     offset: Array
     roll: Array
     coupling: Array
+    late: Array
     swapped: NDArray[np.bool_]
     silent: NDArray[np.bool_]
     frozen: NDArray[np.bool_]
@@ -336,7 +342,7 @@ class Monitors:
         """Monitors that read where the beam is."""
         plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
         one = np.zeros(count)
-        return cls(plane, plane.copy(), one, one.copy(), flag, flag.copy(), flag.copy())
+        return cls(plane, plane.copy(), one, one.copy(), one.copy(), flag, flag.copy(), flag.copy())
 
     def copy(self) -> "Monitors":
         """Monitors of their own with the same errors."""
@@ -353,6 +359,34 @@ class Monitors:
     def constant(self) -> Array:
         """What they read without a beam, [monitor, 2], m."""
         return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
+
+    @property
+    def ahead(self) -> int:
+        """Turns of the beam, behind those that are asked for, of which some monitor tells."""
+        return int(max(np.ceil(self.late.max(initial=0.0)), 0))
+
+    def counted(self, beam: Array, turns: int, before: Array | float = np.nan) -> Array:
+        """The beam on the turns that each monitor counts, [shot, turn, monitor, 2].
+
+        Args:
+            beam: on turns from 0 on, `ahead` more than are asked for.
+            turns: of each shot.
+            before: where it was before turn 0, of a shape that fits [shot, turn, monitor, 2].
+
+        Raises:
+            EffectError: a monitor is off by a part of a turn.
+        """
+        if not self.late.any():
+            return beam[:, :turns]
+        if (self.late != np.round(self.late)).any():
+            raise EffectError("monitor_turn_offset is a whole number of turns, as 1 or -2")
+        seen = beam[:, :turns].copy()
+        for monitor in np.flatnonzero(self.late):
+            at = np.arange(turns) + round(self.late[monitor])
+            own = beam[:, np.maximum(at, 0), monitor]
+            outside = np.broadcast_to(before, seen.shape)[:, :, monitor]
+            seen[:, :, monitor] = np.where((at < 0)[None, :, None], outside, own)
+        return seen
 
     def read(self, beam: Array) -> Array:
         """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
@@ -410,6 +444,10 @@ def names(chosen: Iterable[str] | None = None) -> list[str]:
     return [name for name in CATALOGUE if name in wanted]
 
 
-def modelled(chosen: Iterable[str] | None = None) -> list[str]:
-    """Those of `names` whose amount can be fitted."""
-    return [name for name in names(chosen) if CATALOGUE[name].modelled]
+def modelled(chosen: Iterable[str] | None = None, turns: bool = False) -> list[str]:
+    """Those of `names` whose amount can be fitted; with what only turns of a stored beam show where
+    there are such."""
+    if chosen is None and turns:
+        chosen = [name for name, effect in CATALOGUE.items() if effect.usual or effect.of_turns]
+    effects = [CATALOGUE[name] for name in names(chosen)]
+    return [one.name for one in effects if one.modelled and (turns or not one.of_turns)]
