@@ -63,8 +63,27 @@ class ChoiceError(TmlatticeError, ValueError):
     """A word for which there is a list, and that is not on it; the message gives the list."""
 
 
+class MissingPackageError(TmlatticeError, ImportError):
+    """A package that not everything needs, and that is not installed; the message says the extra
+    that brings it."""
+
+
 class EffectError(TmlatticeError):
     """An effect that cannot be as it was asked for."""
+
+
+def missing_package(error: ImportError, what: str, extra: str) -> MissingPackageError:
+    """The error for a package of an extra.
+
+    Args:
+        error: of the import.
+        what: needs it, as the subject of the sentence.
+        extra: brings it.
+    """
+    return MissingPackageError(
+        f"{what} the package '{error.name}', which is not installed: "
+        f"`pip install 'tmlattice[{extra}]'` brings it (README.md, Install)"
+    )
 
 
 def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError:
