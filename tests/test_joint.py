@@ -13,7 +13,9 @@ from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import MeasurementError
+from tmlattice.maps import ring_matrix
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
+from tmlattice.optics import matrix_tunes
 
 KICK = Cause("corrector_kick_x", "v6", 3e-5)
 WEAK = Cause("quadrupole_gradient", "QD::3", -0.01)
@@ -158,6 +160,14 @@ def test_the_command_takes_many_folders(small_ring, tmp_path):
     assert document["kind"] == "together"
     assert [m["name"] for m in document["measurements"]] == ["turns", "tunes"]
     assert set(document["findings"][0]["seen_by"]) == {"turns", "tunes"}
+    numbers = {n["quantity"]: n for n in document["measurements"][1]["numbers"]}
+    assert list(numbers) == ["tune_x", "tune_y"]
+    told_of = told.stdout[told.stdout.index("as found") :]
+    for plane, own in enumerate(numbers.values()):  # by the product of OCELOT's matrices
+        for ring, said in ((small_ring, "before"), (apply(small_ring, [WEAK]), "after")):
+            assert abs(own[said] - matrix_tunes(ring_matrix(ring))[plane]) < 3e-4
+        assert f"{own['read']:.5f} ± 0.00010" in told_of
+    assert "no reading in x" not in tmlattice("diagnose", "ring.json", "tunes", cwd=tmp_path).stdout
     assert (tmp_path / "page" / "report.html").stat().st_size > 1000
     assert (tmp_path / "page" / "readings.png").exists()
 

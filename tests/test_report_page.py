@@ -178,6 +178,8 @@ def test_several_measurements_are_told_and_drawn_one_by_one(opened, together):
     assert "QD::5" in tab.inner_text("#answer")
     assert tab.locator('.figure[data-figure="data-readings"] .main-svg').first.is_visible()
     assert "tune" in tab.inner_text("#gap ~ .scroll")
+    numbers = tab.locator("table", has=tab.get_by_text("as found", exact=True)).first
+    assert [row.split("\t")[0] for row in numbers.inner_text().splitlines()[1:]] == ["Qx", "Qy"]
 
 
 @pytest.mark.parametrize("kind", ["first_turns", "response", "together"])

@@ -295,8 +295,6 @@ def _told(
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     heldout = held_out(parts, problem.fixed, stages, aside, since)
-    if heldout is None:
-        said = (*said, "nothing is held out, so nobody but the fit judges the gap")
     warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]

@@ -40,11 +40,14 @@ def place_text(finding: Finding) -> str:
     return f"s = {finding.s:.2f} m; from {span}{between}"
 
 
+NOT_HELD_OUT = "Nothing was held out: nobody but the fit judges the gap"
+
+
 def closed_text(diagnosis: Diagnosis) -> str:
     """How much of the gap is closed on held-out shots."""
     gap = diagnosis.heldout
     if gap is None:
-        return "No shot was held out: nobody but the fit judges the gap"
+        return NOT_HELD_OUT
     if diagnosis.by_steps and len(diagnosis.steps) < 2:
         return "Nothing was put into the model, so the gap stays"
     if diagnosis.findings and not diagnosis.causes:
@@ -227,8 +230,8 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 def gap_sentence(diagnosis: Diagnosis) -> str:
     """How far the gap falls, on the readings that judge."""
     rows = gap_rows(diagnosis)
-    name, before, after = rows[-1]
-    return f"{name}: from {before} to {after}"
+    judges = rows if diagnosis.heldout is None else rows[-1:]
+    return "; ".join(f"{name}: from {before} to {after}" for name, before, after in judges)
 
 
 def next_text(diagnosis: Diagnosis) -> str:
@@ -366,7 +369,9 @@ def _chi2(value: float) -> str:
 
 
 def noise_text(diagnosis: Diagnosis) -> str:
-    """The noise of a reading."""
+    """The noise of a reading; empty where no monitor reads."""
+    if not np.isfinite(diagnosis.noise).any():
+        return ""
     x, y = (f"{1e6 * sigma:.1f} µm" if np.isfinite(sigma) else "no reading"
             for sigma in diagnosis.noise)  # fmt: skip
     return f"{x} in x, {y} in y" + (" (estimated)" if diagnosis.noise_estimated else "")
