@@ -122,10 +122,9 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return steps_sentence(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.priors:
-        return (
-            "Small errors all along the ring explain the readings; no single fault stands out "
-            "among them."
-        )
+        much = "the readings" if diagnosis.unexplained["p_value"] >= MUCH_MORE else "much, not all"
+        everywhere = f"Small errors all along the ring explain {much}"
+        return f"{everywhere}; no single fault stands out among them."
     if diagnosis.verdict == "distributed":
         return (
             "The data differ from the model all along the ring; no single place, and no few "
@@ -277,12 +276,16 @@ def _setting_text(element: str, name: str, value: float) -> str:
     return f"{element} {name} = {value:g}"
 
 
+MUCH_MORE = 1e-4
+"""Chance that noise leaves as much, below which what is left is no noise."""
+
+
 def left_text(diagnosis: Diagnosis) -> str:
     """What is left when all that was found is in the model."""
     p_value = diagnosis.unexplained["p_value"]
     places = diagnosis.unexplained["places"]
     how = "noise" if p_value >= 0.01 else "slightly more than the noise"
-    how = how if p_value >= 1e-4 else "more than the noise"
+    how = how if p_value >= MUCH_MORE else "more than the noise"
     text = f"What is left is {how} ({_chance(p_value)})"
     if diagnosis.noise_estimated:
         text += "; the noise was taken from the same data, which weakens this check"
