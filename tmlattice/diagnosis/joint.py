@@ -47,6 +47,7 @@ from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.observe.stored import Kept, Stored
+from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 
@@ -323,7 +324,7 @@ def _told(
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
         noise=_noise(parts),
         noise_estimated=estimated,
-        provenance={"package": _version(), "lattice": ring.name, "measurement": None, **made},
+        provenance={"package": __version__, "lattice": ring.name, "measurement": None, **made},
         ring=ring,
         repaired=repaired,
         causes=causes,
@@ -332,12 +333,6 @@ def _told(
         prior_errors={} if small is None else dict(small.errors),
         view=JointView(found, views, learnt),
     )
-
-
-def _version() -> str:
-    from tmlattice import __version__
-
-    return __version__
 
 
 def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:
