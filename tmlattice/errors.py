@@ -96,6 +96,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     known = list(known)
     near = difflib.get_close_matches(name.casefold(), [k.casefold() for k in known], 3, 0.5)
     original = {k.casefold(): k for k in known}
+    near = near or [k for k in original if name and name.casefold() in k][:3]
     shown = [original[k] for k in near] or known[:3]
     offer = " or ".join(f"'{k}'" for k in shown)
     question = f"did you mean {offer}?" if near else f"known are {offer}, ..."

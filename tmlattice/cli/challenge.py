@@ -52,7 +52,9 @@ def _cluster_options(function: Any) -> Any:
 
 
 @challenge.command("make")
-@click.argument("tier", type=click.Choice(["A", "B", "C", "D", "E"], case_sensitive=False))
+@click.argument(
+    "tier", metavar="A|B|C|D|E", type=click.Choice(["A", "B", "C", "D", "E"], case_sensitive=False)
+)
 @click.option("--cases", type=click.IntRange(1), default=300, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
