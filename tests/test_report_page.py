@@ -110,7 +110,7 @@ def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turn
         assert words in answer
     assert tab.locator("nav a").count() == 6
     assert tab.locator(".figure .main-svg").first.is_visible()
-    assert tab.locator(".figure").count() == 4
+    assert tab.locator(".figure").count() == 5
     for figure in ("plan", "scan"):
         place = tab.locator(f'.figure[data-figure="data-{figure}"]')
         place.scroll_into_view_if_needed()
