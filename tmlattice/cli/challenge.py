@@ -55,10 +55,12 @@ def _cluster_options(function: Any) -> Any:
 @click.argument(
     "tier", metavar="A|B|C|D|E", type=click.Choice(["A", "B", "C", "D", "E"], case_sensitive=False)
 )
-@click.option("--cases", type=click.IntRange(1), default=300, show_default=True)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--cases", type=click.IntRange(1), default=300, show_default=True, help="How many.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all that is drawn."
+)
 @click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
-@click.option("--lattice", default="petra3", show_default=True)
+@click.option("--lattice", default="petra3", show_default=True, help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
 @click.option(
     "--shots",
