@@ -116,6 +116,22 @@ def response():
         yield f"response-{name}", figure
 
 
+def together():
+    """Turns, dispersion and tunes of one machine: what was read, and what each leaves."""
+    from tmlattice.machine.stored_beam import simulate_dispersion, simulate_tunes, simulate_turns
+    from tmlattice.plots.parts import plot_parts
+
+    ring, weak = tmlattice.load_ring(SMALL), [Cause("quadrupole_gradient", "QD::5", -0.02)]
+    read = {
+        "turns": simulate_turns(ring, weak).measured,
+        "dispersion": simulate_dispersion(ring, weak).measured,
+        "tunes": simulate_tunes(ring, weak).measured,
+    }
+    yield "read-dispersion", read["dispersion"].plot(ring)
+    yield "read-tunes", read["tunes"].plot(ring)
+    yield "parts", plot_parts(tmlattice.diagnose(ring, read))
+
+
 def real_ring():
     """SOLEIL, 2012: its response less the lattice of the file, and less the ring as found."""
     from tmlattice.importers import bring_in
@@ -222,7 +238,7 @@ def tables():
     yield "petra3-steps", figure
 
 
-MAKERS = (diagnosis, credible, tunes, optics, response, report, real_ring, tables)
+MAKERS = (diagnosis, credible, tunes, optics, response, together, report, real_ring, tables)
 
 
 def main(names):

@@ -48,7 +48,7 @@ nor OCELOT, which take seconds.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from tmlattice.version import __version__
 
 if TYPE_CHECKING:
     from tmlattice import challenge as challenge

@@ -45,6 +45,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
+from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -147,7 +148,7 @@ def diagnose(
         noise=noise,
         noise_estimated=ready.estimated,
         provenance={
-            "package": _version(),
+            "package": __version__,
             "lattice": ring.name,
             "measurement": measurement.lattice,
             "options": options,
@@ -162,12 +163,6 @@ def diagnose(
         prior_errors={} if small is None else small.open,
         view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
     )
-
-
-def _version() -> str:
-    from tmlattice import __version__
-
-    return __version__
 
 
 # --- what is told ----

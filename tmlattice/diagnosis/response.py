@@ -193,7 +193,7 @@ def _view(fit: DenseFit) -> ResponseView:
 
 def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
     """What made a diagnosis."""
-    from tmlattice import __version__
+    from tmlattice.version import __version__
 
     return {
         "package": __version__,
