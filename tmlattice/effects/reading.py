@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.errors import EffectError
+
 Array = NDArray[np.float64]
 
 
