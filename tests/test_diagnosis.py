@@ -258,6 +258,23 @@ def test_what_is_in_the_reference_too_is_no_change(small_ring, cause, shots):
         assert (found.verdict, found.findings) == ("nothing", ())
 
 
+def test_more_shots_than_find_room_are_used_in_part(small_ring, monkeypatch):
+    """Memory is that of the shots that find room, however many there are; with a word."""
+    from tmlattice.diagnosis import prepare
+
+    each = prepare.COPIES * 8 * 36 * (len(small_ring.magnets) + 1)
+    monkeypatch.setattr(prepare, "MEMORY", 6.5 * each)
+    fault = Cause("quadrupole_gradient", "QD::3", -0.05)
+    measured = simulate(small_ring, [fault], shots=60, seed=3, engine="ocelot").measurement()
+    found = diagnose(small_ring, measured)
+    assert len(found.trajectories.data.readings) + len(found.heldout_shots) == 6
+    assert any("6 of 60 shots are used" in said for said in found.warnings)
+    assert [(f.effect, f.element) for f in found.findings] == [(fault.effect, fault.element)]
+    monkeypatch.setattr(prepare, "MEMORY", 0.5 * each)
+    with pytest.raises(MeasurementError, match="give fewer turns"):
+        diagnose(small_ring, measured)
+
+
 def test_small_errors_alone_are_no_change(small_ring):
     machine = {"background": {"all": None}, "machine_seed": 7}
     before, after = (
