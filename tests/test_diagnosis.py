@@ -310,3 +310,17 @@ def test_a_fault_beside_one_that_was_there_before(small_ring):
     assert [(f.effect, f.element) for f in found.findings] == [("quadrupole_gradient", "QD::5")]
     sigma = found.findings[0].amount_sigma
     assert abs(found.findings[0].amount + 0.05) < 4 * sigma
+
+
+def test_the_number_of_threads_changes_no_bit(small_ring):
+    """A background's linear algebra adds in another order on two threads."""
+    from threadpoolctl import threadpool_limits
+
+    measured = simulate(small_ring, [], shots=6, seed=1, background={"all": None}).measurement()
+    found = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, "blas"):
+            document = diagnose(small_ring, measured).as_json()
+        document["provenance"].pop("seconds")
+        found.append(repr(document))
+    assert found[0] == found[1]
