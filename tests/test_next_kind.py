@@ -14,7 +14,8 @@ from tmlattice.diagnosis.kinds import How
 from tmlattice.diagnosis.next_kind import KINDS, minutes_of, next_kind
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.rivals import Rival
-from tmlattice.report.text import next_text, to_do
+from tmlattice.report.next_shot import next_text
+from tmlattice.report.text import to_do
 
 WEAK = Cause("quadrupole_gradient", "QD::3", -0.01)
 
