@@ -19,16 +19,15 @@ from tmlattice.diagnosis.background import SmallErrors
 from tmlattice.diagnosis.common import sought_in
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
-    credible,
     findings_of,
     sensitivity,
     unexplained,
     verdict_of,
     with_consequences,
 )
+from tmlattice.diagnosis.next_kind import leading
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
-from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
@@ -293,16 +292,13 @@ def _left_out(
 def _next(
     ring: Ring, ready: Prepared, explanation: Explanation, seed: int
 ) -> NextMeasurement | None:
-    for named in explanation.named:
-        first, *others = credible(named.rivals, ready.problem.judgement.mass)[0]
-        done = remedy_of(ring, first.cause)
-        other = next((rival for rival in others if remedy_of(ring, rival.cause) != done), None)
-        if other is not None:  # which of two mechanisms with one remedy it is changes nothing
-            data = ready.problem.data
-            try:
-                return next_measurement(ring, data, first, other, ready.known, seed)
-            except TmlatticeError:
-                log.warning("no next measurement could be found", exc_info=True)
+    pair = leading(ring, explanation, ready.problem.judgement.mass)
+    if pair is None:
+        return None
+    try:
+        return next_measurement(ring, ready.problem.data, *pair, ready.known, seed)
+    except TmlatticeError:
+        log.warning("no next measurement could be found", exc_info=True)
     return None
 
 
