@@ -5,7 +5,7 @@ import pytest
 
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
-from tmlattice.effects import CATALOGUE
+from tmlattice.effects import CATALOGUE, background_rms, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.newton import fit
 from tmlattice.observe.data import of_measurement
@@ -264,6 +264,25 @@ def test_small_errors_alone_are_no_change(small_ring):
         simulate(small_ring, [], shots=6, seed=seed, **machine).measurement() for seed in (50, 0)
     )
     assert diagnose(small_ring, after, reference=before).verdict == "nothing"
+
+
+def test_a_fault_among_small_errors_that_lose_the_beam(small_ring):
+    """Five times the usual ones: what all shots ask for loses the beam, the reference's do not."""
+    rng = np.random.default_rng(12)
+    fault = Cause("quadrupole_gradient", "QD::4", -0.05)
+    small = [
+        Cause(name, place, float(5 * rms * rng.standard_normal()))
+        for name, rms in background_rms({"all": None}).items()
+        for place in find(name).places(small_ring)
+        if (name, place) != (fault.effect, fault.element)
+    ]
+    before, after = (
+        simulate(small_ring, causes, shots=3, seed=seed, engine="ocelot").measurement()
+        for causes, seed in ((small, 12), ([*small, fault], 112))
+    )
+    (found,) = diagnose(small_ring, after, reference=before).findings
+    assert (found.effect, found.element) == (fault.effect, fault.element)
+    assert abs(found.amount - fault.amount) < 3 * found.amount_sigma
 
 
 def test_a_fault_beside_one_that_was_there_before(small_ring):

@@ -169,6 +169,16 @@ def test_a_reference_cancels_what_was_there(small_ring):
     assert not same.findings
 
 
+@pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])
+def test_what_was_there_before_is_nothing_now(small_ring, make):
+    """A folder against itself, and the same faulty machine measured twice."""
+    fault = Cause("quadrupole_gradient", "QD::4", -0.05)
+    before, after = (make(small_ring, [fault], seed=seed) for seed in (70, 71))
+    for reference in (after, before) if make is not _turns else (after,):  # seconds each
+        found = diagnose(small_ring, after, reference=reference)
+        assert (found.verdict, found.findings) == ("nothing", ())
+
+
 def test_the_command_takes_many_folders(small_ring, tmp_path):
     from tmlattice.lattice import save_ring
 
@@ -243,6 +253,18 @@ def test_tuesday_is_sharper_for_monday(small_ring, monday):
     assert diagnose(diagnosis.as_found, sound, known=known_of(diagnosis)).verdict == "nothing"
 
 
+def test_what_was_known_of_another_ring_goes_with_it(small_ring, tmp_path):
+    from tmlattice.lattice import save_ring
+
+    save_ring(small_ring, tmp_path / "ring.json")
+    write_measurement(tmp_path / "sound", _tunes(small_ring, []))
+    for name in ("twin.json.known.json", "twin.json.calibration.json"):
+        (tmp_path / name).write_text("of the ring before")
+    words = ["diagnose", "ring.json", "sound", "--lattice-out", "twin.json", "-q"]
+    tmlattice(*words, cwd=tmp_path, check=0)
+    assert [path.name for path in tmp_path.glob("twin.json*")] == ["twin.json"]
+
+
 def test_what_is_known_is_written_beside_the_lattice(small_ring, monday, tmp_path):
     small, _ = monday
     from tmlattice.lattice import save_ring
@@ -256,6 +278,13 @@ def test_what_is_known_is_written_beside_the_lattice(small_ring, monday, tmp_pat
     assert (tmp_path / "twin.json.known.json").is_file()
     told = tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=0)
     assert told.stdout.startswith("NOTHING")
+    tmlattice("diagnose", "twin.json", "tuesday", "--json", "twin.json.known.json",
+              cwd=tmp_path, check=2)  # fmt: skip
+    lattice = (tmp_path / "twin.json").read_text()
+    (tmp_path / "twin.json").write_text(lattice.replace("0.9", "0.91", 1))
+    told = tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=2)
+    assert "is not the file any more that it was written with" in told.stderr
+    (tmp_path / "twin.json").write_text(lattice)
     file = tmp_path / "twin.json.known.json"
     document = json.loads(file.read_text())
     document["small_errors"][0]["element"] = "nowhere"

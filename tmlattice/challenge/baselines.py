@@ -67,15 +67,20 @@ def baselines(case: Case) -> dict[str, Guesses]:
         solved = np.linalg.pinv(rows[gradients].T, rcond=1e-2) @ residual
         order = np.argsort(-np.abs(solved))[:SUSPECTS]
         out["svd_gradients"] = guess([gradients[i] for i in order])
-    for name, values in _pursuits(rows, residual).items():
+    for name, values in pursuits(rows, residual).items():
         order = np.argsort(-np.abs(values))[:SUSPECTS]
         out[name] = guess([int(i) for i in order if values[i] != 0])
     out["weight_change"] = _weight_change(case, data, paths, launches)
     return out
 
 
-def _pursuits(rows: Array, residual: Array) -> dict[str, Array]:
-    """Weights of the signatures, each of unit length, by matching pursuit and by the LASSO."""
+def pursuits(rows: Array, residual: Array) -> dict[str, Array]:
+    """Weights of signatures, each of unit length, by matching pursuit and by the LASSO.
+
+    Args:
+        rows: signatures, nuisances projected out, [hypothesis, row].
+        residual: [row].
+    """
     try:
         from sklearn.linear_model import Lasso, orthogonal_mp
     except ModuleNotFoundError as error:

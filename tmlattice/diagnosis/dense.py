@@ -238,6 +238,10 @@ def fit_steps(
         if doubted:
             again, without = _worth(state, doubted, progress)
             worth |= again
+    if _lost(_inner(design), _inner(state)) < -VETO:  # all together spoil what they should mend
+        refused += [replace(step, kept=False) for step in steps.values()]
+        return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
+                        (before, before))  # fmt: skip
     progress("result")
     state = settle(bend(jump(replace(state, exploring=False))))
     after = score(state, split.held)

@@ -15,6 +15,7 @@ from tmlattice.diagnosis.magnets import families, magnets, straights
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.slices import stem
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
 
 Array = NDArray[np.float64]
@@ -146,12 +147,31 @@ class OtherGradient(_Thin):
         return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
 
 
+class SextupoleGradient(OtherGradient):
+    """Of the orbit in sextupoles: an offset of it beside each, times the sextupole's strength."""
+
+    name = "sextupole_gradient"
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return [own for own in magnets(ring, ("sextupole",)) if any(e.k2 for e in own)]
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """The orbit's offsets, m: strong sextupoles make more of them."""
+        strength = [sum(abs(e.k2) * e.length for e in own) for own in self._places(data.ring)]
+        return [Group(self.name, np.diag(strength), 2e-4, TAILS)]
+
+
 class VerticalFocusing(_Thin):
     """Of insertion devices, in wigglers and in straights."""
 
     name = effect = "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
     block, variable, trust = 0, "device", 3e-3
+
+    @property
+    def title(self) -> str:
+        """Dipoles have it too."""
+        return f"{self.effect} in straights"
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         devices = [*magnets(ring, ("wiggler",)), *((e,) for e in straights(ring))]
@@ -163,7 +183,7 @@ class VerticalFocusing(_Thin):
 
 
 class EdgeFocusing(_Thin):
-    """Vertical focusing of dipoles: their edges and fringe fields, alike in dipoles of one type."""
+    """Vertical focusing of dipoles, by their edges and fringe fields: one number a type."""
 
     name, effect = "edge_focusing", "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
@@ -172,10 +192,14 @@ class EdgeFocusing(_Thin):
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("bend",))
 
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Of all dipoles of a type: what makes one of them alone is no edge, but something beside
+        it that would be made up with."""
+        types: dict[str, dict[str, float]] = {}
+        for pieces in super().shares(data):
+            types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
+        return list(types.values())
+
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each, and of families."""
-        places = self.places(data)
-        return [
-            Group(self.name, np.eye(len(places)), 1e-4, TAILS),
-            Group(f"{self.name} of families", families(places)[1], 1e-3),
-        ]
+        """Of each type."""
+        return [Group(self.name, np.eye(self.size(data)), 1e-3)]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
-from tmlattice.diagnosis.kinds import How, Measured, Part, part_of
+from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.left_out import spikes, with_silent
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
@@ -36,7 +36,7 @@ from tmlattice.diagnosis.strategy import (
     strongest,
 )
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
+from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled, rare
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
@@ -46,7 +46,6 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
-from tmlattice.observe.stored import Kept, Stored
 from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
@@ -99,24 +98,17 @@ def diagnose_together(
     """
     begun = time.perf_counter()
     judgement = Judgement(false_alarm=false_alarm)
-    chosen = _chosen(ring, effects)
+    turns = any(kind_of(one) == "turn_by_turn" for one in measured.values())
+    chosen = _chosen(ring, effects, turns)
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
     how = How(ring, places, judgement, holdout, assume, seed)
     progress("data")
     parts = [with_silent(ring, _named(label, one, how), one) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
-    kept = Kept()
-    first, then = (
-        [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
-            for part in some
-        ]
-        for some in (parts, before)
-    )
     problem = replace(
-        Together.of(first, then),
-        places=places, judgement=judgement, fixed=() if known is None else known.causes,
+        stacked(parts, before, how), rare=rare(ring, chosen),
+        fixed=() if known is None else known.causes,
     )  # fmt: skip
     hypotheses = [
         (name, place) for name in chosen for place in find(name).places(ring)
@@ -155,8 +147,8 @@ def _named(label: str, measured: Measured, how: How) -> Part:
         raise MeasurementError(f"{label}: {error}") from error
 
 
-def _chosen(ring: Ring, effects: Sequence[str] | None) -> list[str]:
-    chosen = [name for name in modelled(effects) if find(name).places(ring)]
+def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
+    chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
     launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
     chosen = [name for name in chosen if name not in launch or find(name).responds]
     if not chosen:
@@ -286,8 +278,8 @@ def _told(
     findings = findings_of(ring, found, dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
     verdict, findings, said = verdict_of(found, findings, p_value, estimated, judgement)
-    if verdict == "nothing" and small is not None and small.errors:
-        verdict = "distributed"  # the gap has a cause: many small ones
+    if verdict == "nothing" and small is not None and small.errors and all(problem.active):
+        verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.choice import chosen_effects
-from tmlattice.effects import Cause, expected_radiation, find
+from tmlattice.effects import Cause, expected_radiation, find, rare
 from tmlattice.errors import BeamLostError, MeasurementError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
@@ -90,7 +90,9 @@ def prepare(
     listed = {name.casefold() for name in measurement.monitors}
     dead, data, said = _dead_monitors(model, data, listed, judgement)
     rough = data.with_sigma(np.array([ROUGH, ROUGH]))
-    problem = FirstTurns(model=model, data=rough, places=places, judgement=judgement)
+    problem = FirstTurns(
+        model=model, data=rough, places=places, rare=rare(ring, chosen), judgement=judgement
+    )
     start = _on_its_way(fit(problem, (), data.launches), ring)
     data, noise, estimated = _with_noise(data, start)
     data, noise, floor = _above_the_floor(data, noise)

@@ -7,7 +7,8 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +34,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -108,7 +109,7 @@ def diagnose(
     progress("data")
     measurement = mended(ring, measurement, assume)
     reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
-    said = consulted(ring, measurement, radiation)
+    said = consulted(ring, measurement, radiation, reference)
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
@@ -124,7 +125,9 @@ def diagnose(
     small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
+    gap = None
+    with _unjudged(said):
+        gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
     repaired = apply(ring, told.causes)
     noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
@@ -234,6 +237,15 @@ def _noise(ready: Prepared, small: SmallErrors | None) -> tuple[float, float]:
     return ready.noise if small is None else noise_of(small.problem.data)
 
 
+@contextmanager
+def _unjudged(said: list[str]) -> Iterator[None]:
+    """A beam that the held-out shots lose is told: then nobody judges."""
+    try:
+        yield
+    except BeamLostError as error:
+        said.append(f"{error}: the held-out shots do not judge the gap")
+
+
 def _held_out(
     ring: Ring,
     heldout: Measurement,
@@ -260,7 +272,7 @@ def _held_out(
     seen_by = (small.problem, turns_of(explanation))
     fits = (explanation.before, explanation.fit)[: len(told.estimates)]
     for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
-        unknown = small.unknown(one, seen, problem(errors, ()))
+        unknown = small.unknown(one, seen, problem(errors, ()), errors)
         scored.append(judged(problem(errors, one.causes), other.launches, unknown))
     return held_out_gap(scored, since=max(len(scored) - 2, 0))
 

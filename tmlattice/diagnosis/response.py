@@ -57,7 +57,7 @@ def diagnose_response(
     *,
     holdout: float = 0.2,
     effects: Sequence[str] | None = None,
-    max_effects: int = 8,
+    max_effects: int = len(STEPS),
     false_alarm: float = DEFAULT.false_alarm,
     missing: bool = False,
     assume: Sequence[str] = (),

@@ -43,7 +43,7 @@ from tmlattice.effects.effect import (
     register,
 )
 from tmlattice.effects.radiation import expected_loss, expected_radiation
-from tmlattice.effects.sizes import background_rms
+from tmlattice.effects.sizes import background_rms, rare
 
 __all__ = [
     "CATALOGUE",
@@ -67,6 +67,7 @@ __all__ = [
     "modelled",
     "monitors_with",
     "names",
+    "rare",
     "register",
     "set_elements",
 ]

@@ -28,6 +28,10 @@ Group = Literal[
 """Effects that a figure draws in one colour."""
 
 
+LEAST_LEFT = 0.01
+"""Share of a strength below which nothing is left of it."""
+
+
 class Effect(ABC):
     """One imperfection that the project knows.
 
@@ -53,12 +57,17 @@ class Effect(ABC):
         calibrates: a file of calibrations may hold it.
         headline: a short report states how little of it would be seen.
         usual: looked for, and drawn by the challenge, where nobody says which effects to take.
+        of_turns: seen in turns of a stored beam alone, and looked for there.
+        whole: its amounts on a machine are whole numbers; a fit finds what is near to one.
         responds: a closed orbit's response to a corrector sees it alone, to first order.
         multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
         quantity: what the amount is of, as a remedy says it ("integrated gradient"); else `words`.
         remedy: what takes it away, of the element's name in {}: "turn {} upright".
         to_check: what to look at on the machine, one sentence.
         natural: no fault: known physics that the model leaves out, and nothing is to be repaired.
+        odds: how often it is the fault where it stands for itself (see `stands_for`), beside an
+            ordinary kind of fault: a field that no magnet there makes is rarer than a magnet whose
+            own field is wrong.
     """
 
     name: ClassVar[str]
@@ -80,12 +89,15 @@ class Effect(ABC):
     calibrates: ClassVar[bool] = False
     headline: ClassVar[bool] = False
     usual: ClassVar[bool] = True
+    of_turns: ClassVar[bool] = False
+    whole: ClassVar[bool] = False
     responds: ClassVar[bool] = False
     multiplies: ClassVar[bool] = False
     quantity: ClassVar[str] = ""
     remedy: ClassVar[str] = "find out what acts at {}"
     to_check: ClassVar[str] = "Look at what stands there, and at what its record says."
     natural: ClassVar[bool] = False
+    odds: ClassVar[float] = 1.0
 
     @property
     def label(self) -> str:
@@ -104,6 +116,17 @@ class Effect(ABC):
         the quadrupole's own gradient. Most stand for themselves.
         """
         return self.name, 1.0
+
+    def chain(self, amount: float) -> float:
+        """d readings / d amount of what is there, over a signature, which is of more on top of it.
+
+        Where two amounts multiply, as (1 + a)(1 + b), nothing is left at a = -1 that more of the
+        effect could act on: near to it, `LEAST_LEFT` is taken.
+        """
+        if not self.multiplies:
+            return float(self.power * amount ** (self.power - 1))
+        left = 1 + amount
+        return float(1 / np.copysign(max(abs(left), LEAST_LEFT), left))
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.
@@ -301,6 +324,7 @@ class Monitors:
     Attributes:
         gain, offset: [monitor, 2], relative and m.
         roll, coupling: [monitor], rad and 1.
+        late: how many turns after the beam's turn t comes what it calls turn t, [monitor].
         swapped, silent, frozen: [monitor], true or false.
     """
 
@@ -308,6 +332,7 @@ class Monitors:
     offset: Array
     roll: Array
     coupling: Array
+    late: Array
     swapped: NDArray[np.bool_]
     silent: NDArray[np.bool_]
     frozen: NDArray[np.bool_]
@@ -317,7 +342,7 @@ class Monitors:
         """Monitors that read where the beam is."""
         plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
         one = np.zeros(count)
-        return cls(plane, plane.copy(), one, one.copy(), flag, flag.copy(), flag.copy())
+        return cls(plane, plane.copy(), one, one.copy(), one.copy(), flag, flag.copy(), flag.copy())
 
     def copy(self) -> "Monitors":
         """Monitors of their own with the same errors."""
@@ -334,6 +359,34 @@ class Monitors:
     def constant(self) -> Array:
         """What they read without a beam, [monitor, 2], m."""
         return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
+
+    @property
+    def ahead(self) -> int:
+        """Turns of the beam, behind those that are asked for, of which some monitor tells."""
+        return int(max(np.ceil(self.late.max(initial=0.0)), 0))
+
+    def counted(self, beam: Array, turns: int, before: Array | float = np.nan) -> Array:
+        """The beam on the turns that each monitor counts, [shot, turn, monitor, 2].
+
+        Args:
+            beam: on turns from 0 on, `ahead` more than are asked for.
+            turns: of each shot.
+            before: where it was before turn 0, of a shape that fits [shot, turn, monitor, 2].
+
+        Raises:
+            EffectError: a monitor is off by a part of a turn.
+        """
+        if not self.late.any():
+            return beam[:, :turns]
+        if (self.late != np.round(self.late)).any():
+            raise EffectError("monitor_turn_offset is a whole number of turns, as 1 or -2")
+        seen = beam[:, :turns].copy()
+        for monitor in np.flatnonzero(self.late):
+            at = np.arange(turns) + round(self.late[monitor])
+            own = beam[:, np.maximum(at, 0), monitor]
+            outside = np.broadcast_to(before, seen.shape)[:, :, monitor]
+            seen[:, :, monitor] = np.where((at < 0)[None, :, None], outside, own)
+        return seen
 
     def read(self, beam: Array) -> Array:
         """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
@@ -391,6 +444,10 @@ def names(chosen: Iterable[str] | None = None) -> list[str]:
     return [name for name in CATALOGUE if name in wanted]
 
 
-def modelled(chosen: Iterable[str] | None = None) -> list[str]:
-    """Those of `names` whose amount can be fitted."""
-    return [name for name in names(chosen) if CATALOGUE[name].modelled]
+def modelled(chosen: Iterable[str] | None = None, turns: bool = False) -> list[str]:
+    """Those of `names` whose amount can be fitted; with what only turns of a stored beam show where
+    there are such."""
+    if chosen is None and turns:
+        chosen = [name for name, effect in CATALOGUE.items() if effect.usual or effect.of_turns]
+    effects = [CATALOGUE[name] for name in names(chosen)]
+    return [one.name for one in effects if one.modelled and (turns or not one.of_turns)]

@@ -179,6 +179,32 @@ class MonitorSwap(ReadingEffect):
 
 
 @register
+class MonitorTurnOffset(ReadingEffect):
+    """A monitor that counts its turns from another one than the others do."""
+
+    name = "monitor_turn_offset"
+    words = "monitor that counts its turns off"
+    quantity = "count of turns"
+    remedy = "set the turn count of {}"
+    to_check = "Look at its trigger and at the delay of its turn clock."
+    unit = "turns"
+    sign = "what it calls turn t is the beam's turn t + amount"
+    largest = 3.0
+    curved = True
+    usual = False
+    of_turns = True
+    whole = True
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """Nothing on a turn by itself."""
+        return np.zeros_like(beam)
+
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
+        """Count later."""
+        monitors.late[at] += amount
+
+
+@register
 class MonitorDead(ReadingEffect):
     """A monitor without a signal, or one whose reading is frozen."""
 
