@@ -52,7 +52,11 @@ def _cluster_options(function: Any) -> Any:
 
 
 @challenge.command("make")
-@click.argument("tier", metavar="TIER", type=click.Choice(list("ABCDERTPM"), case_sensitive=False))
+@click.argument(
+    "tier",
+    metavar="A|B|C|D|E|R|T|P|M",
+    type=click.Choice(list("ABCDERTPM"), case_sensitive=False),
+)
 @click.option("--cases", type=click.IntRange(1), default=300, show_default=True, help="How many.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all that is drawn."
