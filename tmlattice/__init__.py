@@ -19,7 +19,7 @@ A machine whose fault is known, what its monitors read, and what that says:
 >>> diagnosis = tmlattice.diagnose(ring, measurement)
 >>> print(diagnosis.report())                              # diagnosis.plot(), .save("folder")
 
-Your own: a folder, or a control room's file (`tmlattice import --example` writes templates):
+Your own: a folder, or a control room's file (`tmlattice import --example --out x` has templates):
 
 >>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")
 

@@ -70,7 +70,7 @@ def main(prefix):
         ]
         build(recipe(place, "python", version, copied), channel, test="skip")
         filled = [f"mkdir -p $PREFIX/{packages}", f"cp -r {place}/site/. $PREFIX/{packages}/"]
-        wheels = recipe(place, "wheels", "1.0", filled, [f"python {version}"])
+        wheels = recipe(place, "wheels", "1.0", filled, [f"python =={version}"])
         build(wheels, channel, test="skip")
         for name in (w.partition(">")[0] for w in wanted):
             there = known[ON_PYPI.get(name, name).lower().replace("_", "-")]
