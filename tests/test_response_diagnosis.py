@@ -220,27 +220,6 @@ def test_an_insertion_device_is_found_where_it_stands(small_ring):
     assert found.steps[-1].heldout_chi2_per_dof < 2
 
 
-def test_the_orbit_in_sextupoles_is_not_made_up_with_quadrupoles(small_ring, rng):
-    """LNLS: without it 0.73 µm stay, with it 0.61."""
-    off = [
-        Cause("sextupole_offset_x", e.name, 1e-3 * rng.standard_normal())
-        for e in small_ring.elements
-        if e.kind == "sextupole"
-    ]
-    measured = simulate_response(
-        small_ring, [*CAUSES, *off], kick=1e-5, noise=2e-8, engine="ocelot", progress=False
-    ).measured
-    known = ["quadrupole_gradient", "corrector_calibration"]
-    without = diagnose(small_ring, measured, effects=known).steps[-1]
-    found = diagnose(small_ring, measured, effects=[*known, "gradient_absolute"])
-    # the quadrupole beside it takes it up, but for the dispersion
-    assert found.steps[-1].dispersion_rms < 0.6 * without.dispersion_rms
-    there = {c.element: c.amount for c in found.causes if c.effect == "gradient_absolute"}
-    made = [-small_ring[c.element].k2 * small_ring[c.element].length * c.amount for c in off]
-    told = [there[small_ring[c.element].name] for c in off]
-    assert np.corrcoef(made, told)[0, 1] > 0.8
-
-
 def test_what_the_fit_may_not_mend_is_warned_about(small_ring):
     """The held-out correctors are noise; the fitted ones are not."""
     measured = wrong_corrector(small_ring, "corrector_calibration", -2.0)
