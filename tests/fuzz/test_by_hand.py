@@ -65,8 +65,6 @@ def scaled(factor):
 DOCUMENTS = {
     "a key in other letters": (lambda d: d.update(NOISE=d.pop("noise")), "NOISE"),
     "an energy in eV": (lambda d: d.update(energy_gev=3e9), "eV"),
-    "the noise of a monitor that is not there": (
-        lambda d: d.update(noise={"m::77": {"x": 1e-5, "y": 1e-5}}), "m::77"),
     "a launch outside every pipe": (lambda d: d["shots"][0]["launch"].update(x=0.1), "lost"),
     "a kick of a radian": (
         lambda d: d["shots"][0].update(settings={"ch::0": {"kick": 1.0}}), "settings"),
