@@ -2,15 +2,22 @@
 
 import json
 import sys
+import time
 
 import pytest
 
+from tmlattice import batch
 from tmlattice.batch import fingerprint, finished, run_batch
 from tmlattice.errors import TmlatticeError
 
 
 def cases(**values):
     return {name: (lambda value=value: value) for name, value in values.items()}
+
+
+def late(value):
+    time.sleep(0.5)
+    return value
 
 
 def test_a_failed_case_does_not_stop_the_rest_and_is_done_again(tmp_path):
@@ -50,6 +57,28 @@ def test_two_processes_and_a_scheduler_by_its_address(tmp_path):
 def test_no_scheduler_is_one_sentence(tmp_path):
     with pytest.raises(TmlatticeError, match="no Dask scheduler answers"):
         run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)
+
+
+def test_workers_that_never_came_or_are_all_gone_are_one_sentence(tmp_path, monkeypatch):
+    """It waited for ever. What was done before is kept."""
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(batch, "PATIENCE", 1.0)
+    inside = {"processes": False, "dashboard_address": None}
+    with LocalCluster(n_workers=0, **inside) as cluster:
+        where = {"scheduler": cluster.scheduler_address, "progress": False}
+        with pytest.raises(TmlatticeError, match="has no worker; start one"):
+            run_batch(dict, cases(a={"n": 1}), tmp_path, **where)
+    with LocalCluster(1, threads_per_worker=1, **inside) as cluster:
+        where = {"scheduler": cluster.scheduler_address, "progress": False}
+
+        def gone():
+            cluster.scale(0)
+            return {"n": 2}
+
+        some = {**cases(a={"n": 1}, b={"n": 1}), "c": gone, **cases(d={"n": 1}, e={"n": 1})}
+        with pytest.raises(TmlatticeError, match="all workers are gone"):
+            run_batch(late, some, tmp_path, **where)
 
 
 def test_results_of_other_data_or_of_nobody_are_done_again(tmp_path):

@@ -65,6 +65,27 @@ def test_a_folder_never_holds_files_of_two_runs(tmp_path):
     assert not litter(tmp_path)
 
 
+def test_two_writers_leave_the_folder_of_one_of_them(tmp_path):
+    folder = tmp_path / "out"
+    wrong = []
+
+    def write(text):
+        for number in range(40):
+            try:
+                write_pair(folder, f"{text} {number}")
+            except OutputError as error:  # the other one exchanged it at this moment
+                wrong.append(str(error))
+
+    both = [threading.Thread(target=write, args=(text,)) for text in ("one", "other")]
+    for writer in both:
+        writer.start()
+    for writer in both:
+        writer.join()
+    assert not wrong
+    assert len({(folder / name).read_text() for name in "ab"}) == 1
+    assert not litter(tmp_path)
+
+
 def test_what_fails_leaves_the_folder_as_it_was(tmp_path):
     folder = tmp_path / "deep" / "out"
     with pytest.raises(ZeroDivisionError), output_folder(folder):

@@ -221,7 +221,13 @@ def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
                 "leave the address out"
             ) from error
         with client:
-            client.wait_for_workers(1, timeout=60)
+            try:
+                client.wait_for_workers(1, timeout=PATIENCE)
+            except TimeoutError as error:
+                raise TmlatticeError(
+                    f"the Dask scheduler at '{scheduler}' has no worker; start one with `dask "
+                    f"worker {scheduler}`"
+                ) from error
             yield client, sum(client.nthreads().values())
         return
     # one thread a process: compiled kernels must not be entered twice, and cores are shared out

@@ -224,6 +224,7 @@ def small_errors(
         estimate = small.estimate(explained, problem.whitening)
     if fixed:
         small = replace(small, before=fit(problem, (), launches))
+        _on_its_way(small.before)
     return small
 
 

@@ -200,7 +200,10 @@ def _run(search: Search, before: Fit) -> Explanation:
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
         search.progress(best.name)
-        state = _taken(search, state, best, look)
+        there, state = state, _taken(search, state, best, look)
+        if state.fit.point.lost:  # the model has no answer there
+            state = there
+            break
         spiked = best.kind == "reading" and state.count > 1
         if state.count > 1 and not spiked:
             state = _revised(search, state)
@@ -377,6 +380,8 @@ def _monitor_revised(search: Search, state: State, monitor: int) -> State:
     others = {m: seen for m, seen in state.monitors.items() if m != monitor}
     spikes = tuple(spike for spike in state.spikes if not own[spike])
     back = replace(_again(search, state, state.dropped & ~own), monitors=others, spikes=spikes)
+    if back.fit.point.lost:
+        return state
     about = back.problem.metric(back.fit.point)
     free = scan_monitors(about, back.fit.residual)
     alone = float(free.gain[monitor]) + back.problem.unknown_prior(len(free.gain))
@@ -396,6 +401,8 @@ def _kick_revised(search: Search, state: State, place: int) -> State:
     seen = {k: v for k, v in state.kicks.items() if k != place}
     alone = fit(state.problem, now.causes, now.nuisances, kicks, slopes=now.slopes)
     without = replace(state, fit=alone, kicks=seen)
+    if alone.point.lost:
+        return state
     if alone.log_evidence > now.log_evidence:
         return without
     tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 8)
@@ -416,6 +423,8 @@ def _cause_revised(search: Search, state: State, hypothesis: Hypothesis) -> Stat
     named = (*state.named[:k], *state.named[k + 1 :])
     alone = fit(state.problem, rest, now.nuisances, now.kicks, slopes=now.slopes)
     without = replace(state, fit=alone, named=named)
+    if alone.point.lost:
+        return state
     if alone.log_evidence > now.log_evidence:
         return without
     tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 12)

@@ -3,7 +3,7 @@
 import difflib
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
@@ -26,7 +26,13 @@ def _validator(schema: str) -> Any:
     return Draft202012Validator(json.loads(text))
 
 
-def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[str, Any]:
+def read_document(
+    path: Path,
+    schema: str,
+    name: str,
+    version: int = 1,
+    first: Callable[[dict[str, Any]], None] = lambda document: None,
+) -> dict[str, Any]:
     """A JSON file of the format `name`, as its schema has it.
 
     Args:
@@ -34,6 +40,7 @@ def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[
         schema: file name in `tmlattice/schemas`, without `.schema.json`.
         name: what `format` has to be.
         version: the one that can be read.
+        first: looks before the schema does, which takes its time over long lists.
 
     Raises:
         MeasurementError: no such file, not UTF-8, not JSON (with the line), another format or
@@ -63,6 +70,7 @@ def read_document(path: Path, schema: str, name: str, version: int = 1) -> dict[
             f'{path}: its "version" is {_short(document.get("version"))}; this package reads '
             f"{version}: write it in that version, or update tmlattice"
         )
+    first(document)
     from jsonschema.exceptions import best_match
 
     wrong = best_match(_validator(schema).iter_errors(document))

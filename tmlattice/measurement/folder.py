@@ -6,6 +6,7 @@ back bit by bit.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ RESPONSE = ("corrector", "monitor", "x", "y")
 RF = "rf"
 FEWEST, MOST_UNREAD = 100, 10
 """Shots that may be listed without a reading: so many, and so many times those that were read."""
+SHORTEST = 4
+"""Bytes of a row of a table at least."""
 
 _WORDS = {
     Measurement: "first turns",
@@ -91,7 +94,7 @@ def read_measurement(
     file = folder / "measurement.json"
     if not file.is_file():
         raise MeasurementError(f"no '{file}'; a measurement folder has one")
-    document = read_document(file, "measurement", FORMAT)
+    document = read_document(file, "measurement", FORMAT, first=partial(_check_number, file))
     kind = document["kind"]
     if kind in KINDS:
         measured: AnyMeasurement = KINDS[kind].read(file, document, monitors)
@@ -99,6 +102,18 @@ def read_measurement(
         return measured
     read = _trajectory if kind == "trajectory" else _orbit_response
     return read(file, document, monitors)
+
+
+def _check_number(file: Path, document: dict[str, Any]) -> None:
+    """Shots that so short a table cannot have readings of are not looked at one by one."""
+    shots, table = document.get("shots"), file.with_name("readings.csv")
+    if isinstance(shots, list) and table.is_file():
+        rows = table.stat().st_size // SHORTEST
+        if len(shots) > FEWEST + MOST_UNREAD * rows:
+            raise MeasurementError(
+                f"{file}: it lists {len(shots)} shots, and {table.name} has {rows} rows at most; "
+                "take the others out"
+            )
 
 
 def _trajectory(

@@ -105,6 +105,8 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
     columns: dict[str, list[Any]] = defaultdict(list)
     index: dict[str, dict[str, int]] = {}
     done = 0
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise MeasurementError(f"'{path}' is a pipe or a device; give a file")
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, skipinitialspace=True)
