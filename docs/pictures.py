@@ -135,29 +135,12 @@ def together():
 def real_ring():
     """SOLEIL, 2012: its response less the lattice of the file, and less the ring as found."""
     from tmlattice.importers import bring_in
+    from tmlattice.plots.response import plot_left
 
     path = Path(os.environ["TMLATTICE_DATA"]) / "real_rings" / "soleil_2012-01-20.loco.mat"
     brought = bring_in([path])
-    yield "real_ring", before_and_after(tmlattice.diagnose(brought.ring, brought.measurement))
-
-
-def before_and_after(result):
-    """What is left of each fitted corrector in its own plane, in one scale of colours."""
-    view = result.response
-    plane = np.array([int(p == "y") for p in view.measured.planes])
-    shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True, layout="constrained")
-    limit = 0.0
-    for ax, name, model in zip(axes, ("before", "after"), (view.design, view.model), strict=True):
-        left = 1e6 * (view.data - model)[shown][:, view.good]
-        left = left[np.arange(len(shown)), :, plane[shown]]
-        limit = limit or float(np.percentile(abs(left), 98))
-        image = ax.imshow(left.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
-        ax.set_title(f"{name}: {np.sqrt(np.mean(left**2)):.2g} µm rms", loc="left")
-        ax.set_xlabel("corrector: horizontal, then vertical")
-    axes[0].set_ylabel("monitor, along the ring")
-    figure.colorbar(image, ax=axes, label="measured less model [µm]")
-    return figure
+    figure = plt.figure(figsize=(11, 4.2), layout="constrained")
+    yield "real_ring", plot_left(tmlattice.diagnose(brought.ring, brought.measurement), figure)
 
 
 def report():

@@ -13,7 +13,6 @@ from tmlattice.diagnosis.families import (
 from tmlattice.diagnosis.fields import (
     EdgeFocusing,
     QuadrupoleGradient,
-    SextupoleGradient,
     SkewGradient,
     VerticalFocusing,
 )
@@ -25,7 +24,6 @@ RMS = {
     CALIBRATION: 0.1,  # large, and beside the others: these two are exact
     GAIN: 0.1,
     QuadrupoleGradient(): 1e-3,
-    SextupoleGradient(): 1e-3,
     VerticalFocusing(): 1e-3,
     EdgeFocusing(): 1e-3,
     EnergySpread(): 1.0,

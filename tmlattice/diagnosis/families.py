@@ -19,7 +19,6 @@ from tmlattice.diagnosis.fields import (
     FamilyGradient,
     OtherGradient,
     QuadrupoleGradient,
-    SextupoleGradient,
     SkewGradient,
     VerticalFocusing,
 )
@@ -222,7 +221,6 @@ STEPS = (
     Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
     Trial((MonitorGain(),), 2, 0),
     Trial((QuadrupoleGradient(),), 4, 0),
-    Trial((SextupoleGradient(),), 2, 0),
     Trial((VerticalFocusing(),), 2, 0),
     Trial((EdgeFocusing(),), 2, 0),
     Trial((EnergySpread(),), 2, 0),

@@ -147,20 +147,6 @@ class OtherGradient(_Thin):
         return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
 
 
-class SextupoleGradient(OtherGradient):
-    """Of the orbit in sextupoles: an offset of it beside each, times the sextupole's strength."""
-
-    name = "sextupole_gradient"
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return [own for own in magnets(ring, ("sextupole",)) if any(e.k2 for e in own)]
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The orbit's offsets, m: strong sextupoles make more of them."""
-        strength = [sum(abs(e.k2) * e.length for e in own) for own in self._places(data.ring)]
-        return [Group(self.name, np.diag(strength), 2e-4, TAILS)]
-
-
 class VerticalFocusing(_Thin):
     """Of insertion devices, in wigglers and in straights."""
 

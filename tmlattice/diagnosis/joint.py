@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.left_out import spikes, with_silent
+from tmlattice.diagnosis.next_kind import next_kind
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
     held_out,
@@ -126,7 +127,7 @@ def diagnose_together(
     found, small = _sought(search, everywhere, rms, known)
     progress("report")
     return _told(
-        ring, parts, problem, found, small, judgement,
+        ring, parts, problem, found, small, how,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
             "options": {
@@ -268,9 +269,10 @@ def _told(
     problem: Together,
     found: Explanation,
     small: Learnt | None,
-    judgement: Judgement,
+    how: How,
     made: Mapping[str, Any],
 ) -> Diagnosis:
+    judgement = how.judgement
     found = _by_ring(ring, problem, found)
     result = found.fit
     dead = tuple(dict.fromkeys(one for part in parts for one in part.dead))
@@ -310,7 +312,7 @@ def _told(
         heldout_shots=(),
         unexplained={"p_value": p_value, "places": []},
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
-        next=None,
+        next=next_kind(ring, found, [part.kind for part in parts], how, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),

@@ -7,8 +7,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,16 +19,15 @@ from tmlattice.diagnosis.background import SmallErrors
 from tmlattice.diagnosis.common import sought_in
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
-    credible,
     findings_of,
     sensitivity,
     unexplained,
     verdict_of,
     with_consequences,
 )
+from tmlattice.diagnosis.next_kind import leading
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.prepare import Prepared, noise_of, same_monitors
-from tmlattice.diagnosis.remedies import remedy_of
+from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
@@ -110,6 +108,8 @@ def diagnose(
     measurement = mended(ring, measurement, assume)
     reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
     said = consulted(ring, measurement, radiation, reference)
+    measurement = batch(ring, measurement, said)
+    reference, heldout = (own and batch(ring, own, said) for own in (reference, heldout))
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
@@ -125,9 +125,7 @@ def diagnose(
     small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None
-    with _unjudged(said):
-        gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
+    gap = _held_out(ring, heldout, ready, told, small, explanation, said)
     repaired = apply(ring, told.causes)
     noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
@@ -237,26 +235,20 @@ def _noise(ready: Prepared, small: SmallErrors | None) -> tuple[float, float]:
     return ready.noise if small is None else noise_of(small.problem.data)
 
 
-@contextmanager
-def _unjudged(said: list[str]) -> Iterator[None]:
-    """A beam that the held-out shots lose is told: then nobody judges."""
-    try:
-        yield
-    except BeamLostError as error:
-        said.append(f"{error}: the held-out shots do not judge the gap")
-
-
 def _held_out(
     ring: Ring,
-    heldout: Measurement,
+    heldout: Measurement | None,
     ready: Prepared,
     told: _Told,
     small: SmallErrors | None,
     explanation: Explanation,
-) -> Gap:
+    said: list[str],
+) -> Gap | None:
     """The gap on shots that the fit did not see: the design's; with the small errors in it, as the
     fit without causes leaves them; with the findings, one by one where there are no small errors.
     """
+    if heldout is None:
+        return None
     other = of_measurement(ring, heldout).with_sigma(np.array(_noise(ready, small)))
     dropped = ready.problem.valid & ~told.problem.valid
     other = same_monitors(other, ready.problem.data, dropped)
@@ -272,7 +264,11 @@ def _held_out(
     seen_by = (small.problem, turns_of(explanation))
     fits = (explanation.before, explanation.fit)[: len(told.estimates)]
     for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
-        unknown = small.unknown(one, seen, problem(errors, ()), errors)
+        try:
+            unknown = small.unknown(one, seen, problem(errors, ()), errors)
+        except BeamLostError as error:
+            said.append(f"{error}: the held-out shots do not judge the gap")
+            return None
         scored.append(judged(problem(errors, one.causes), other.launches, unknown))
     return held_out_gap(scored, since=max(len(scored) - 2, 0))
 
@@ -296,16 +292,13 @@ def _left_out(
 def _next(
     ring: Ring, ready: Prepared, explanation: Explanation, seed: int
 ) -> NextMeasurement | None:
-    for named in explanation.named:
-        first, *others = credible(named.rivals, ready.problem.judgement.mass)[0]
-        done = remedy_of(ring, first.cause)
-        other = next((rival for rival in others if remedy_of(ring, rival.cause) != done), None)
-        if other is not None:  # which of two mechanisms with one remedy it is changes nothing
-            data = ready.problem.data
-            try:
-                return next_measurement(ring, data, first, other, ready.known, seed)
-            except TmlatticeError:
-                log.warning("no next measurement could be found", exc_info=True)
+    pair = leading(ring, explanation, ready.problem.judgement.mass)
+    if pair is None:
+        return None
+    try:
+        return next_measurement(ring, ready.problem.data, *pair, ready.known, seed)
+    except TmlatticeError:
+        log.warning("no next measurement could be found", exc_info=True)
     return None
 
 

@@ -71,6 +71,27 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
     return figure
 
 
+def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
+    """What is left of each fitted corrector in its own plane before and after, in one scale."""
+    figure = plt.figure(figsize=(11, 4.2), layout="constrained") if figure is None else figure
+    view = result.response
+    plane = np.array([int(p == "y") for p in view.measured.planes])
+    shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
+    axes = figure.subplots(1, 2, sharey=True)
+    limit = 0.0
+    for ax, name, model in zip(axes, ("before", "after"), (view.design, view.model), strict=True):
+        left = 1e6 * (view.data - model)[shown][:, view.good]
+        left = left[np.arange(len(shown)), :, plane[shown]]
+        limit = limit or float(np.nanpercentile(abs(left), 98))
+        image = ax.imshow(left.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
+        rms = float(np.sqrt(np.nanmean(left**2)))
+        ax.set_title(f"{name}: {rms:.2g} µm rms", loc="left", fontsize="medium")
+        ax.set_xlabel("corrector: horizontal, then vertical")
+    axes[0].set_ylabel("monitor, along the ring")
+    figure.colorbar(image, ax=axes, label="measured less model [µm]")
+    return figure
+
+
 def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
     """Held-out rms after each step that was kept."""
     if ax is None:

@@ -5,6 +5,7 @@
 
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
+from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
 from tmlattice.report.tables import LARGE_TITLE, NUMBERS, large_text, number_rows
 from tmlattice.report.text import (
@@ -14,7 +15,6 @@ from tmlattice.report.text import (
     finding_rows,
     gap_rows,
     left_text,
-    next_text,
     noise_text,
     sensitivity_rows,
     small_rows,

@@ -12,6 +12,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
 from tmlattice.report.amounts import amount_text, least_text, probability_text, words
+from tmlattice.report.next_shot import next_text
 from tmlattice.report.remedies import (
     consequence_text,
     mechanism_text,
@@ -231,49 +232,6 @@ def gap_sentence(diagnosis: Diagnosis) -> str:
     rows = gap_rows(diagnosis)
     judges = rows if diagnosis.heldout is None else rows[-1:]
     return "; ".join(f"{name}: from {before} to {after}" for name, before, after in judges)
-
-
-def next_text(diagnosis: Diagnosis) -> str:
-    """The next measurement, in words; empty where none was proposed."""
-    shot = diagnosis.next
-    if shot is None:
-        return ""
-    changes = [
-        _setting_text(element, name, value)
-        for element, setting in shot.settings.items()
-        for name, value in setting.items()
-    ]
-    launch = shot.launch
-    where = (
-        f"x = {1e3 * launch['x']:.2f} mm, px = {1e3 * launch['px']:.3f} mrad, "
-        f"y = {1e3 * launch['y']:.2f} mm, py = {1e3 * launch['py']:.3f} mrad"
-    )
-    if launch["delta"]:
-        where += f", energy {100 * launch['delta']:+.2f} %"
-    first, second = shot.parts
-    how = f"with {' and '.join(changes)}, " if changes else ""
-    return (
-        f"One more shot, {how}launched at {where}, would part '{first}' from '{second}' by "
-        f"{shot.separation:.1f} standard deviations" + _enough(shot.separation)
-    )
-
-
-def _enough(separation: float) -> str:
-    """How many such shots make 5 standard deviations."""
-    if separation >= 5:
-        return "."
-    return f"; {int(np.ceil((5 / separation) ** 2))} such shots reach 5."
-
-
-def _setting_text(element: str, name: str, value: float) -> str:
-    match name:
-        case "k1_relative":
-            return f"the strength of {element} changed by {100 * value:+g} %"
-        case "k2_relative":
-            return f"{element} switched off" if value == -1 else f"{element} {100 * value:+g} %"
-        case "kick":
-            return f"{element} set to {1e6 * value:+g} µrad"
-    return f"{element} {name} = {value:g}"
 
 
 MUCH_MORE = 1e-4
