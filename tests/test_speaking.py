@@ -5,6 +5,7 @@ import json
 import pkgutil
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import jsonschema
@@ -15,6 +16,7 @@ from conftest import SMALL
 from test_cli import schema
 
 import tmlattice
+from tmlattice.effects import CATALOGUE
 from tmlattice.errors import ChoiceError, MeasurementError, UnknownNameError
 from tmlattice.late import Method
 from tmlattice.maps import ring_matrix
@@ -28,6 +30,7 @@ from tmlattice.measurement import (
     write_measurement,
 )
 from tmlattice.optics import matrix_tunes
+from tmlattice.report import tables
 
 FAULT = tmlattice.Cause("quadrupole_gradient", "QD::5", -0.05)
 
@@ -135,6 +138,18 @@ def test_objects_draw_themselves(small_ring, measured, diagnosis):
     for figure in (scan, gap, betas, *drawn):
         plt.close(figure)
     assert len(plt.get_fignums()) == before  # what was not asked for is closed
+
+
+def test_small_errors_that_are_not_small_are_told(diagnosis):
+    usual = CATALOGUE["quadrupole_gradient"].background
+    for times, error, told in ((8.0, 0.1, True), (8.0, 0.9, False), (1.5, 0.1, False)):
+        found = replace(
+            diagnosis, priors={"quadrupole_gradient": times * usual},
+            prior_errors={"quadrupole_gradient": error},
+        )  # fmt: skip
+        assert ("(8 times)" in found.report()) == told
+        notes = dict(tables.notes(found, found.provenance))
+        assert ("small errors larger than usual" in notes) == told
 
 
 def test_tunes_are_drawn_beside_those_of_the_ring(small_ring):

@@ -7,7 +7,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
-from tmlattice.report.tables import NUMBERS, number_rows
+from tmlattice.report.tables import LARGE_TITLE, NUMBERS, large_text, number_rows
 from tmlattice.report.text import (
     advice,
     closed_text,
@@ -70,6 +70,8 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         if rows:
             lines += ["", "Would have been seen, at half of the places where it can sit, from:"]
             lines += columns(rows, "   ")
+    if large := large_text(diagnosis):
+        lines += ["", *wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width)]
     for warning in diagnosis.warnings:
         lines += ["", *wrapped(warning, "Note: ", width)]
     return "\n".join(lines)
