@@ -52,6 +52,9 @@ Array = NDArray[np.float64]
 MOST_OF_IT = 0.5
 """Share of the gap that one cause has to make to be put aside before sizes are learnt."""
 
+MISSING = 1.5
+"""Chi-square per held-out reading from which on `nothing` is not said alone."""
+
 CROWDED = 1.5
 """What half of the monitors leave at least of their noise where a few causes with names were tried,
 from which on nothing without a name is: errors are everywhere."""
@@ -298,6 +301,9 @@ def _told(
     heldout = held_out(parts, problem.fixed, stages, aside, since)
     if heldout is None:
         said = (*said, "nothing is held out, so nobody but the fit judges the gap")
+    elif verdict == "nothing" and (left := heldout.misfits[-1].chi2_per_dof) > MISSING:
+        said = (*said, f"held-out readings leave {np.sqrt(left):.1f} times the noise: something is "
+                "there that the fitted ones do not see")  # fmt: skip
     warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
