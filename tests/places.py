@@ -35,6 +35,7 @@ PLACES = {
     "monitor_roll": MONITORS,
     "monitor_coupling": MONITORS,
     "monitor_swap": MONITORS,
+    "monitor_turn_offset": MONITORS,
     "monitor_dead": MONITORS,
     "energy_offset": [None],
     "energy_spread": [None],

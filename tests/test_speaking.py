@@ -5,6 +5,7 @@ import json
 import pkgutil
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import jsonschema
@@ -15,8 +16,10 @@ from conftest import SMALL
 from test_cli import schema
 
 import tmlattice
+from tmlattice.effects import CATALOGUE
 from tmlattice.errors import ChoiceError, MeasurementError, UnknownNameError
 from tmlattice.late import Method
+from tmlattice.maps import ring_matrix
 from tmlattice.measurement import (
     ClosedOrbit,
     Dispersion,
@@ -26,6 +29,8 @@ from tmlattice.measurement import (
     TurnByTurn,
     write_measurement,
 )
+from tmlattice.optics import matrix_tunes
+from tmlattice.report import tables
 
 FAULT = tmlattice.Cause("quadrupole_gradient", "QD::5", -0.05)
 
@@ -133,6 +138,31 @@ def test_objects_draw_themselves(small_ring, measured, diagnosis):
     for figure in (scan, gap, betas, *drawn):
         plt.close(figure)
     assert len(plt.get_fignums()) == before  # what was not asked for is closed
+
+
+def test_small_errors_that_are_not_small_are_told(diagnosis):
+    usual = CATALOGUE["quadrupole_gradient"].background
+    for times, error, told in ((8.0, 0.1, True), (8.0, 0.9, False), (1.5, 0.1, False)):
+        found = replace(
+            diagnosis, priors={"quadrupole_gradient": times * usual},
+            prior_errors={"quadrupole_gradient": error},
+        )  # fmt: skip
+        assert ("(8 times)" in found.report()) == told
+        notes = dict(tables.notes(found, found.provenance))
+        assert ("small errors larger than usual" in notes) == told
+
+
+def test_tunes_are_drawn_beside_those_of_the_ring(small_ring):
+    tune = [[0.1, 0.2], [0.15, 0.25]]
+    measured = TuneReading(tune, None, [[1.0, 2.0], [1.5, 2.5]], shots=(3, 7))
+    figure = measured.plot(small_ring)
+    read = [ax.lines[0].get_ydata().tolist() for ax in figure.axes]
+    assert read == [[0.1, 0.15], [1.0, 1.5], [0.2, 0.25], [2.0, 2.5]]
+    design = matrix_tunes(ring_matrix(small_ring))  # by the product of OCELOT's matrices
+    for plane, ax in enumerate(figure.axes[::2]):
+        assert ax.lines[-1].get_ydata()[0] == pytest.approx(design[plane], abs=1e-6)
+    assert [label.get_text() for label in figure.axes[3].get_xticklabels()] == ["3", "7"]
+    plt.close(figure)
 
 
 def test_a_name_or_a_path_goes_where_a_ring_or_a_measurement_does(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model, Paths
 from tmlattice.challenge.case import Case, ring_of
 from tmlattice.effects import modelled
+from tmlattice.errors import missing_package
 from tmlattice.fitting import fine_tune
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.measurement import Measurement
@@ -66,16 +67,24 @@ def baselines(case: Case) -> dict[str, Guesses]:
         solved = np.linalg.pinv(rows[gradients].T, rcond=1e-2) @ residual
         order = np.argsort(-np.abs(solved))[:SUSPECTS]
         out["svd_gradients"] = guess([gradients[i] for i in order])
-    for name, values in _pursuits(rows, residual).items():
+    for name, values in pursuits(rows, residual).items():
         order = np.argsort(-np.abs(values))[:SUSPECTS]
         out[name] = guess([int(i) for i in order if values[i] != 0])
     out["weight_change"] = _weight_change(case, data, paths, launches)
     return out
 
 
-def _pursuits(rows: Array, residual: Array) -> dict[str, Array]:
-    """Weights of the signatures, each of unit length, by matching pursuit and by the LASSO."""
-    from sklearn.linear_model import Lasso, orthogonal_mp
+def pursuits(rows: Array, residual: Array) -> dict[str, Array]:
+    """Weights of signatures, each of unit length, by matching pursuit and by the LASSO.
+
+    Args:
+        rows: signatures, nuisances projected out, [hypothesis, row].
+        residual: [row].
+    """
+    try:
+        from sklearn.linear_model import Lasso, orthogonal_mp
+    except ModuleNotFoundError as error:
+        raise missing_package(error, "the baselines need", "challenge") from error
 
     size = np.sqrt(np.einsum("hr,hr->h", rows, rows))
     seen = np.flatnonzero(size > 0)

@@ -2,7 +2,8 @@
 
 DIR/challenge.json                   tier and lattice
 DIR/cases/NAME/case.json             options that the diagnosis may know
-DIR/cases/NAME/fit|heldout|reference measurement folders
+DIR/cases/NAME/fit|heldout|reference measurement folders of first turns, or one of each kind, and
+                                     before_KIND of the machine before the fault
 DIR/truth/NAME.json, NAME.npz        causes, launches, readings without noise
 DIR/truth/made.json                  seed, and what was drawn anew
 DIR/results/NAME.json                the diagnosis
@@ -14,19 +15,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.batch import fingerprint
+from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError, plain
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.load import contents
-from tmlattice.measurement import Measurement, read_measurement, write_measurement
+from tmlattice.measurement import (
+    AnyMeasurement,
+    Measurement,
+    read_measurement,
+    write_measurement,
+)
 
 Array = NDArray[np.float64]
 
@@ -34,9 +41,15 @@ SET = "tmlattice-challenge-set"
 PUBLIC = "tmlattice-challenge-case"
 TRUTH = "tmlattice-challenge-truth"
 
-CAUSES = {"A": (1, 1), "B": (1, 1), "C": (2, 3), "D": (0, 1), "E": (0, 0)}
-"""Fewest and most of a case, by tier."""
+CAUSES = {
+    "A": (1, 1), "B": (1, 1), "C": (2, 3), "D": (0, 1), "E": (0, 0),
+    "R": (1, 1), "T": (1, 1), "P": (1, 1000), "M": (1, 1),
+}  # fmt: skip
+"""Fewest and most of a case, by tier; a pair may differ by all the sextupoles of a family."""
 TIERS = tuple(CAUSES)
+
+BEFORE = "before_"
+"""What the folder of a kind is called that was measured before the fault."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +59,42 @@ class Case:
     Attributes:
         name: of the case.
         lattice: what `load_ring` takes.
-        fit, heldout: the measurement, and shots for the gap.
-        reference: before the fault, or None.
+        parts: the measurements by folder: fit, heldout and perhaps reference of first turns; or
+            one of each kind by its name, and `before_KIND` of the machine before the fault.
         options: of `diagnose`: background, effects.
+        kinds: those that are diagnosed together; () of first turns.
     """
 
     name: str
     lattice: str
-    fit: Measurement
-    heldout: Measurement
-    reference: Measurement | None = None
+    parts: Mapping[str, AnyMeasurement]
     options: Mapping[str, Any] = field(default_factory=dict)
+    kinds: tuple[str, ...] = ()
+
+    @property
+    def fit(self) -> Measurement:
+        """First turns."""
+        return cast(Measurement, self.parts["fit"])
+
+    @property
+    def heldout(self) -> Measurement:
+        """First turns for the gap."""
+        return cast(Measurement, self.parts["heldout"])
+
+    @property
+    def reference(self) -> Measurement | None:
+        """First turns before the fault, or None."""
+        return cast(Measurement | None, self.parts.get("reference"))
+
+    @property
+    def measured(self) -> dict[str, AnyMeasurement]:
+        """By kind."""
+        return {kind: self.parts[kind] for kind in self.kinds}
+
+    @property
+    def before(self) -> dict[str, AnyMeasurement]:
+        """Those before the fault by kind; none where there is no reference."""
+        return {k: self.parts[BEFORE + k] for k in self.kinds if BEFORE + k in self.parts}
 
 
 @dataclass(frozen=True)
@@ -72,11 +110,12 @@ class Truth:
         signal_to_noise: of each cause alone, or of the unknown; NaN for what has no signal.
         total: signal to noise of all together.
         background: rms of small errors, by effect.
-        amplitude, noise: m.
+        amplitude, noise: m; of a case of kinds 0, and in units of what each kind usually has.
         seed: of the case.
         launches: true ones by part (fit, heldout, reference), [shot, 5].
         clean: readings without noise by part, and "before": those of the fit without the fault,
-            [shot, monitor, 2], m.
+            [shot, monitor, 2], m. Neither is kept of a case of kinds.
+        alone: of a case of several kinds the signal to noise in each, by kind.
     """
 
     name: str
@@ -91,6 +130,7 @@ class Truth:
     seed: int
     launches: Mapping[str, Array]
     clean: Mapping[str, Array]
+    alone: Mapping[str, float] = field(default_factory=dict)
 
 
 @lru_cache(maxsize=2)
@@ -102,17 +142,16 @@ def ring_of(lattice: str) -> Ring:
 def write_case(folder: Path, case: Case, truth: Truth) -> None:
     """Public and secret part; the public one is whole when its `case.json` is there."""
     own = folder / "cases" / case.name
-    for name in ("fit", "heldout", "reference"):
-        measurement = getattr(case, name)
-        if measurement is not None:
-            write_measurement(own / name, measurement, force=True)
+    for name, measurement in case.parts.items():
+        write_measurement(own / name, measurement, force=True)
     _write_truth(folder / "truth", truth)
     document = {
         "format": PUBLIC,
         "version": 1,
         "lattice": case.lattice,
-        "reference": case.reference is not None,
+        "reference": bool(case.before) or "reference" in case.parts,
         "options": dict(case.options),
+        **({"kinds": list(case.kinds)} if case.kinds else {}),
     }
     with output_file(own / "case.json") as path:
         write_json(path, document)
@@ -136,6 +175,7 @@ def _write_truth(folder: Path, truth: Truth) -> None:
         "amplitude": truth.amplitude,
         "noise": truth.noise,
         "seed": truth.seed,
+        **({"alone": dict(truth.alone)} if truth.alone else {}),
     }
     with output_file(folder / f"{truth.name}.json") as path:
         write_json(path, document)
@@ -210,16 +250,12 @@ def trusted_case(folder: Path, name: str, trusted: str | None) -> Case:
     return case
 
 
-PARTS = ("fit", "heldout", "reference")
-TABLES = ("measurement.json", "readings.csv")
-
-
 def made_by(folder: Path, name: str, lattice: str) -> str:
     """The fingerprint of what a case's results depend on: lattice, data, options, version."""
     from tmlattice import __version__
 
     own = folder / "cases" / name
-    files = [own / "case.json", *(own / part / table for part in PARTS for table in TABLES)]
+    files = [own / "case.json", *sorted(own.glob("*/*"))]
     return fingerprint(__version__, contents(ring_of(lattice)), *files)
 
 
@@ -227,24 +263,25 @@ def read_case(folder: Path, name: str) -> Case:
     """The public part of a case."""
     own = folder / "cases" / name
     public = _read(own / "case.json", PUBLIC)
+    kinds = public.get("kinds", [])
     good = isinstance(public.get("options"), dict) and isinstance(public.get("reference"), bool)
+    good = good and isinstance(kinds, list) and all(kind in RECORDS for kind in kinds)
     if not good or "lattice" not in public:
         raise TmlatticeError(f"{own / 'case.json'} is damaged; make the challenge anew")
+    wanted = {kind: kind for kind in kinds} or {"fit": "trajectory", "heldout": "trajectory"}
+    if public["reference"]:
+        wanted |= {BEFORE + kind: kind for kind in kinds} or {"reference": "trajectory"}
+    parts = {}
+    for folder_name, kind in wanted.items():
+        parts[folder_name] = read_measurement(own / folder_name)
+        if not isinstance(parts[folder_name], RECORDS[kind]):
+            raise TmlatticeError(
+                f"'{own / folder_name}' is no {kind.replace('_', ' ')}; make the challenge anew"
+            )
+    return Case(name, public["lattice"], parts, public["options"], tuple(kinds))
 
-    def part(which: str) -> Measurement:
-        measurement = read_measurement(own / which)
-        if not isinstance(measurement, Measurement):
-            raise TmlatticeError(f"'{own / which}' is no trajectory; make the challenge anew")
-        return measurement
 
-    return Case(
-        name,
-        public["lattice"],
-        part("fit"),
-        part("heldout"),
-        part("reference") if public["reference"] else None,
-        public["options"],
-    )
+RECORDS: Mapping[str, type] = {kind: record for kind, (record, _) in KINDS.items()}
 
 
 def read_truth(folder: Path, name: str) -> Truth:
@@ -292,6 +329,7 @@ def _truth(folder: Path, name: str) -> Truth:
         secret["seed"],
         launches,
         clean,
+        {kind: number(v) for kind, v in secret.get("alone", {}).items()},
     )
 
 

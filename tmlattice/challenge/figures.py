@@ -22,6 +22,9 @@ PROBABILITIES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 
 Row = dict[str, Any]
 
+ALONE = "alone: "
+"""What the answer of one kind of several is called."""
+
 
 def rate(flags: Sequence[bool]) -> dict[str, Any]:
     """A share with its 95 % interval (Wilson)."""
@@ -40,7 +43,13 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
         "verdicts": dict(Counter(row["verdict"] for row in rows)),
     }
     if tier == "E":
-        out["false_alarms"] = rate([row["verdict"] != "nothing" for row in rows])
+        # errors everywhere are no alarm where there are some
+        out["false_alarms"] = rate(
+            [
+                row["answers"]["tool"]["detected"] if row["small"] else row["verdict"] != "nothing"
+                for row in rows
+            ]
+        )
         out["oracle_false_alarms"] = rate(
             [row["answers"]["oracle"]["detected"] for row in rows if "oracle" in row["answers"]]
         )
@@ -80,7 +89,20 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
     out["relative_to_oracle"] = _relative(clear)
     out["classes"] = classes(rows)
+    if tier == "M":
+        out["together"] = together(rows)
     return out
+
+
+def together(rows: Sequence[Row]) -> dict[str, Any]:
+    """Of several kinds: what all of them find of what the best single one finds, and of what none
+    of them finds alone. Found is a first finding within one monitor gap."""
+    split: dict[bool, list[bool]] = {True: [], False: []}
+    for row in rows:
+        answers = row["answers"]
+        alone = [a["place"] for name, a in answers.items() if name.startswith(ALONE)]
+        split[any(alone)].append(answers["tool"]["place"])
+    return {"of_found_alone": rate(split[True]), "of_none_alone": rate(split[False])}
 
 
 def _told(rows: Sequence[Row], name: str) -> dict[str, Any]:

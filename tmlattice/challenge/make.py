@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 from tmlattice.batch import fingerprint
 from tmlattice.challenge.case import (
     CONTENTS,
+    RECORDS,
     SET,
     TIERS,
     Case,
@@ -22,6 +23,8 @@ from tmlattice.challenge.case import (
     ring_of,
     write_case,
 )
+from tmlattice.challenge.draw import Draw
+from tmlattice.challenge.kinds import TIER_KINDS, Asked, kinds_case
 from tmlattice.challenge.ruler import Ruler
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
 from tmlattice.effects import (
@@ -39,7 +42,7 @@ from tmlattice.lattice import Ring
 from tmlattice.lattice.load import contents
 from tmlattice.machine import Machine, Shots, draw_background, draw_shots
 from tmlattice.machine.shots import stream
-from tmlattice.measurement import Measurement
+from tmlattice.measurement import AnyMeasurement, Measurement
 
 Array = NDArray[np.float64]
 
@@ -57,9 +60,6 @@ SET_KICK = (2e-5, 5e-5)
 
 HELD_OUT = 2
 
-Drawn = tuple[str, str | None, float]
-"""What was asked for and could not be reached: effect, place, signal to noise at the cap."""
-
 
 def make(
     tier: str,
@@ -75,25 +75,29 @@ def make(
     signal: tuple[float, float] = SIGNAL,
     background: Mapping[str, float | None] | None = None,
     told: bool = False,
+    kinds: Sequence[str] = (),
     progress: bool = True,
 ) -> dict[str, int]:
     """Make a challenge; cases that are there already are kept.
 
     Args:
         tier: A one effect; B one effect among small errors everywhere; C two or three; D one that
-            the catalogue does not hold; E none.
+            the catalogue does not hold; E none. Those are in first turns; R is one effect in an
+            orbit response, T in turns of a stored beam, M in two or three kinds together, P what
+            changed between two measurements of one machine.
         cases: how many.
         seed: of everything.
         folder: for the challenge.
         lattice: what `load_ring` takes.
         reference: tier B, with a measurement from before the fault.
-        shots: of the fit; two more are held out.
+        shots: of first turns and kicks of a stored beam; of the fit, two more are held out.
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a signal to noise that is drawn.
         signal: smallest and largest signal to noise.
-        background: tier B, rms of the small errors by effect (None: the catalogue's own); every
-            usual one if not given.
+        background: tiers of kinds and tier B, rms of the small errors by effect (None: the
+            catalogue's own); every usual one if not given in tiers B and P.
         told: the diagnosis is told those sizes; else it has to learn them.
+        kinds: of measurement, for tiers E, M and P; of M two or three are drawn.
         progress: show a bar where there is a terminal.
 
     Returns:
@@ -106,9 +110,15 @@ def make(
         raise TmlatticeError(f"no tier '{tier}'; there are {', '.join(TIERS)}")
     if reference and tier != "B":
         raise TmlatticeError("a reference is for tier B; leave --reference out")
-    if background and tier != "B":
-        raise TmlatticeError("small errors everywhere are for tier B; leave --background out")
-    rms = background_rms(background or {"all": None}) if tier == "B" else {}
+    kinds = _kinds(tier, kinds)
+    if background and tier != "B" and not kinds:
+        raise TmlatticeError(
+            "small errors everywhere are for tier B and for those of kinds; leave --background out"
+        )
+    if told and "orbit_response" in kinds:
+        raise TmlatticeError("an orbit response says those sizes by itself; leave --told out")
+    everywhere = background or ({"all": None} if tier in ("B", "P") else {})
+    rms = background_rms(everywhere) if everywhere else {}
     chosen = names(effects)
     ring = ring_of(lattice)
     public = {
@@ -124,43 +134,71 @@ def make(
         "signal": list(signal),
         "background": rms,
     }
-    if tier == "B":
+    if tier == "B" or kinds:
         public["told"] = told
-    if (folder / "challenge.json").exists():
-        described = read_set(folder)
-        if {CONTENTS: public[CONTENTS], **described} != public or _seed(folder) not in (None, seed):
-            raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
-        with output_file(folder / "challenge.json") as path:
-            write_json(path, public)
+    if kinds:
+        public["kinds"] = list(kinds)
+    _begin(folder, public, seed)
     unreachable: Counter[str] = Counter()
     there = set(case_names(folder))
     for number in tqdm(range(cases), unit="case", disable=None if progress else True):
         name = f"{number:04d}"
         if name in there:
             continue
-        draw = CaseDraw(
-            ring,
-            lattice,
-            tier,
-            seed,
-            number,
-            reference,
-            shots,
-            chosen,
-            amount,
-            signal,
-            rms,
-            told,
-        )
-        case, truth = draw.make(name)
+        if kinds:
+            asked = Asked(
+                tier,
+                lattice,
+                ring,
+                seed,
+                kinds,
+                tuple(chosen) if effects else None,
+                shots,
+                signal,
+                amount,
+                rms,
+                told,
+            )
+            case, truth, lost = kinds_case(asked, number, name)
+        else:
+            drawn = CaseDraw(
+                ring, lattice, tier, seed, number, reference, shots, chosen, amount, signal, rms,
+                told,
+            )  # fmt: skip
+            case, truth = drawn.make(name)
+            lost = drawn.draw
         write_case(folder, case, truth)
-        unreachable.update(effect for effect, _, _ in draw.unreachable)
+        unreachable.update(effect for effect, _, _ in lost.unreachable)
     made = {"seed": seed, "cases": cases, "unreachable": dict(unreachable)}
     with output_file(folder / "truth" / "made.json") as path:
         write_json(path, {"format": "tmlattice-challenge-made", "version": 1, **made})
     return dict(unreachable)
+
+
+def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:
+    """What is measured in a tier; () of first turns."""
+    if not asked:
+        return TIER_KINDS.get(tier, ())
+    if tier not in "EMP":
+        raise TmlatticeError("kinds are chosen for tiers E, M and P; leave --kind out")
+    for kind in asked:
+        if kind not in RECORDS:
+            raise TmlatticeError(f"no kind '{kind}'; there are {', '.join(RECORDS)}")
+    if tier == "M" and len(set(asked)) < 2:
+        raise TmlatticeError("tier M is of kinds together; name two of them or more")
+    return tuple(dict.fromkeys(asked))
+
+
+def _begin(folder: Path, public: Mapping[str, Any], seed: int) -> None:
+    """The folder of a new challenge, or of the same one."""
+    if (folder / "challenge.json").exists():
+        described = read_set(folder)
+        if {CONTENTS: public[CONTENTS], **described} != public or _seed(folder) not in (None, seed):
+            raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with output_file(folder / "challenge.json") as path:
+        write_json(path, public)
 
 
 def _seed(folder: Path) -> int | None:
@@ -192,7 +230,6 @@ class CaseDraw:
     ) -> None:
         self.ring, self.lattice, self.tier = ring, lattice, tier
         self.effects = names(effects)
-        self.amount, self.signal = amount, signal
         self.fit_shots = shots
         self.number, self.set_seed = number, seed
         random = stream(seed, "challenge", tier, number)
@@ -209,7 +246,7 @@ class CaseDraw:
         self.background = dict(background or {})
         self.told = told
         self.small = draw_background(ring, self.background, self.seed)
-        self.unreachable: list[Drawn] = []
+        self.draw = Draw(random, signal, amount)
 
     def _draw_shots(self, count: int, seed: int) -> Shots:
         settings: list[Settings] = []
@@ -269,36 +306,11 @@ class CaseDraw:
         return case, truth
 
     # --- what is wrong --------------------------------------------------------------------------
-    def _target(self) -> float:
-        return float(np.exp(self.random.uniform(*np.log(self.signal))))
-
     def _cause(self, ruler: Ruler, effects: Sequence[str]) -> Cause:
-        """Effect, then place, uniformly; the amount for a signal to noise, up to its cap."""
-        for _ in range(1000):
-            name = effects[int(self.random.integers(len(effects)))]
-            effect = find(name)
-            places = self.set if effect.acts_on_settings else effect.places(self.ring)
-            if not places:
-                continue
-            place = places[int(self.random.integers(len(places)))]
-            sign = float(self.random.choice([-1.0, 1.0]))
-            target = self._target()
-            if effect.discrete:
-                forms = int(effect.largest)
-                return Cause(name, place, float(self.random.integers(1, forms + 1)))
-            if effect.one_sign:
-                sign = 1.0
-            if self.amount is not None:
-                return Cause(name, place, sign * self.amount)
-            cap = Cause(name, place, sign * effect.largest)
-            most = ruler.of([cap])
-            if not most >= self.signal[0]:
-                self.unreachable.append((name, place, most))
-                continue
-            if target >= most:
-                return cap
-            return Cause(name, place, _solved(ruler, cap, most, target, effect.power))
-        raise TmlatticeError("no effect reaches the smallest signal to noise; take larger shots")
+        """Correctors only where they are set, if it is their setting that is wrong."""
+        return self.draw.one(
+            ruler, effects, lambda e: self.set if e.acts_on_settings else e.places(self.ring)
+        )
 
     def _unknown_kind(self) -> str:
         """Unknowns and effects taken out share the cases half and half, each in turn."""
@@ -315,7 +327,7 @@ class CaseDraw:
             fault = Unknown(self.ring, kind, self.shots, healthy, self.random)
             amount = LARGEST[kind]
             if kind not in DISCRETE:
-                target = self._target()
+                target = self.draw.target()
                 amount *= 0.1
                 for _ in range(3):
                     change = fault.readings(amount) - healthy
@@ -323,11 +335,11 @@ class CaseDraw:
                     amount = min(amount * target / max(size, 1e-9), LARGEST[kind])
             clean = fault.readings(amount)
             size = ruler.size((clean - healthy)[fit])
-            if np.isfinite(clean).all() and size >= self.signal[0]:
+            if np.isfinite(clean).all() and size >= self.draw.signal[0]:
                 place = fault.element
                 known = {"kind": kind, "element": place.name, "s": place.s, "amount": amount}
                 return clean, known
-            self.unreachable.append((kind, fault.element.name, size))
+            self.draw.unreachable.append((kind, fault.element.name, size))
         raise TmlatticeError(f"no {kind} reaches the smallest signal to noise; take larger shots")
 
     def _readings(self, causes: Sequence[Cause]) -> Array:
@@ -353,14 +365,13 @@ class CaseDraw:
             quiet = clean_readings(Machine(self.ring, self.small), self.before)
             noise = stream(self.seed, "reference noise").standard_normal(quiet.shape)
             reference = self._measurement(self.before, quiet + self.noise * noise)
-        return Case(
-            name,
-            self.lattice,
-            first.select(shots[: self.fit_shots]),
-            first.select(shots[self.fit_shots :]),
-            reference,
-            options,
-        )
+        parts: dict[str, AnyMeasurement] = {
+            "fit": first.select(shots[: self.fit_shots]),
+            "heldout": first.select(shots[self.fit_shots :]),
+        }
+        if reference is not None:
+            parts["reference"] = reference
+        return Case(name, self.lattice, parts, options)
 
     def _measurement(self, shots: Shots, readings: Array) -> Measurement:
         monitors = tuple(monitor.name for monitor in self.ring.monitors)
@@ -383,18 +394,6 @@ class CaseDraw:
         for at in self._frozen_monitors(causes):
             clean[:, at] = case.fit.readings[0, 0, at]
         return clean
-
-
-def _solved(ruler: Ruler, cap: Cause, most: float, target: float, power: int) -> float:
-    """The amount whose signal to noise is the target: readings change nearly as amount^power."""
-    amount, size = cap.amount, most
-    for _ in range(6):
-        amount *= (target / max(size, 1e-12)) ** (1 / power)
-        amount = float(np.clip(amount, -abs(cap.amount), abs(cap.amount)))
-        size = ruler.of([Cause(cap.effect, cap.element, amount)])
-        if abs(size / target - 1) < 1e-3:
-            break
-    return amount
 
 
 def _five(shots: Shots) -> Array:

@@ -22,9 +22,20 @@ log = logging.getLogger(__name__)
 
 
 def diagnose_case(case: Case) -> dict[str, Any]:
-    """The diagnosis of one case as JSON, and the seconds it took."""
+    """The diagnosis of one case as JSON, and the seconds it took; of several kinds also what is
+    found in each alone."""
     ring = ring_of(case.lattice)
     begun = time.perf_counter()
+    if case.kinds:
+        together = diagnose(
+            ring, case.measured, reference=case.before or None, **case.options
+        ).as_json()
+        seconds = time.perf_counter() - begun
+        alone = {}
+        for kind in case.kinds if len(case.kinds) > 1 else ():
+            one = diagnose(ring, case.measured[kind], **case.options).as_json()
+            alone[kind] = {key: one[key] for key in ("verdict", "findings", "priors")}
+        return {**together, "seconds": seconds, **({"alone": alone} if alone else {})}
     found = diagnose(
         ring,
         case.fit,

@@ -24,7 +24,8 @@ from tmlattice.challenge.case import (
     ring_of,
     trusted_case,
 )
-from tmlattice.challenge.figures import Row, summary
+from tmlattice.challenge.figures import ALONE, Row, summary
+from tmlattice.challenge.ideal import judge_kinds, plain_kinds
 from tmlattice.challenge.oracle import judge
 from tmlattice.challenge.record import (
     ALIASED,
@@ -43,7 +44,6 @@ from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError, plain
 from tmlattice.inference.judge import held_out_gap
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged
 
@@ -93,21 +93,8 @@ def score(
         raise TmlatticeError(failed[names[0]])
     others = sorted(set(case_names(folder)) - set(names))
     names = list(truths)
-    judged: dict[str, dict[str, Any]] = {}
-    guessed: dict[str, dict[str, Any]] = {}
-    if oracle:
-
-        def load(name: str) -> Callable[[], tuple[Case, Truth]]:
-            return lambda: (trusted_case(folder, name, lattice), truths[name])
-
-        def load_case(name: str) -> Callable[[], Case]:
-            return lambda: trusted_case(folder, name, lattice)
-
-        where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
-        judged = run_batch(judge, {n: load(n) for n in names}, folder / "oracle", **where)
-        if described["tier"] != "E":  # they always find something
-            cases = {n: load_case(n) for n in names}
-            guessed = run_batch(baselines, cases, folder / "baselines", **where)
+    where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
+    judged, guessed = _others(folder, described, truths, lattice, where) if oracle else ({}, {})
     ring = ring_of(described["lattice"])
     places = Places(ring)
     rows = []
@@ -116,7 +103,7 @@ def score(
             continue
         try:
             row = row_of(results[name], truths[name], judged.get(name), guessed.get(name), places)
-            row |= clean_gap(ring, read_case(folder, name).heldout, truths[name], results[name])
+            row |= clean_gap(ring, read_case(folder, name), truths[name], results[name])
         except (
             ArithmeticError, LookupError, TypeError, ValueError, AttributeError, TmlatticeError
         ) as error:  # fmt: skip
@@ -132,12 +119,37 @@ def score(
         "version": 2,
         "package": __version__,
         **{key: described[key] for key in ("tier", "lattice", "reference", "shots", "amount")},
+        **({"measured_kinds": described["kinds"]} if "kinds" in described else {}),
         "cases": len(names),
         "failed": failed,
         "not_run": others,
         **summary(rows, described["tier"]),
         "rows": rows,
     }
+
+
+def _others(
+    folder: Path,
+    described: Mapping[str, Any],
+    truths: Mapping[str, Truth],
+    lattice: str | None,
+    where: Mapping[str, Any],
+) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Oracle and plain methods, by case."""
+    of_kinds = bool(described.get("kinds"))
+
+    def load(name: str) -> Callable[[], tuple[Case, Truth]]:
+        return lambda: (trusted_case(folder, name, lattice), truths[name])
+
+    def load_case(name: str) -> Callable[[], Case]:
+        return lambda: trusted_case(folder, name, lattice)
+
+    ideal, plain_ones = (judge_kinds, plain_kinds) if of_kinds else (judge, baselines)
+    judged = run_batch(ideal, {n: load(n) for n in truths}, folder / "oracle", **where)
+    if described["tier"] == "E":  # they always find something
+        return judged, {}
+    cases = {n: load_case(n) for n in truths}
+    return judged, run_batch(plain_ones, cases, folder / "baselines", **where)
 
 
 # --- a case ---------------------------------------------------------------------------------------
@@ -165,8 +177,12 @@ def row_of(
         "stated": stated(result, causes),
         "class": _class(result),
         "refused": _refused(result),
+        "small": bool(truth.background),
     }
     answers: dict[str, Mapping[str, Any]] = {"tool": result}
+    answers |= {f"{ALONE}{kind}": one for kind, one in result.get("alone", {}).items()}
+    if truth.alone:
+        row["alone"] = dict(truth.alone)
     if judged is not None and "error" not in judged:
         for ranking, name in (("class", "oracle"), ("posterior", "bayes_oracle")):
             answers[name] = oracle_answer(judged, ranking)
@@ -185,7 +201,7 @@ def row_of(
         row["one_remedy"] = one_remedy(result, causes[0], places.ring)
         if judged is not None and "error" not in judged:
             row["oracle_one_remedy"] = oracle_one_remedy(judged, causes[0], places.ring)
-    if len(causes) > 1:
+    if len(causes) > 1 and truth.tier == "C":
         visible = [cause for cause in causes if find(cause.effect).modelled]
         row["exact"] = {
             name: exact(answer, visible if name.endswith("oracle") else causes)
@@ -200,6 +216,9 @@ def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
     first = findings[0] if findings else None
     small = bool(answer.get("priors"))  # errors everywhere are no fault
     row: Row = {"detected": bool(findings) or (answer["verdict"] == "distributed" and not small)}
+    if truth.tier == "P" and first is not None:  # all the sextupoles of a family are one change
+        named = [c for c in truth.causes if c.element == first["element"]]
+        return row | finding_row(first, (*named, *truth.causes)[0], places)
     if len(truth.causes) == 1:
         return row | finding_row(first, truth.causes[0], places)
     if truth.unknown is not None and truth.unknown.get("element"):
@@ -224,7 +243,7 @@ def _after(result: Mapping[str, Any]) -> float | None:
 def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
     """Whether the held-out misfit of so many scored monitors lies within its 99 % interval."""
     left = _after(result)
-    if left is None or not np.isfinite(left):
+    if left is None or not np.isfinite(left) or not result["gap"]["heldout"]["shots"]:
         return None
     freedom = 2 * monitors * len(result["gap"]["heldout"]["shots"])
     low, high = stats.chi2.interval(0.99, freedom)
@@ -248,13 +267,14 @@ def _class(result: Mapping[str, Any]) -> Row | None:
 
 
 def clean_gap(
-    ring: Ring, heldout: Measurement, truth: Truth, result: Mapping[str, Any]
+    ring: Ring, case: Case, truth: Truth, result: Mapping[str, Any]
 ) -> dict[str, float | None]:
     """rms error on held-out readings without noise, design and with the findings in it, m.
 
-    In each shot the launch is fitted to one half of the monitors, the other half is scored.
+    In each shot the launch is fitted to one half of the monitors, the other half is scored. None of
+    kinds: of those no reading without noise is kept.
     """
-    if truth.background or not (truth.causes or truth.unknown):
+    if truth.background or case.kinds or not (truth.causes or truth.unknown):
         return {"clean_before": None, "clean_after": None}
     findings = [f for f in result["findings"] if f["effect"] is not None]
     causes = [
@@ -262,7 +282,7 @@ def clean_gap(
         for f in findings
         if find(f["effect"]).modelled
     ]
-    data = of_measurement(ring, heldout)
+    data = of_measurement(ring, case.heldout)
     clean = np.nan_to_num(truth.clean["heldout"])
     dropped = np.zeros(data.valid.shape, dtype=bool)
     monitors = [monitor.name for monitor in ring.monitors]

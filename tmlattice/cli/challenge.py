@@ -52,12 +52,27 @@ def _cluster_options(function: Any) -> Any:
 
 
 @challenge.command("make")
-@click.argument("tier", type=click.Choice(["A", "B", "C", "D", "E"], case_sensitive=False))
-@click.option("--cases", type=click.IntRange(1), default=300, show_default=True)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.argument(
+    "tier",
+    metavar="A|B|C|D|E|R|T|P|M",
+    type=click.Choice(list("ABCDERTPM"), case_sensitive=False),
+)
+@click.option("--cases", type=click.IntRange(1), default=300, show_default=True, help="How many.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all that is drawn."
+)
 @click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
-@click.option("--lattice", default="petra3", show_default=True)
+@click.option("--lattice", default="petra3", show_default=True, help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
+@click.option(
+    "--kind",
+    "kinds",
+    multiple=True,
+    type=click.Choice(
+        ["trajectory", "turn_by_turn", "closed_orbit", "dispersion", "tunes", "orbit_response"]
+    ),
+    help="Tiers E, M and P: of measurement (repeat); M draws two or three of them for a case.",
+)
 @click.option(
     "--shots",
     type=click.IntRange(1),
@@ -75,8 +90,8 @@ def _cluster_options(function: Any) -> Any:
     help="Smallest and largest signal to noise, log-uniform.",
 )
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
-@background_option("Tier B: small errors everywhere")
-@click.option("--told", is_flag=True, help="Tier B: the diagnosis is told those sizes.")
+@background_option("Tiers B, E, R, T, P and M: small errors everywhere")
+@click.option("--told", is_flag=True, help="The diagnosis is told those sizes.")
 @quiet_option
 def make(
     tier: str,
@@ -87,7 +102,8 @@ def make(
     **options: Any,
 ) -> None:
     """Make cases of a TIER: A one effect, B one among small errors everywhere, C two or three,
-    D one that the catalogue does not hold, E none.
+    D one that the catalogue does not hold, E none, all in first turns; R one in an orbit response,
+    T in turns of a stored beam, M in two or three kinds together, P what changed between two.
 
     AT is the real machine. The truth goes to the folder's `truth`, which only `score` opens.
     """  # fmt: skip
@@ -223,6 +239,11 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
         screen.print(shown)
     for title, methods in _method_tables(result):
         _print_methods(screen, title, methods)
+    if "together" in result:
+        for key, title in (("of_found_alone", "one kind"), ("of_none_alone", "none")):
+            rate = result["together"][key]
+            screen.print(f"found together where {title} alone finds it: {_share(rate)} of "
+                         f"{rate['cases']}")  # fmt: skip
     if "detection" in result:
         shown = table("signal to noise", "detected", "oracle", "cases")
         for entry in result["detection"]:
@@ -273,7 +294,8 @@ def _print_methods(screen: "Console", title: str, methods: dict[str, Any]) -> No
     if not methods:
         return
     names = [name for name in METHODS if name in methods]
-    shown = table(title, *(METHODS[name] for name in names))
+    names += [name for name in methods if name not in METHODS]  # each kind alone
+    shown = table(title, *(METHODS.get(name, name) for name in names))
     for key in methods[names[0]]:
         shown.add_row(
             key.replace("_", " "), *(_number(methods[n][key]["share"], "{:.1%}") for n in names)

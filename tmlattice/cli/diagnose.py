@@ -61,8 +61,8 @@ log = logging.getLogger(__name__)
     "--max-effects",
     type=click.IntRange(1),
     default=None,
-    help="Findings at most; of an orbit response, steps that are kept at most. 8 where nothing is "
-    "said, 40 of a change between two responses.",
+    help="Findings at most: 8 where nothing is said, 40 of a change between two responses. Of an "
+    "orbit response, steps that are kept at most: all.",
 )
 @click.option(
     "--effects",
@@ -218,7 +218,14 @@ def _read(
     paths: tuple[Path, ...], ring: "Ring", map_file: Path | None, unit: str | None, quiet: bool
 ) -> "tuple[dict[str, Measured], list[str]]":
     """Measurements by the names of their folders, by the whole path where two have one name; and
-    what was assumed of files that are none."""
+    what was assumed of files that are none.
+
+    Raises:
+        click.UsageError: one is given twice: it would count as two.
+    """
+    for k, path in enumerate(paths):
+        if path.resolve() in [other.resolve() for other in paths[:k]]:
+            raise click.UsageError(f"'{path}' is given twice; give each measurement once")
     names = [path.resolve().name for path in paths]
     twice = len(set(names)) < len(names)
     found: dict[str, Measured] = {}

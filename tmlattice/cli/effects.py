@@ -43,7 +43,8 @@ def effects(json_file: Path | None) -> None:
         column.no_wrap = column is not shown.columns[-1]
     for effect in CATALOGUE.values():
         usual = "-" if effect.background is None else f"{effect.background:g}"
-        asked = "" if effect.usual else "; looked for where it is named (--effects)"
+        where = "in turns of a stored beam" if effect.of_turns else "where it is named (--effects)"
+        asked = "" if effect.usual else f"; looked for {where}"
         text = f"{effect.sits_on_text}; {effect.sign}{asked}"
         shown.add_row(effect.name, effect.unit, f"{usual} / {effect.largest:g}", text)
     console().print(shown)

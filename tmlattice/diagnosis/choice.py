@@ -31,7 +31,10 @@ def chosen_effects(
         raise EffectError("no effect is named; leave effects out to look for all of them")
     chosen = modelled(effects)
     free = [six for six, sigma in zip(_COLUMNS, launch_sigma.T, strict=True) if (sigma > 0).any()]
-    why: list[str] = []
+    why = [
+        f"{name} shows in turns of a stored beam alone"
+        for name in names(effects) if find(name).of_turns
+    ]  # fmt: skip
     for name in list(chosen):
         effect = find(name)
         if not effect.places(ring):

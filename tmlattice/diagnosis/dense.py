@@ -243,7 +243,8 @@ def fit_steps(
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
                         (before, before))  # fmt: skip
     progress("result")
-    state = settle(bend(jump(replace(state, exploring=False))))
+    # those that chose start at what they say: a column far off would weigh nothing, and stay there
+    state = settle(bend(jump(replace(state, exploring=False), beyond=1.0)))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)

@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
-from tmlattice.diagnosis.kinds import How, Measured, Part, part_of
+from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
+from tmlattice.diagnosis.left_out import spikes, with_silent
+from tmlattice.diagnosis.next_kind import next_kind
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
     held_out,
@@ -45,7 +47,7 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
-from tmlattice.observe.stored import Kept, Stored
+from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 
@@ -100,24 +102,16 @@ def diagnose_together(
     """
     begun = time.perf_counter()
     judgement = Judgement(false_alarm=false_alarm)
-    chosen = _chosen(ring, effects)
+    turns = any(kind_of(one) == "turn_by_turn" for one in measured.values())
+    chosen = _chosen(ring, effects, turns)
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
     how = How(ring, places, judgement, holdout, assume, seed)
     progress("data")
-    parts = [_named(label, one, how) for label, one in measured.items()]
+    parts = [with_silent(ring, _named(label, one, how), one) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
-    kept = Kept()
-    first, then = (
-        [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
-            for part in some
-        ]
-        for some in (parts, before)
-    )
     problem = replace(
-        Together.of(first, then),
-        places=places, rare=rare(ring, chosen), judgement=judgement,
+        stacked(parts, before, how), rare=rare(ring, chosen),
         fixed=() if known is None else known.causes,
     )  # fmt: skip
     hypotheses = [
@@ -136,7 +130,7 @@ def diagnose_together(
     found, small = _sought(search, everywhere, rms, known)
     progress("report")
     return _told(
-        ring, parts, problem, found, small, judgement,
+        ring, parts, problem, found, small, how,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
             "options": {
@@ -157,8 +151,8 @@ def _named(label: str, measured: Measured, how: How) -> Part:
         raise MeasurementError(f"{label}: {error}") from error
 
 
-def _chosen(ring: Ring, effects: Sequence[str] | None) -> list[str]:
-    chosen = [name for name in modelled(effects) if find(name).places(ring)]
+def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
+    chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
     launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
     chosen = [name for name in chosen if name not in launch or find(name).responds]
     if not chosen:
@@ -278,9 +272,10 @@ def _told(
     problem: Together,
     found: Explanation,
     small: Learnt | None,
-    judgement: Judgement,
+    how: How,
     made: Mapping[str, Any],
 ) -> Diagnosis:
+    judgement = how.judgement
     found = _by_ring(ring, problem, found)
     result = found.fit
     dead = tuple(dict.fromkeys(one for part in parts for one in part.dead))
@@ -293,18 +288,19 @@ def _told(
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
+    if result.causes and not causes:  # nothing is explained: what is left is what was there
+        p_value = float(chi2.sf(found.before.chi2, freedom(found.problem, found.before)))
     kept = problem.without(found.dropped)
     stages = stages_of(kept, found, small, causes)
     views = views_of(parts, kept, stages)
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     heldout = held_out(parts, problem.fixed, stages, aside, since)
-    if heldout is None:
-        said = (*said, "nothing is held out, so nobody but the fit judges the gap")
-    elif verdict == "nothing" and (left := heldout.misfits[-1].chi2_per_dof) > MISSING:
+    if verdict == "nothing" and heldout and (left := heldout.misfits[-1].chi2_per_dof) > MISSING:
         said = (*said, f"held-out readings leave {np.sqrt(left):.1f} times the noise: something is "
                 "there that the fitted ones do not see")  # fmt: skip
-    warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
+    told = (f"{part.label}: {one}" for part in parts for one in part.said)
+    warnings = [*told, *spikes(parts, problem, found), *said]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     learnt = None
@@ -322,13 +318,13 @@ def _told(
         heldout_shots=(),
         unexplained={"p_value": p_value, "places": []},
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
-        next=None,
+        next=next_kind(ring, found, [part.kind for part in parts], how, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
         noise=_noise(parts),
         noise_estimated=estimated,
-        provenance={"package": _version(), "lattice": ring.name, "measurement": None, **made},
+        provenance={"package": __version__, "lattice": ring.name, "measurement": None, **made},
         ring=ring,
         repaired=repaired,
         causes=causes,
@@ -337,12 +333,6 @@ def _told(
         prior_errors={} if small is None else dict(small.errors),
         view=JointView(found, views, learnt),
     )
-
-
-def _version() -> str:
-    from tmlattice import __version__
-
-    return __version__
 
 
 def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:

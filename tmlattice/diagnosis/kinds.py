@@ -4,7 +4,7 @@ A new kind is a record in `measurement`, a problem in `observe`, and a line in `
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from tmlattice.diagnosis.prepare import batch, prepare
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Problem
+from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     ClosedOrbit,
@@ -30,6 +31,7 @@ from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_problem import Response
+from tmlattice.observe.stored import Kept, Stored
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
@@ -92,6 +94,20 @@ def part_of(label: str, measured: Measured, how: How) -> Part:
         if isinstance(measured, record):
             return made(label, kind, measured, how)
     raise TypeError(f"{type(measured).__name__} is no measurement")
+
+
+def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together:
+    """Measurements as one problem, beside those of a reference; stored beams of the same machine
+    share the models made of it."""
+    kept = Kept()
+    first, then = (
+        [
+            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            for part in some
+        ]
+        for some in (parts, before)
+    )
+    return replace(Together.of(first, then), places=how.places, judgement=how.judgement)
 
 
 def kind_of(measured: Measured) -> str:

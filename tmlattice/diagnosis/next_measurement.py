@@ -41,19 +41,23 @@ AMPLITUDE = 1e-3
 
 @dataclass(frozen=True)
 class NextMeasurement:
-    """One more shot, and what it would bring.
+    """What to measure, and what it would bring.
 
     Attributes:
-        launch: x, px, y, py, delta.
+        launch: x, px, y, py, delta of one more shot; None of another kind of measurement.
         settings: of the shot.
         parts: the two hypotheses, as texts.
         separation: between them, in standard deviations.
+        kind: of measurement.
+        minutes: of machine time that it takes; None of a shot.
     """
 
-    launch: dict[str, float]
+    launch: dict[str, float] | None
     settings: Settings
     parts: tuple[str, str]
     separation: float
+    kind: str = "trajectory"
+    minutes: float | None = None
 
     def as_json(self) -> dict[str, object]:
         """As it stands in the diagnosis."""
@@ -62,6 +66,7 @@ class NextMeasurement:
             "settings": {name: dict(value) for name, value in self.settings.items()},
             "between": list(self.parts),
             "separation_sigma": self.separation,
+            **({} if self.minutes is None else {"kind": self.kind, "minutes": self.minutes}),
         }
 
 

@@ -19,16 +19,15 @@ from tmlattice.diagnosis.background import SmallErrors
 from tmlattice.diagnosis.common import sought_in
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
-    credible,
     findings_of,
     sensitivity,
     unexplained,
     verdict_of,
     with_consequences,
 )
+from tmlattice.diagnosis.next_kind import leading
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
-from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
@@ -44,6 +43,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
+from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -146,7 +146,7 @@ def diagnose(
         noise=noise,
         noise_estimated=ready.estimated,
         provenance={
-            "package": _version(),
+            "package": __version__,
             "lattice": ring.name,
             "measurement": measurement.lattice,
             "options": options,
@@ -161,12 +161,6 @@ def diagnose(
         prior_errors={} if small is None else small.open,
         view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
     )
-
-
-def _version() -> str:
-    from tmlattice import __version__
-
-    return __version__
 
 
 # --- what is told ----
@@ -271,7 +265,7 @@ def _held_out(
     fits = (explanation.before, explanation.fit)[: len(told.estimates)]
     for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
         try:
-            unknown = small.unknown(one, seen, problem(errors, ()))
+            unknown = small.unknown(one, seen, problem(errors, ()), errors)
         except BeamLostError as error:
             said.append(f"{error}: the held-out shots do not judge the gap")
             return None
@@ -298,16 +292,13 @@ def _left_out(
 def _next(
     ring: Ring, ready: Prepared, explanation: Explanation, seed: int
 ) -> NextMeasurement | None:
-    for named in explanation.named:
-        first, *others = credible(named.rivals, ready.problem.judgement.mass)[0]
-        done = remedy_of(ring, first.cause)
-        other = next((rival for rival in others if remedy_of(ring, rival.cause) != done), None)
-        if other is not None:  # which of two mechanisms with one remedy it is changes nothing
-            data = ready.problem.data
-            try:
-                return next_measurement(ring, data, first, other, ready.known, seed)
-            except TmlatticeError:
-                log.warning("no next measurement could be found", exc_info=True)
+    pair = leading(ring, explanation, ready.problem.judgement.mass)
+    if pair is None:
+        return None
+    try:
+        return next_measurement(ring, ready.problem.data, *pair, ready.known, seed)
+    except TmlatticeError:
+        log.warning("no next measurement could be found", exc_info=True)
     return None
 
 

@@ -34,7 +34,6 @@ from tmlattice.effects.effect import (
     CATALOGUE,
     Effect,
     LaunchEffect,
-    Monitors,
     ReadingEffect,
     RingEffect,
     find,
@@ -43,6 +42,7 @@ from tmlattice.effects.effect import (
     register,
 )
 from tmlattice.effects.radiation import expected_loss, expected_radiation
+from tmlattice.effects.reading import Monitors
 from tmlattice.effects.sizes import background_rms, rare
 
 __all__ = [

@@ -7,7 +7,6 @@ To add an effect, write a class of one of them and `register` it: see docs/new_e
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from tmlattice.effects.build import Build, Where
 from tmlattice.effects.cause import Cause
+from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
@@ -26,6 +26,10 @@ Group = Literal[
     "quadrupoles", "bends", "correctors", "sextupoles", "insertion devices", "monitors", "beam"
 ]
 """Effects that a figure draws in one colour."""
+
+
+LEAST_LEFT = 0.01
+"""Share of a strength below which nothing is left of it."""
 
 
 class Effect(ABC):
@@ -53,6 +57,8 @@ class Effect(ABC):
         calibrates: a file of calibrations may hold it.
         headline: a short report states how little of it would be seen.
         usual: looked for, and drawn by the challenge, where nobody says which effects to take.
+        of_turns: seen in turns of a stored beam alone, and looked for there.
+        whole: its amounts on a machine are whole numbers; a fit finds what is near to one.
         responds: a closed orbit's response to a corrector sees it alone, to first order.
         multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
         quantity: what the amount is of, as a remedy says it ("integrated gradient"); else `words`.
@@ -83,6 +89,8 @@ class Effect(ABC):
     calibrates: ClassVar[bool] = False
     headline: ClassVar[bool] = False
     usual: ClassVar[bool] = True
+    of_turns: ClassVar[bool] = False
+    whole: ClassVar[bool] = False
     responds: ClassVar[bool] = False
     multiplies: ClassVar[bool] = False
     quantity: ClassVar[str] = ""
@@ -108,6 +116,17 @@ class Effect(ABC):
         the quadrupole's own gradient. Most stand for themselves.
         """
         return self.name, 1.0
+
+    def chain(self, amount: float) -> float:
+        """d readings / d amount of what is there, over a signature, which is of more on top of it.
+
+        Where two amounts multiply, as (1 + a)(1 + b), nothing is left at a = -1 that more of the
+        effect could act on: near to it, `LEAST_LEFT` is taken.
+        """
+        if not self.multiplies:
+            return float(self.power * amount ** (self.power - 1))
+        left = 1 + amount
+        return float(1 / np.copysign(max(abs(left), LEAST_LEFT), left))
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.
@@ -295,60 +314,6 @@ class LaunchEffect(Effect):
         """Launches whose weighted mean reading is the reading: weights [node], [node, shot, 6]."""
 
 
-@dataclass
-class Monitors:
-    """What each monitor makes of the beam: all errors at once.
-
-    reading = diag(1 + gain) C Rot(roll) beam + offset, C = [[1, c], [c, 1]], then the swap, then
-    noise; Rot: x_read = x cos + y sin, y_read = -x sin + y cos.
-
-    Attributes:
-        gain, offset: [monitor, 2], relative and m.
-        roll, coupling: [monitor], rad and 1.
-        swapped, silent, frozen: [monitor], true or false.
-    """
-
-    gain: Array
-    offset: Array
-    roll: Array
-    coupling: Array
-    swapped: NDArray[np.bool_]
-    silent: NDArray[np.bool_]
-    frozen: NDArray[np.bool_]
-
-    @classmethod
-    def perfect(cls, count: int) -> "Monitors":
-        """Monitors that read where the beam is."""
-        plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
-        one = np.zeros(count)
-        return cls(plane, plane.copy(), one, one.copy(), flag, flag.copy(), flag.copy())
-
-    def copy(self) -> "Monitors":
-        """Monitors of their own with the same errors."""
-        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
-
-    def matrix(self) -> Array:
-        """diag(1 + gain) C Rot(roll), then the swap: d reading / d beam, [monitor, 2, 2]."""
-        cos, sin, c = np.cos(self.roll), np.sin(self.roll), self.coupling
-        turned = np.array([[cos + -c * sin, sin + c * cos], [c * cos - sin, c * sin + cos]])
-        matrix = (1 + self.gain)[:, :, None] * np.moveaxis(turned, -1, 0)
-        matrix[self.swapped] = matrix[self.swapped][:, ::-1]
-        return np.asarray(matrix)
-
-    def constant(self) -> Array:
-        """What they read without a beam, [monitor, 2], m."""
-        return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
-
-    def read(self, beam: Array) -> Array:
-        """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
-
-        A frozen monitor goes on telling what it does: see `machine`.
-        """
-        readings = np.einsum("mij,...mj->...mi", self.matrix(), beam) + self.constant()
-        readings[..., self.silent, :] = np.nan
-        return np.asarray(readings)
-
-
 class Catalogue(dict[str, Effect], Speaks):
     """Effects by name; a name that is not there is answered with the nearest ones."""
 
@@ -395,6 +360,10 @@ def names(chosen: Iterable[str] | None = None) -> list[str]:
     return [name for name in CATALOGUE if name in wanted]
 
 
-def modelled(chosen: Iterable[str] | None = None) -> list[str]:
-    """Those of `names` whose amount can be fitted."""
-    return [name for name in names(chosen) if CATALOGUE[name].modelled]
+def modelled(chosen: Iterable[str] | None = None, turns: bool = False) -> list[str]:
+    """Those of `names` whose amount can be fitted; with what only turns of a stored beam show where
+    there are such."""
+    if chosen is None and turns:
+        chosen = [name for name, effect in CATALOGUE.items() if effect.usual or effect.of_turns]
+    effects = [CATALOGUE[name] for name in names(chosen)]
+    return [one.name for one in effects if one.modelled and (turns or not one.of_turns)]

@@ -5,7 +5,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects.effect import Monitors, ReadingEffect, register
+from tmlattice.effects.effect import ReadingEffect, register
+from tmlattice.effects.reading import Monitors
 
 Array = NDArray[np.float64]
 
@@ -176,6 +177,32 @@ class MonitorSwap(ReadingEffect):
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Exchange the planes (0 does not)."""
         monitors.swapped[at] ^= amount != 0
+
+
+@register
+class MonitorTurnOffset(ReadingEffect):
+    """A monitor that counts its turns from another one than the others do."""
+
+    name = "monitor_turn_offset"
+    words = "monitor that counts its turns off"
+    quantity = "count of turns"
+    remedy = "set the turn count of {}"
+    to_check = "Look at its trigger and at the delay of its turn clock."
+    unit = "turns"
+    sign = "what it calls turn t is the beam's turn t + amount"
+    largest = 3.0
+    curved = True
+    usual = False
+    of_turns = True
+    whole = True
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """Nothing on a turn by itself."""
+        return np.zeros_like(beam)
+
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
+        """Count later."""
+        monitors.late[at] += amount
 
 
 @register

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
-from tmlattice.inference.newton import Fit, Outcome, fit
+from tmlattice.inference.newton import Fit, Outcome, fit, settled
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
 
@@ -63,7 +63,10 @@ def rivals(
     for index in order:
         if not linear[index] >= linear[order[0]] - window:
             break
-        cause = _first_guess(found, int(index))
+        if find(found.hypotheses[index][0]).whole:
+            cause: Cause | None = best_start(problem, others, found.hypotheses[index])
+        else:
+            cause = _first_guess(found, int(index))
         if cause is None or found.hypotheses[index] in have:
             continue
         tried = _with(problem, others, cause, best)
@@ -75,7 +78,7 @@ def rivals(
         have |= {rival.hypothesis for rival in chosen}
         curved = [h for h in hypotheses if find(h[0]).curved and h not in have]
         for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
-            cause = _best_start(problem, others, hypothesis)
+            cause = best_start(problem, others, hypothesis)
             chosen.append(Rival(hypothesis, _with(problem, others, cause, best)))
     return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
 
@@ -113,13 +116,21 @@ def _with(problem: Problem, others: Fit, cause: Cause, hopeless: float) -> Fit:
     )  # fmt: skip
 
 
-def _best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
+def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
     """The amount, out of a few, that leaves least when the nuisances follow."""
-    largest = find(hypothesis[0]).largest
-    causes = [Cause(*hypothesis, share * largest) for share in problem.judgement.starts]
+    effect = find(hypothesis[0])
+    starts = [share * effect.largest for share in problem.judgement.starts]
+    if effect.whole:
+        starts = [float(n * side) for n in range(1, int(effect.largest) + 1) for side in (1, -1)]
+    causes = [Cause(*hypothesis, amount) for amount in starts]
     left = []
     for cause in causes:
-        point = problem.at((*others.causes, cause), others.nuisances, others.kicks)
+        there = (*others.causes, cause)
+        if effect.whole:  # far from nothing: what the nuisances were without it says little
+            point = settled(problem, there, others.nuisances)
+            left.append(point.chi2)
+            continue
+        point = problem.at(there, others.nuisances, others.kicks)
         clean = others.projection.out(np.nan_to_num(point.residual, nan=1e3))
         left.append(float(clean @ clean))
     return causes[int(np.argmin(left))]

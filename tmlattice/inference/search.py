@@ -54,6 +54,7 @@ class Search:
         names_first: what has a name goes before a free kick. Else that is tried where a free kick
             took what a name nearly explains, and the evidence decides.
         enough: chi-square at which nothing is left to be explained, and no further look is taken.
+        granted: hypotheses of which it is decided already that something is there.
         seed: of the threshold's simulation.
         progress: told what was found.
     """
@@ -65,6 +66,7 @@ class Search:
     by_evidence: bool = False
     names_first: bool = False
     enough: float = -np.inf
+    granted: frozenset[Hypothesis] = frozenset()
     seed: int = 0
     progress: Callable[[str], None] = lambda _: None
 
@@ -254,8 +256,8 @@ def _options(search: Search, state: State, look: Look) -> list[Option]:
     statistic = float(look.named.statistic.max(initial=0.0))
     rate = judge.rate("named")
     detection = Detection(statistic, look.named.threshold(rate), look.named.p_value(statistic))
-    if detection.p_value < rate:
-        top = look.named.hypotheses[int(look.named.statistic.argmax())]
+    top = look.named.hypotheses[int(look.named.statistic.argmax())] if statistic > 0 else None
+    if top is not None and top not in search.granted and detection.p_value < rate:
         freedom = problem.certainty(state.fit.point, top)
         detection = Detection(
             statistic,

@@ -127,8 +127,9 @@ class Machine:
     def _read(self, shots: Shots, chunk: range, turns: int, seed: int) -> Array:
         """Readings of some shots but for what frozen monitors make of them."""
         part = slice(chunk.start, chunk.stop)
-        beam = self.beam(shots.launches[part], turns, shots.settings[part])
-        readings = self.monitors.read(beam)
+        further = turns + self.monitors.ahead
+        beam = self.beam(shots.launches[part], further, shots.settings[part])
+        readings = self.monitors.read(self.monitors.counted(beam, turns))
         for shot, reading in zip(chunk, readings, strict=True):
             noise = stream(seed, "noise", shot).standard_normal(reading.shape)
             reading += self.noise * noise  # noqa: PLW2901

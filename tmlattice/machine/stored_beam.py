@@ -181,13 +181,18 @@ def simulate_turns(
         kicked = np.tile([0.0, kick[0], 0.0, kick[1]], (shots, 1))
     beam = Beam(particles, (emittance[0], emittance[1]), float(np.hypot(spread, own)))
     each = _settings(settings, shots)
+    monitors, further = machine.monitors, turns + machine.monitors.ahead
     readings = np.stack(
         [
-            turns_of(machine.engine, kicked[i], turns, each[i], beam, stream(seed, "particles", i))
+            turns_of(
+                machine.engine, kicked[i], further, each[i], beam, stream(seed, "particles", i)
+            )
             for i in range(shots)
         ]
     )
-    readings = machine.read(readings)
+    # before its kick the beam is on its orbit
+    orbit = _orbits(machine, each)[:, None] if (monitors.late < 0).any() else np.nan
+    readings = machine.read(monitors.counted(readings, turns, orbit))
     frozen = machine.monitors.frozen
     sigma, known = _noise(noise, len(ring.monitors))
     for i, reading in enumerate(readings):

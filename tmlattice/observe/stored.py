@@ -9,6 +9,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,10 @@ class Stored(Steady):
         data, errors: what was read and its noise, of the kind's shape.
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
         kept: models made a moment ago; those of the same ring may share one.
+        counts: whether turn by turn is read.
     """
+
+    counts: ClassVar[bool] = False
 
     ring: Ring = field(repr=False)
     states: tuple[tuple[Settings, float], ...]
@@ -119,6 +123,14 @@ class Stored(Steady):
     def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """The kind's readings [..., *shape] of what each state shows, or of changes of that, with
         any axes in front; linear."""
+
+    def counted(self, states: Sequence[Moved], late: Array) -> list[Moved]:
+        """What is shown, or changes of it, where monitors [monitor] count turns from later ones."""
+        return list(states)
+
+    def a_turn_on(self, states: Sequence[Moved]) -> list[Moved]:
+        """What a turn later at every monitor changes of that, to first order."""
+        raise NotImplementedError("this kind of measurement has no turns")
 
     @property
     def values(self) -> Array:
@@ -141,8 +153,9 @@ class Stored(Steady):
 
     # --- the model ------------------------------------------------------------------------------
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """A stored beam has no launch."""
-        return not isinstance(find(hypothesis[0]), LaunchEffect)
+        """A stored beam has no launch, and only where turns are read their count."""
+        effect = find(hypothesis[0])
+        return not isinstance(effect, LaunchEffect) and (self.counts or not effect.of_turns)
 
     def view(self, causes: Sequence[Cause]) -> Beams:
         """A closed orbit for each state."""
@@ -153,7 +166,8 @@ class Stored(Steady):
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Monitors' errors and all."""
         matrix, constant = view.monitors.matrix(), view.monitors.constant()
-        return self.told([_seen(b.shown, matrix, constant) for b in view.beams], nuisances)
+        shown = self.counted([b.shown for b in view.beams], view.monitors.late)
+        return self.told([_seen(one, matrix, constant) for one in shown], nuisances)
 
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
         """Effects on the ring in closed form, those of monitors by differences."""
@@ -167,7 +181,8 @@ class Stored(Steady):
             for beam in view.beams:
                 if id(beam) not in known:
                     known[id(beam)] = _seen(beam.moved(some), matrix)
-            out[on_ring] = self.told([known[id(beam)] for beam in view.beams], nuisances)
+            moved = self.counted([known[id(beam)] for beam in view.beams], view.monitors.late)
+            out[on_ring] = self.told(moved, nuisances)
         place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
         for name in dict.fromkeys(name for name, _ in hypotheses):
             effect = find(name)
@@ -181,6 +196,10 @@ class Stored(Steady):
 
     def _of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
         """d readings / d amount of an effect on top, every monitor's own."""
+        own = self.counted([b.shown for b in view.beams], view.monitors.late)
+        if effect.of_turns:
+            matrix = view.monitors.matrix()
+            return self.told([_seen(one, matrix) for one in self.a_turn_on(own)], nuisances)
         high = 1.0 if effect.discrete else SMALL * effect.largest
         low = 0.0 if effect.discrete else -high
         ends = []
@@ -191,8 +210,7 @@ class Stored(Steady):
             ends.append((monitors.matrix(), monitors.constant()))
         (upper, up), (lower, down) = ends
         slope, constant = ((a - b) / (high - low) for a, b in ((upper, lower), (up, down)))
-        shown = [_seen(b.shown, slope, constant, tunes=0.0) for b in view.beams]
-        return self.told(shown, nuisances)
+        return self.told([_seen(one, slope, constant, tunes=0.0) for one in own], nuisances)
 
 
 def _seen(shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0) -> Moved:

@@ -8,14 +8,15 @@ touches, ratios of amplitudes, and in the other plane coupling.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.stored import Moved
-from tmlattice.effects import Settings
+from tmlattice.effects import Settings, find
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.problem import Point
+from tmlattice.inference.problem import Hypothesis, Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
@@ -43,7 +44,33 @@ class ManyTurns(Stored):
         said: what could not be used of the turns, a sentence each.
     """
 
+    counts: ClassVar[bool] = True
     said: tuple[str, ...] = ()
+
+    def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """What is wrong with a monitor may be its count of turns."""
+        return [h for h in among if find(h[0]).of_turns and h[1] == hypothesis[1]]
+
+    @property
+    def _turn(self) -> Array:
+        """Phase of both lines in a turn, [shot, mode], rad, as it was read: the amplitude moves it.
+        The nearer way round: that is what stands between two whole turns."""
+        return np.asarray(2 * np.pi * ((self.data[:, -2:] + 0.5) % 1 - 0.5))
+
+    def counted(self, states: Sequence[Moved], late: Array) -> list[Moved]:
+        """By the phase of so many turns."""
+        if not late.any():
+            return list(states)
+        turned = np.exp(1j * late[:, None, None] * self._turn[:, None, None, :])
+        own = zip(states, turned, strict=True)
+        return [replace(state, modes=state.modes * by) for state, by in own]
+
+    def a_turn_on(self, states: Sequence[Moved]) -> list[Moved]:
+        """Its phase, in every mode."""
+        return [
+            Moved(np.zeros_like(one.orbit), np.zeros_like(one.tunes), 1j * phase * one.modes)
+            for one, phase in zip(states, self._turn, strict=True)
+        ]
 
     @property
     def first(self) -> Array:

@@ -5,7 +5,9 @@
 
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
+from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
+from tmlattice.report.tables import LARGE_TITLE, NUMBERS, large_text, number_rows
 from tmlattice.report.text import (
     advice,
     closed_text,
@@ -13,7 +15,6 @@ from tmlattice.report.text import (
     finding_rows,
     gap_rows,
     left_text,
-    next_text,
     noise_text,
     sensitivity_rows,
     small_rows,
@@ -25,6 +26,9 @@ from tmlattice.report.text import (
 )
 
 WIDTH = 100
+
+MOST = 8
+"""Tunes that are listed; the page has all."""
 
 SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 
@@ -66,6 +70,8 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         if rows:
             lines += ["", "Would have been seen, at half of the places where it can sit, from:"]
             lines += columns(rows, "   ")
+    if large := large_text(diagnosis):
+        lines += ["", *wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width)]
     for warning in diagnosis.warnings:
         lines += ["", *wrapped(warning, "Note: ", width)]
     return "\n".join(lines)
@@ -76,7 +82,12 @@ def _gap_table(diagnosis: Diagnosis) -> list[str]:
     rows = [
         ("readings less model, rms", "before", "after"),
         *gap_rows(diagnosis),
-        ("noise of a reading", noise_text(diagnosis), ""),
         ("fractional tunes Qx, Qy", before, after),
     ]
-    return columns(rows)
+    noise = noise_text(diagnosis)
+    lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows)
+    numbers = number_rows(diagnosis)
+    if numbers:
+        lines += ["", *columns([NUMBERS, *numbers[:MOST]])]
+        lines += [f"and {len(numbers) - MOST} more"] if len(numbers) > MOST else []
+    return lines

@@ -11,9 +11,10 @@ import numpy as np
 
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.effects import Cause, find
+from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.amounts import amount_text, scaled, words
+from tmlattice.report.text import HARDLY, NOT_HELD_OUT
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
 """By the group of an effect; all other elements are magnets."""
@@ -139,6 +140,57 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     ]
 
 
+NUMBERS = ("tunes", "read", "design", "as found")
+"""Head of `number_rows`."""
+
+
+def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
+    """Tunes and chromaticities: (which, read with its error, of the design, of the ring as found).
+
+    With the measurement and the shot where there are several.
+    """
+    rows: list[tuple[str, ...]] = []
+    told = [part for part in diagnosis.parts if part.numbers]
+    for part in told:
+        several = len({number.shot for number in part.numbers}) > 1
+        for number in part.numbers:
+            kind, _, plane = number.quantity.partition("_")
+            name = f"Q{plane}" if kind == "tune" else f"chromaticity {plane}"
+            name += f", shot {number.shot + 1}" if several else ""
+            name = f"{part.label}: {name}" if len(told) > 1 else name
+            digits = _digits(number.error)
+            read, *models, error = (
+                f"{value:.{digits}f}"
+                for value in (number.read, number.before, number.after, number.error)
+            )
+            rows.append((name, f"{read} ± {error}", *models))
+    return rows
+
+
+LARGE = 3.0
+"""Times the usual size, from which on small errors are no longer what a sound ring has."""
+
+
+def large_text(diagnosis: Diagnosis) -> str:
+    """Small errors that are larger than a sound ring's: single faults may pass for them."""
+    if diagnosis.by_steps:
+        return ""
+    large = []
+    for name, rms in diagnosis.priors.items():
+        usual = CATALOGUE[name].background if name in CATALOGUE else None
+        if usual and rms > LARGE * usual and diagnosis.prior_errors.get(name, 0.0) < HARDLY:
+            large.append(f"{words(name)} ({rms / usual:.2g} times)")
+    if not large:
+        return ""
+    return (
+        f"{', '.join(large)}: faults may hide among them; a measurement of this machine from "
+        "before (--reference) would show them"
+    )
+
+
+LARGE_TITLE = "small errors larger than usual"
+
+
 def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """All that limits what was said, in one place: (what, text).
 
@@ -148,6 +200,11 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
     """
     for warning in diagnosis.warnings:
         yield "warning", warning
+    if diagnosis.heldout is None:
+        what, _, judges = NOT_HELD_OUT.partition(": ")
+        yield what.lower(), judges
+    if large := large_text(diagnosis):
+        yield LARGE_TITLE, large
     if diagnosis.bad_monitors:
         yield "bad monitors, left out", ", ".join(diagnosis.bad_monitors)
     if diagnosis.left_out:

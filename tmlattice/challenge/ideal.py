@@ -1,0 +1,157 @@
+"""What the data of any kinds allow, and what plain methods make of them.
+
+The oracle knows the noise and the sizes of the small errors exactly, and that there is one cause.
+It weighs every hypothesis by its fall of chi-square, the leading ones refitted through the full
+model. Plain methods know the design, the noise and the nuisances; each names three suspects.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.challenge.baselines import SUSPECTS, Guesses, pursuits
+from tmlattice.challenge.case import Case, Truth, ring_of
+from tmlattice.challenge.kinds import problem_of
+from tmlattice.challenge.oracle import CLASS, LISTED, REFINED
+from tmlattice.effects import Cause, find, modelled
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.rivals import best_start
+from tmlattice.inference.scan import Scan, scan
+
+Array = NDArray[np.float64]
+
+FAR = 60.0
+"""Chi-square behind the best of the scan from which on a hypothesis is not refitted."""
+
+MOST_NUMBERS = 2**27
+"""Of all signatures: a gigabyte; plain methods are not asked about more."""
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Every hypothesis about one case.
+
+    Attributes:
+        problem: rows in the covariance of noise and small errors.
+        start: nuisances alone.
+        seen: the scan about it.
+        statistic: fall of chi-square within the largest fault, [hypothesis].
+        amount: that does it, [hypothesis].
+    """
+
+    problem: Problem
+    start: Fit
+    seen: Scan
+    statistic: Array
+    amount: Array
+
+
+def judge_kinds(argument: tuple[Case, Truth]) -> dict[str, Any]:
+    """What the oracle says of a case of kinds, as `oracle.judge` says it."""
+    case, truth = argument
+    said = _said(weighed(case, truth))
+    return {"oracles": [said], "residual": None}
+
+
+def weighed(case: Case, truth: Truth) -> Weighed:
+    """The hypotheses about a case, the leading ones refitted."""
+    ring = ring_of(case.lattice)
+    problem = problem_of(ring, case.measured, case.before, truth.background)
+    start = fit(problem, (), problem.first)
+    hypotheses = _hypotheses(case, problem)
+    seen = scan(problem.metric(start.point), hypotheses, start.residual)
+    reach = np.array([find(n).largest ** find(n).power for n, _ in hypotheses])
+    amount = np.clip(seen.amount, -reach, reach)
+    discrete = np.array([find(n).discrete for n, _ in hypotheses])
+    inner = seen.amount * seen.information
+    amount = np.where(discrete & (seen.information > 0), 1.0, amount)
+    statistic = 2 * amount * inner - amount**2 * seen.information
+    power = np.array([find(n).power for n, _ in hypotheses])
+    amount = np.sign(amount) * np.abs(amount) ** (1 / power)
+    order = np.argsort(-statistic)[:REFINED]
+    for h in order[statistic[order] > statistic.max() - FAR]:
+        if discrete[h] or not amount[h]:
+            continue
+        name, place = hypotheses[h]
+        guess = Cause(name, place, float(amount[h]))
+        if find(name).whole:
+            guess = best_start(problem, start, hypotheses[h])
+        again = fit(problem, [guess], start.nuisances)
+        if again.good and abs(again.causes[0].amount) <= find(name).largest:
+            statistic[h] = start.chi2 - again.chi2
+            amount[h] = again.causes[0].amount
+    return Weighed(problem, start, seen, statistic, amount)
+
+
+def _hypotheses(case: Case, problem: Problem) -> list[Hypothesis]:
+    ring = ring_of(case.lattice)
+    return [
+        (name, place) for name in modelled(case.options.get("effects"), turns=True)
+        for place in find(name).places(ring) if problem.sees((name, place))
+    ]  # fmt: skip
+
+
+def _said(found: Weighed) -> dict[str, Any]:
+    statistic, problem = found.statistic, found.problem
+    hypotheses = found.seen.hypotheses
+    weight = statistic / 2 + np.array([problem.prior(h) for h in hypotheses])
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    by_weight = np.argsort(-weight)[:LISTED]
+    by_likelihood = np.argsort(-statistic)[:LISTED]
+
+    def listed(some: NDArray[np.intp]) -> list[dict[str, Any]]:
+        return [
+            {
+                "effect": hypotheses[h][0], "element": hypotheses[h][1],
+                "statistic": float(statistic[h]), "amount": float(found.amount[h]),
+                "probability": float(weight[h]),
+            }
+            for h in some
+        ]  # fmt: skip
+
+    top = float(statistic.max())
+    threshold = found.seen.threshold(DEFAULT.false_alarm)
+    return {
+        "statistic": top,
+        "threshold": threshold,
+        "detected": bool(top > threshold),
+        "class_size": int((statistic > top - CLASS).sum()),
+        "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
+        "posterior": listed(by_weight),
+    }
+
+
+def plain_kinds(case: Case) -> dict[str, Guesses]:
+    """First guesses of a case of kinds by method, as of `baselines`, but for the network."""
+    problem = problem_of(ring_of(case.lattice), case.measured, case.before, {})
+    start = fit(problem, (), problem.first)
+    hypotheses = _hypotheses(case, problem)
+    if len(hypotheses) * len(start.residual) > MOST_NUMBERS:
+        return {}
+    metric = problem.metric(start.point)
+    rows = np.concatenate(
+        [
+            metric.projection.out(metric.rows(hypotheses[i : i + metric.chunk]))
+            for i in range(0, len(hypotheses), metric.chunk)
+        ]
+    )
+    clean = start.clean
+
+    def guess(order: Sequence[int]) -> Guesses:
+        return [dict(zip(("effect", "element"), hypotheses[i], strict=True)) for i in order]
+
+    out: dict[str, Guesses] = {}
+    gradients = [i for i, (name, _) in enumerate(hypotheses) if name == "quadrupole_gradient"]
+    if gradients:
+        solved = np.linalg.pinv(rows[gradients].T, rcond=1e-2) @ clean
+        out["svd_gradients"] = guess([gradients[i] for i in np.argsort(-np.abs(solved))[:SUSPECTS]])
+    for name, values in pursuits(rows, clean).items():
+        order = np.argsort(-np.abs(values))[:SUSPECTS]
+        out[name] = guess([int(i) for i in order if values[i] != 0])
+    return out

@@ -1,0 +1,251 @@
+"""Cases of any kinds of measurement: what is wrong, what AT makes of it, how clearly it is seen."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.challenge.case import BEFORE, Case, Truth
+from tmlattice.challenge.draw import Draw
+from tmlattice.diagnosis.kinds import How, Measured, part_of, stacked
+from tmlattice.effects import Cause, Effect, LaunchEffect, find, modelled
+from tmlattice.errors import TmlatticeError
+from tmlattice.inference.among import Known, small_errors_of
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.newton import fit
+from tmlattice.inference.problem import Problem
+from tmlattice.lattice import Ring
+from tmlattice.machine import simulate, stored_beam
+from tmlattice.machine.response import NOISE, simulate_response
+from tmlattice.machine.shots import stream
+
+Array = NDArray[np.float64]
+
+TIER_KINDS: Mapping[str, tuple[str, ...]] = {
+    "R": ("orbit_response",),
+    "T": ("turn_by_turn",),
+    "P": ("orbit_response",),
+    "M": ("trajectory", "turn_by_turn", "closed_orbit", "dispersion", "tunes"),
+}
+"""What is measured in a tier; of several, M draws two or three for each case."""
+
+FAINTER, LOUDER = 0.5, 2.0
+"""The noise of a case in units of what the kind usually has, log-uniform."""
+
+TURNS = 500
+"""Of the stored beam."""
+
+HALVES = 6
+"""How often a largest fault that no stored beam survives is halved."""
+
+READING_NOISE = 2e-5
+"""m; of a first turn."""
+
+CHANGES = (
+    ("quadrupole_gradient",), ("family_gradient",), ("insertion_device_focusing",),
+    ("sextupole_strength",), ("corrector_calibration",), ("monitor_gain_x", "monitor_gain_y"),
+)  # fmt: skip
+"""What a pair may differ by, drawn evenly; of sextupoles all of a family."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is made of every case.
+
+    Attributes:
+        tier: of the challenge.
+        lattice, ring: what `load_ring` takes, and what it makes of it.
+        seed: of the challenge.
+        kinds: see `TIER_KINDS`.
+        effects: drawn from these; None: from all usual ones.
+        shots: of first turns, and kicks of a stored beam.
+        signal, amount: see `Draw`.
+        background: rms of small errors by effect.
+        told: the diagnosis is told them.
+    """
+
+    tier: str
+    lattice: str
+    ring: Ring
+    seed: int
+    kinds: tuple[str, ...]
+    effects: tuple[str, ...] | None
+    shots: int
+    signal: tuple[float, float]
+    amount: float | None
+    background: Mapping[str, float]
+    told: bool
+
+
+# --- the machine ----------------------------------------------------------------------------------
+def measure(
+    kind: str, ring: Ring, causes: Sequence[Cause], noise: float, shots: int, **own: Any
+) -> Measured:
+    """One measurement of a machine by AT.
+
+    Args:
+        kind: of measurement.
+        ring: the design.
+        causes: what is wrong with it.
+        noise: in units of what the kind usually has.
+        shots: of first turns and of turns.
+        own: background, seed and machine_seed.
+
+    Raises:
+        TmlatticeError: no beam survives them.
+    """
+    fine = tuple(noise * rms for rms in NOISE)
+    made: Mapping[str, Callable[[], Any]] = {
+        "trajectory": lambda: simulate(
+            ring, causes, shots=shots, noise=noise * READING_NOISE, **own
+        ).measurement(),
+        "turn_by_turn": lambda: stored_beam.simulate_turns(
+            ring, causes, shots=shots, turns=TURNS, noise=noise * stored_beam.TURN_NOISE, **own
+        ).measured,
+        "closed_orbit": lambda: stored_beam.simulate_orbits(
+            ring, causes, noise=fine, **own
+        ).measured,
+        "dispersion": lambda: stored_beam.simulate_dispersion(
+            ring, causes, noise=fine, **own
+        ).measured,
+        "tunes": lambda: stored_beam.simulate_tunes(
+            ring, causes, noise=[noise * rms for rms in stored_beam.TUNE_NOISE], **own
+        ).measured,
+        "orbit_response": lambda: simulate_response(
+            ring, causes, noise=fine, progress=False, **own
+        ).measured,
+    }  # fmt: skip
+    measured: Measured = made[kind]()
+    return measured
+
+
+# --- rows -----------------------------------------------------------------------------------------
+def problem_of(
+    ring: Ring,
+    measured: Mapping[str, Measured],
+    before: Mapping[str, Measured],
+    background: Mapping[str, float],
+) -> Problem:
+    """Measurements as rows, among small errors of known sizes where there are any."""
+    places = {name: float(max(len(find(name).places(ring)), 1)) for name in modelled(turns=True)}
+    how = How(ring, places, DEFAULT)
+    first, then = (
+        [part_of(label, one, how) for label, one in some.items()] for some in (measured, before)
+    )
+    problem = stacked(first, then, how)
+    if not background:
+        return problem
+    everywhere = [
+        (name, place) for name in background for place in find(name).places(ring)
+        if problem.sees((name, place))
+    ]  # fmt: skip
+    known = Known.usual(everywhere, background)
+    return small_errors_of(problem, known, problem.first, learn=False).problem
+
+
+class Ruler:
+    """Signal to noise by the model: the finite change of all rows, nuisances projected out.
+
+    Args:
+        problem: of a machine without the fault.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.start = fit(problem, (), problem.first)
+
+    def of(self, causes: Sequence[Cause]) -> float:
+        """NaN where no beam is stored."""
+        seen = [c for c in causes if self.problem.sees((c.effect, c.element))]
+        point = self.problem.at(seen, self.start.nuisances)
+        if point.lost:
+            return float("nan")
+        change = self.start.projection.out(self.start.residual - point.residual)
+        return float(np.linalg.norm(change))
+
+
+# --- a case ---------------------------------------------------------------------------------------
+def kinds_case(asked: Asked, number: int, name: str) -> tuple[Case, Truth, Draw]:
+    """The public and the secret part of a case, and what was drawn in vain."""
+    random = stream(asked.seed, "challenge", asked.tier, number)
+    seed = int(random.integers(2**31))
+    noise = float(np.exp(random.uniform(np.log(FAINTER), np.log(LOUDER))))
+    kinds = asked.kinds
+    if asked.tier == "M" and len(kinds) > 2:
+        some = random.permutation(len(kinds))[: int(random.integers(2, 4))]
+        kinds = tuple(kinds[i] for i in sorted(some))
+    ring, background = asked.ring, dict(asked.background)
+    pair = asked.tier == "P"
+
+    def machine(causes: Sequence[Cause], again: int) -> dict[str, Measured]:
+        own: dict[str, Any] = {"seed": seed + again, "machine_seed": seed}
+        if background:
+            own["background"] = background
+        return {kind: measure(kind, ring, causes, noise, asked.shots, **own) for kind in kinds}
+
+    healthy = machine((), 1)
+    draw = Draw(random, asked.signal, asked.amount, HALVES)
+    causes: tuple[Cause, ...] = ()
+    alone: dict[str, float] = {}
+    total, measured = 0.0, healthy
+    if asked.tier != "E":
+        ruler = Ruler(problem_of(ring, healthy, healthy if pair else {}, background))
+        causes, measured = _drawn(asked, draw, ruler, lambda some: machine(some, 0))
+        total = ruler.of(causes)
+        if len(kinds) > 1:
+            for kind in kinds:
+                own = Ruler(problem_of(ring, {kind: healthy[kind]}, {}, background))
+                alone[kind] = own.of(causes)
+    parts = {**measured, **({BEFORE + kind: healthy[kind] for kind in kinds} if pair else {})}
+    options = {"background": background} if background and asked.told else {}
+    case = Case(name, asked.lattice, parts, options, kinds)
+    sizes = (total,) if len(causes) == 1 else ()
+    truth = Truth(
+        name, asked.tier, causes, None, sizes, total, background, 0.0, noise, seed, {}, {}, alone,
+    )  # fmt: skip
+    return case, truth, draw
+
+
+def _drawn(
+    asked: Asked,
+    draw: Draw,
+    ruler: Ruler,
+    machine: Callable[[Sequence[Cause]], dict[str, Measured]],
+) -> tuple[tuple[Cause, ...], dict[str, Measured]]:
+    """What is wrong, and what is measured of it."""
+    for _ in range(100):
+        causes = _pair(asked, draw, ruler) if asked.tier == "P" else _single(asked, draw, ruler)
+        if causes is None:
+            continue
+        try:
+            return causes, machine(causes)
+        except TmlatticeError:  # no beam survives it in AT
+            draw.unreachable.append((causes[0].effect, causes[0].element, float("nan")))
+    raise TmlatticeError("no fault leaves a beam that can be measured; take a smaller signal")
+
+
+def _single(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...]:
+    def places(effect: Effect) -> Sequence[str | None]:
+        return [p for p in effect.places(asked.ring) if ruler.problem.sees((effect.name, p))]
+
+    chosen = modelled(asked.effects, "turn_by_turn" in asked.kinds)
+    usual = [name for name in chosen if not isinstance(find(name), LaunchEffect)]
+    return (draw.one(ruler, usual, places),)
+
+
+def _pair(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...] | None:
+    random, ring = draw.random, asked.ring
+    names = CHANGES[int(random.integers(len(CHANGES)))]
+    effect = find(names[int(random.integers(len(names)))])
+    places: list[str | None] = list(effect.places(ring))
+    if effect.name not in (asked.effects or names) or not places:
+        return None
+    place = places[int(random.integers(len(places)))]
+    some = [place]
+    if effect.name == "sextupole_strength" and place is not None:
+        family = ring[place].family
+        some = [p for p in places if p is not None and ring[p].family == family]
+    cap = effect.largest * float(random.choice([-1.0, 1.0]))
+    return draw.sized(ruler, [Cause(effect.name, p, cap) for p in some], draw.target())
