@@ -13,6 +13,7 @@ from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import MeasurementError
+from tmlattice.machine.response import simulate_response
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 from tmlattice.optics import matrix_tunes
@@ -177,6 +178,17 @@ def test_what_was_there_before_is_nothing_now(small_ring, make):
     for reference in (after, before) if make is not _turns else (after,):  # seconds each
         found = diagnose(small_ring, after, reference=reference)
         assert (found.verdict, found.findings) == ("nothing", ())
+
+
+def test_a_corrector_that_is_held_out_is_named_too(small_ring):
+    """It was `nothing`, with 69 times the noise's square in the held-out readings."""
+    wrong = [Cause("corrector_calibration", "v3", 0.2)]
+    made = {"engine": "ocelot", "progress": False, "seed": 1}
+    response = simulate_response(small_ring, wrong, **made).measured
+    both = {"response": response, "dispersion": _dispersion(small_ring, wrong)}
+    (found,) = diagnose(small_ring, both, seed=0).findings  # which holds v3 out
+    assert (found.effect, found.element) == ("corrector_calibration", "v3")
+    assert abs(found.amount - 0.2) < 4 * found.amount_sigma
 
 
 def test_the_command_takes_many_folders(small_ring, tmp_path):

@@ -54,6 +54,9 @@ Array = NDArray[np.float64]
 MOST_OF_IT = 0.5
 """Share of the gap that one cause has to make to be put aside before sizes are learnt."""
 
+MISSING = 1.5
+"""Chi-square per held-out reading from which on `nothing` is not said alone."""
+
 CROWDED = 1.5
 """What half of the monitors leave at least of their noise where a few causes with names were tried,
 from which on nothing without a name is: errors are everywhere."""
@@ -293,6 +296,9 @@ def _told(
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     heldout = held_out(parts, problem.fixed, stages, aside, since)
+    if verdict == "nothing" and heldout and (left := heldout.misfits[-1].chi2_per_dof) > MISSING:
+        said = (*said, f"held-out readings leave {np.sqrt(left):.1f} times the noise: something is "
+                "there that the fitted ones do not see")  # fmt: skip
     told = (f"{part.label}: {one}" for part in parts for one in part.said)
     warnings = [*told, *spikes(parts, problem, found), *said]
     repaired = apply(ring, causes)

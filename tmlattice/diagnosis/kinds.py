@@ -144,11 +144,12 @@ def _response(label: str, kind: str, measured: Any, how: How) -> Part:
         whole = Response(base=base, used=there, places=how.places, judgement=how.judgement)
         return Part(label, kind, whole, said=said)
     split = split_columns(data, min(how.holdout, 0.2), np.random.default_rng(how.seed))
-    held = np.append(split.held[:-1], False)
+    held = np.append(split.held[:-1], False)[:, None]
+    # a held-out corrector gives half of its monitors: nothing else tells what it does itself
     fitted, judges = (
-        Response(base=base, used=there & which[:, None, None], places=how.places,
+        Response(base=base, used=there & which[:, :, None], places=how.places,
                  judgement=how.judgement)
-        for which in (~held, held)
+        for which in (~held | split.half, held & ~split.half)
     )  # fmt: skip
     return Part(label, kind, fitted, judges, said=said)
 
