@@ -1,13 +1,13 @@
 """Measured responses of real rings: `TMLATTICE_DATA=... python benchmarks/real_rings.py [NAME]`.
 
-Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed by the
-commands, with default options, one after another; PETRA III's folder is diagnosed as it is. Told
+Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed, with
+default options, one after another; PETRA III's folder is diagnosed as it is. Told
 are the rms of held-out correctors, in plane, in the other plane (with a roll of their own where
 that was weighed) and of the RF's orbit, in micrometres: of the lattice and of the result; beside
 them what the experts' own LOCO fit leaves of all the data that it was fitted to (its last model,
 in the file). Then the steps, kept and refused. `--iteration first` takes the model as it was
 before that fit; `--seed N` another split, `--seeds N` that many of them; `--json FILE` writes the
-table.
+table, `--pictures FOLDER` a picture a ring: what is left before and after, and the gradients.
 """
 
 import argparse
@@ -19,10 +19,18 @@ import tempfile
 import time
 from pathlib import Path
 
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
 import numpy as np
 
+import tmlattice
 from tmlattice import read_measurement
+from tmlattice.errors import TmlatticeError
 from tmlattice.lattice.mat_file import read_mat
+from tmlattice.plots.response import plot_gradients, plot_left
+from tmlattice.report.page import shrink
 
 MICRO = 1e6
 
@@ -85,30 +93,49 @@ def ring(name, files, data, place, options):
     if files and files[0].name.endswith(".loco.mat"):
         row["experts"] = experts(files[0])
     row["noise"] = MICRO * float(np.nanmedian(read_measurement(folder).noise))
-    every = [_diagnosed(lattice, folder, place / f"{name}.json", seed)
-             for seed in range(options.seed, options.seed + options.seeds)]  # fmt: skip
+    every = []
+    for seed in range(options.seed, options.seed + options.seeds):
+        every.append(_diagnosed(lattice, folder, seed, None if every else options.pictures, name))
     row["seeds"] = [one.get("error") or one["steps"][-1] for one in every]
     return row | every[0]
 
 
-def _diagnosed(lattice, folder, result, seed):
-    done, seconds = command("diagnose", lattice, folder, "--json", result, "-q", "--seed", seed)
-    if done.returncode:
-        return {"error": done.stderr.strip().splitlines()[-1], "seconds": seconds}
-    found = json.loads(result.read_text(encoding="utf-8"))
+def _diagnosed(lattice, folder, seed, pictures, name):
+    begun = time.process_time()
+    try:
+        ring = tmlattice.load_ring(lattice)
+        found = tmlattice.diagnose(ring, read_measurement(folder), seed=seed)
+    except TmlatticeError as error:
+        return {"error": str(error), "seconds": time.process_time() - begun}
+    seconds = time.process_time() - begun
+    if pictures:
+        picture(found, pictures / f"real-{name}.png")
     return {
-        "verdict": found["verdict"],
-        "seconds": found["provenance"]["seconds"],
-        "fit": MICRO * found["gap"]["fit"]["after"]["rms"],
-        "steps": [_step(step) for step in found["steps"]],
-        "refused": [_step(step) for step in found["refused"]],
-        "warnings": found["warnings"],
+        "verdict": found.verdict,
+        "seconds": seconds,
+        "fit": MICRO * found.fit_after.rms,
+        "steps": [_step(step.as_json()) for step in found.steps],
+        "refused": [_step(step.as_json()) for step in found.refused],
+        "warnings": list(found.warnings),
     }
+
+
+def picture(result, path):
+    """What is left before and after, and below it the gradients' errors along the ring."""
+    figure = plt.figure(figsize=(10, 6.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[6, 4])
+    plot_left(result, above)
+    if any(cause.effect == "quadrupole_gradient" for cause in result.causes):
+        plot_gradients(result, below)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+    shrink(path)
 
 
 def _step(step):
     def micro(key):
-        return None if step.get(key) is None else MICRO * step[key]
+        return None if step.get(key) is None or np.isnan(step[key]) else MICRO * step[key]
 
     return {
         "effect": step["effect"],
@@ -171,6 +198,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     if not os.environ.get("TMLATTICE_DATA"):
         sys.exit("TMLATTICE_DATA names no folder of measured data")
@@ -183,9 +211,9 @@ def main():
             rows.append(ring(name, files, data, Path(place), options))
             print(name, rows[-1].get("error", ""), flush=True)
             print(*steps(rows[-1]), sep="\n", flush=True)
+            if options.json:
+                options.json.write_text(json.dumps(rows, indent=2), encoding="utf-8")
     print(*table(rows), *scatter(rows), sep="\n")
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=2), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -4,13 +4,13 @@ Processor time is user + system of the process and its children, s: of the first
 caches (the package's and numba's), and the least of the later calls. The last column names the
 heavy packages that were loaded.
 
-21 November 2026, `python benchmarks/start.py`, two cores, one of them busy; first / later, s; goal:
+22 November 2026, `python benchmarks/start.py`, two cores, both busy; first / later, s; goal:
 
-    --help              0.09 / 0.08   0.15
-    info petra3         2.53 / 1.06   2.5    none of the heavy packages in the later calls
-    simulate            2.97 / 2.20          ocelot, matplotlib, at
-    diagnose            5.63 / 2.87   2.5    ocelot; 1.6 s are the search itself
-    tune-fit --epochs 1 15.6 / 4.62   3.5    torch, ocelot, matplotlib; three figures are 1.8 s
+    --help              0.09 / 0.09   0.15
+    info petra3         2.37 / 1.08   2.5    none of the heavy packages in the later calls
+    simulate            2.92 / 2.35          ocelot, matplotlib, at
+    diagnose            5.56 / 3.40   2.5    ocelot; 2.87 on 21 November with one core free
+    tune-fit --epochs 1 31.7 / 15.3   3.5    all three methods since; the recipe alone was 4.62
 """
 
 import argparse
@@ -26,7 +26,15 @@ HEAVY = ("torch", "torch._dynamo", "ocelot", "matplotlib", "scipy.stats", "panda
 COMMANDS = (
     ("--help",),
     ("info", "petra3"),
-    ("simulate", "petra3", "--effect", "quadrupole_gradient qd::12 -0.2", "--out", "SHOTS"),
+    (
+        "simulate",
+        "petra3",
+        "--effect",
+        "quadrupole_gradient qd::12 -0.2",
+        "--out",
+        "SHOTS",
+        "--force",
+    ),
     ("diagnose", "petra3", "SHOTS"),
     ("tune-fit", "--epochs", "1", "--out", "FIT"),
 )

@@ -116,32 +116,31 @@ def response():
         yield f"response-{name}", figure
 
 
+def together():
+    """Turns, dispersion and tunes of one machine: what was read, and what each leaves."""
+    from tmlattice.machine.stored_beam import simulate_dispersion, simulate_tunes, simulate_turns
+    from tmlattice.plots.parts import plot_parts
+
+    ring, weak = tmlattice.load_ring(SMALL), [Cause("quadrupole_gradient", "QD::5", -0.02)]
+    read = {
+        "turns": simulate_turns(ring, weak).measured,
+        "dispersion": simulate_dispersion(ring, weak).measured,
+        "tunes": simulate_tunes(ring, weak).measured,
+    }
+    yield "read-dispersion", read["dispersion"].plot(ring)
+    yield "read-tunes", read["tunes"].plot(ring)
+    yield "parts", plot_parts(tmlattice.diagnose(ring, read))
+
+
 def real_ring():
     """SOLEIL, 2012: its response less the lattice of the file, and less the ring as found."""
     from tmlattice.importers import bring_in
+    from tmlattice.plots.response import plot_left
 
     path = Path(os.environ["TMLATTICE_DATA"]) / "real_rings" / "soleil_2012-01-20.loco.mat"
     brought = bring_in([path])
-    yield "real_ring", before_and_after(tmlattice.diagnose(brought.ring, brought.measurement))
-
-
-def before_and_after(result):
-    """What is left of each fitted corrector in its own plane, in one scale of colours."""
-    view = result.response
-    plane = np.array([int(p == "y") for p in view.measured.planes])
-    shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True, layout="constrained")
-    limit = 0.0
-    for ax, name, model in zip(axes, ("before", "after"), (view.design, view.model), strict=True):
-        left = 1e6 * (view.data - model)[shown][:, view.good]
-        left = left[np.arange(len(shown)), :, plane[shown]]
-        limit = limit or float(np.percentile(abs(left), 98))
-        image = ax.imshow(left.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
-        ax.set_title(f"{name}: {np.sqrt(np.mean(left**2)):.2g} µm rms", loc="left")
-        ax.set_xlabel("corrector: horizontal, then vertical")
-    axes[0].set_ylabel("monitor, along the ring")
-    figure.colorbar(image, ax=axes, label="measured less model [µm]")
-    return figure
+    figure = plt.figure(figsize=(11, 4.2), layout="constrained")
+    yield "real_ring", plot_left(tmlattice.diagnose(brought.ring, brought.measurement), figure)
 
 
 def report():
@@ -222,7 +221,7 @@ def tables():
     yield "petra3-steps", figure
 
 
-MAKERS = (diagnosis, credible, tunes, optics, response, report, real_ring, tables)
+MAKERS = (diagnosis, credible, tunes, optics, response, together, report, real_ring, tables)
 
 
 def main(names):

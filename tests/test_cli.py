@@ -228,10 +228,14 @@ def test_version_has_one_source(tmp_path):
         (["tune-fit", SMALL, "--out", "/dev/null/folder"], "cannot write"),
         (["tune-fit", SMALL, "--json", "no/such/folder/a.json"], "cannot write"),
         (["tune-fit", SMALL, "--wrong"], "--wrong"),
-        (["tunefit"], "tunefit"),
+        (["tunefit"], "no command 'tunefit'; did you mean 'tune-fit'?"),
+        (["nonsense"], "`tmlattice --help` lists them"),
+        (["simulate", SMALL, "--effect", "quad QD::5 -1", "--out", "y"],
+         "no effect 'quad'; did you mean 'quadrupole_gradient'"),
+        (["diagnose", SMALL, "day", "./day"], "is given twice"),
         (["info", "petra4"], "no lattice"),
     ],
-)
+)  # fmt: skip
 def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(tmp_path, arguments, words):
     done = tmlattice(*arguments, cwd=tmp_path, check=2)
     assert words in done.stderr

@@ -193,3 +193,10 @@ def test_a_measurement_that_is_there_is_kept_unless_forced(folder):
     code, text = run(*QUICK, "--seed", 2, "--out", "day", "--force", "-q")
     assert code == 0, text
     assert (folder / "day" / "readings.csv").read_bytes() != before["readings.csv"]
+
+
+def test_an_amount_in_per_cent_is_warned_of(folder):
+    for amount, warned in ((-2, True), (-0.2, False)):
+        fault = f"quadrupole_gradient QD::5 {amount}"
+        _, said = run(*QUICK, "--effect", fault, "--shots", 1, "--out", f"of{amount}")
+        assert ("-0.2 is -20 %" in said) == warned

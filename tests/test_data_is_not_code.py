@@ -122,6 +122,18 @@ def test_counts_that_do_not_fit_end_no_process(tmp_path, small_ring):
         load_ring(path)
 
 
+def test_modules_of_the_working_directory_are_not_loaded(tmp_path, monkeypatch, small_ring):
+    """By the processes that read a MATLAB file and that track an element."""
+    monkeypatch.chdir(tmp_path)
+    for module in ("scipy", "numpy", "at", "h5py", "pickle"):
+        write(tmp_path, f"{module}.py", "open('MARK', 'w')\n")
+    lattice = small_at(small_ring)
+    lattice.append(at.Element("solenoid", Length=0.5, K=0.2, PassMethod="SolenoidLinearPass"))
+    at.save_lattice(lattice, tmp_path / "ring.mat")
+    assert "solenoid" in load_ring(tmp_path / "ring.mat").counts()
+    assert not Path("MARK").exists()
+
+
 @pytest.mark.parametrize(
     "line", ["__import__('os').system('touch MARK')", "Drift('d', (lambda: 1)())"]
 )

@@ -169,7 +169,7 @@ def test_reference_and_single_shot(folders, tmp_path, schema):
         "diagnose", SMALL, folders / "one", "--reference", folders / "before", "--json", path,
         "--background", "quadrupole_gradient=1e-4", cwd=tmp_path, check=0,
     )  # fmt: skip
-    assert "No shot was held out" in done.stdout
+    assert "Nothing was held out" in done.stdout
     document = json.loads(path.read_text())
     jsonschema.validate(document, schema)
     assert document["provenance"]["options"]["reference"] is True

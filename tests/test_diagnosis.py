@@ -5,7 +5,7 @@ import pytest
 
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
-from tmlattice.effects import CATALOGUE
+from tmlattice.effects import CATALOGUE, background_rms, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.newton import fit
 from tmlattice.observe.data import of_measurement
@@ -258,12 +258,48 @@ def test_what_is_in_the_reference_too_is_no_change(small_ring, cause, shots):
         assert (found.verdict, found.findings) == ("nothing", ())
 
 
+def test_more_shots_than_find_room_are_used_in_part(small_ring, monkeypatch):
+    """Memory is that of the shots that find room, however many there are; with a word."""
+    from tmlattice.diagnosis import prepare
+
+    each = prepare.COPIES * 8 * 36 * (len(small_ring.magnets) + 1)
+    monkeypatch.setattr(prepare, "MEMORY", 6.5 * each)
+    fault = Cause("quadrupole_gradient", "QD::3", -0.05)
+    measured = simulate(small_ring, [fault], shots=60, seed=3, engine="ocelot").measurement()
+    found = diagnose(small_ring, measured)
+    assert len(found.trajectories.data.readings) + len(found.heldout_shots) == 6
+    assert any("6 of 60 shots are used" in said for said in found.warnings)
+    assert [(f.effect, f.element) for f in found.findings] == [(fault.effect, fault.element)]
+    monkeypatch.setattr(prepare, "MEMORY", 0.5 * each)
+    with pytest.raises(MeasurementError, match="give fewer turns"):
+        diagnose(small_ring, measured)
+
+
 def test_small_errors_alone_are_no_change(small_ring):
     machine = {"background": {"all": None}, "machine_seed": 7}
     before, after = (
         simulate(small_ring, [], shots=6, seed=seed, **machine).measurement() for seed in (50, 0)
     )
     assert diagnose(small_ring, after, reference=before).verdict == "nothing"
+
+
+def test_a_fault_among_small_errors_that_lose_the_beam(small_ring):
+    """Five times the usual ones: what all shots ask for loses the beam, the reference's do not."""
+    rng = np.random.default_rng(12)
+    fault = Cause("quadrupole_gradient", "QD::4", -0.05)
+    small = [
+        Cause(name, place, float(5 * rms * rng.standard_normal()))
+        for name, rms in background_rms({"all": None}).items()
+        for place in find(name).places(small_ring)
+        if (name, place) != (fault.effect, fault.element)
+    ]
+    before, after = (
+        simulate(small_ring, causes, shots=3, seed=seed, engine="ocelot").measurement()
+        for causes, seed in ((small, 12), ([*small, fault], 112))
+    )
+    (found,) = diagnose(small_ring, after, reference=before).findings
+    assert (found.effect, found.element) == (fault.effect, fault.element)
+    assert abs(found.amount - fault.amount) < 3 * found.amount_sigma
 
 
 def test_a_fault_beside_one_that_was_there_before(small_ring):
@@ -274,3 +310,17 @@ def test_a_fault_beside_one_that_was_there_before(small_ring):
     assert [(f.effect, f.element) for f in found.findings] == [("quadrupole_gradient", "QD::5")]
     sigma = found.findings[0].amount_sigma
     assert abs(found.findings[0].amount + 0.05) < 4 * sigma
+
+
+def test_the_number_of_threads_changes_no_bit(small_ring):
+    """A background's linear algebra adds in another order on two threads."""
+    from threadpoolctl import threadpool_limits
+
+    measured = simulate(small_ring, [], shots=6, seed=1, background={"all": None}).measurement()
+    found = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, "blas"):
+            document = diagnose(small_ring, measured).as_json()
+        document["provenance"].pop("seconds")
+        found.append(repr(document))
+    assert found[0] == found[1]

@@ -8,6 +8,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import click
 import pytest
 
 import tmlattice
@@ -71,6 +72,25 @@ def test_no_mark_is_left_and_shots_are_in_the_format(site):
 
 def test_commands_have_no_default_where_they_have_none(site):
     assert "UNSET" not in text(site, "command_line")
+
+
+def test_every_option_says_what_it_is_for():
+    silent = [
+        (sub.name, parameter.opts)
+        for name in command.commands.values()
+        for sub in (name, *getattr(name, "commands", {}).values())
+        for parameter in sub.params
+        if isinstance(parameter, click.Option) and not parameter.help
+    ]
+    assert not silent
+
+
+def test_lists_go_on_after_an_equation(site):
+    """Every numbered point of the method begins a line of its own."""
+    page = text(site, "method")
+    source = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    points = len(re.findall(r"^\d+\. ", source, re.M))
+    assert page.count("<li>", page.index("<ol>"), page.rindex("</ol>")) == points
 
 
 def test_equations_are_drawn_and_nothing_is_fetched(site):

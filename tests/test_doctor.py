@@ -248,6 +248,13 @@ def test_diagnose_stops_and_goes_on_with_what_is_assumed(small_ring, machine):
     assert found.as_json()["provenance"]["options"]["assume"] == ["x-reversed"]
 
 
+def test_a_reference_is_looked_at_too(small_ring, healthy):
+    with pytest.raises(MeasurementError, match=r"the reference alone .*: x has the wrong sign"):
+        diagnose(
+            small_ring, healthy, reference=replace(healthy, readings=healthy.readings * [-1, 1])
+        )
+
+
 def test_a_response_stops_and_goes_on_with_what_is_assumed(small_ring, steps):
     data = replace(steps, kicks=-steps.kicks)
     with pytest.raises(MeasurementError, match="--assume kicks-reversed"):

@@ -110,7 +110,7 @@ def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turn
         assert words in answer
     assert tab.locator("nav a").count() == 6
     assert tab.locator(".figure .main-svg").first.is_visible()
-    assert tab.locator(".figure").count() == 4
+    assert tab.locator(".figure").count() == 5
     for figure in ("plan", "scan"):
         place = tab.locator(f'.figure[data-figure="data-{figure}"]')
         place.scroll_into_view_if_needed()
@@ -178,6 +178,8 @@ def test_several_measurements_are_told_and_drawn_one_by_one(opened, together):
     assert "QD::5" in tab.inner_text("#answer")
     assert tab.locator('.figure[data-figure="data-readings"] .main-svg').first.is_visible()
     assert "tune" in tab.inner_text("#gap ~ .scroll")
+    numbers = tab.locator("table", has=tab.get_by_text("as found", exact=True)).first
+    assert [row.split("\t")[0] for row in numbers.inner_text().splitlines()[1:]] == ["Qx", "Qy"]
 
 
 @pytest.mark.parametrize("kind", ["first_turns", "response", "together"])

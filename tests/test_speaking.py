@@ -17,6 +17,7 @@ from test_cli import schema
 import tmlattice
 from tmlattice.errors import ChoiceError, MeasurementError, UnknownNameError
 from tmlattice.late import Method
+from tmlattice.maps import ring_matrix
 from tmlattice.measurement import (
     ClosedOrbit,
     Dispersion,
@@ -26,6 +27,7 @@ from tmlattice.measurement import (
     TurnByTurn,
     write_measurement,
 )
+from tmlattice.optics import matrix_tunes
 
 FAULT = tmlattice.Cause("quadrupole_gradient", "QD::5", -0.05)
 
@@ -133,6 +135,19 @@ def test_objects_draw_themselves(small_ring, measured, diagnosis):
     for figure in (scan, gap, betas, *drawn):
         plt.close(figure)
     assert len(plt.get_fignums()) == before  # what was not asked for is closed
+
+
+def test_tunes_are_drawn_beside_those_of_the_ring(small_ring):
+    tune = [[0.1, 0.2], [0.15, 0.25]]
+    measured = TuneReading(tune, None, [[1.0, 2.0], [1.5, 2.5]], shots=(3, 7))
+    figure = measured.plot(small_ring)
+    read = [ax.lines[0].get_ydata().tolist() for ax in figure.axes]
+    assert read == [[0.1, 0.15], [1.0, 1.5], [0.2, 0.25], [2.0, 2.5]]
+    design = matrix_tunes(ring_matrix(small_ring))  # by the product of OCELOT's matrices
+    for plane, ax in enumerate(figure.axes[::2]):
+        assert ax.lines[-1].get_ydata()[0] == pytest.approx(design[plane], abs=1e-6)
+    assert [label.get_text() for label in figure.axes[3].get_xticklabels()] == ["3", "7"]
+    plt.close(figure)
 
 
 def test_a_name_or_a_path_goes_where_a_ring_or_a_measurement_does(

@@ -28,6 +28,7 @@ BESIDE = {
     "workers",
     "batch",
     "schemas",
+    "version",
 }  # everybody may use them
 LINES, FUNCTION = 450, 70
 

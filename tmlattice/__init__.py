@@ -19,7 +19,7 @@ A machine whose fault is known, what its monitors read, and what that says:
 >>> diagnosis = tmlattice.diagnose(ring, measurement)
 >>> print(diagnosis.report())                              # diagnosis.plot(), .save("folder")
 
-Your own: a folder, or a control room's file (`tmlattice import --example` writes templates):
+Your own: a folder, or a control room's file (`tmlattice import --example --out x` has templates):
 
 >>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")
 
@@ -48,7 +48,7 @@ nor OCELOT, which take seconds.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from tmlattice.version import __version__
 
 if TYPE_CHECKING:
     from tmlattice import challenge as challenge

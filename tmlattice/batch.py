@@ -16,7 +16,7 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, missing_package
 from tmlattice.files import OutputError, output_file, write_json
 from tmlattice.workers import caught, heard
 
@@ -209,10 +209,8 @@ def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
         import dask
         from distributed import Client, LocalCluster
     except ModuleNotFoundError as error:
-        raise TmlatticeError(
-            f"several processes need the package '{error.name}', which is not installed: run "
-            "`pip install 'tmlattice[study]'`, or take one process (--workers 1, --jobs 1)"
-        ) from error
+        what = "more than one process (--workers 1, --jobs 1) needs"
+        raise missing_package(error, what, "study") from error
 
     if scheduler is not None:
         try:

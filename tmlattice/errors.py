@@ -63,8 +63,27 @@ class ChoiceError(TmlatticeError, ValueError):
     """A word for which there is a list, and that is not on it; the message gives the list."""
 
 
+class MissingPackageError(TmlatticeError, ImportError):
+    """A package that not everything needs, and that is not installed; the message says the extra
+    that brings it."""
+
+
 class EffectError(TmlatticeError):
     """An effect that cannot be as it was asked for."""
+
+
+def missing_package(error: ImportError, what: str, extra: str) -> MissingPackageError:
+    """The error for a package of an extra.
+
+    Args:
+        error: of the import.
+        what: needs it, as the subject of the sentence.
+        extra: brings it.
+    """
+    return MissingPackageError(
+        f"{what} the package '{error.name}', which is not installed: "
+        f"`pip install 'tmlattice[{extra}]'` brings it (README.md, Install)"
+    )
 
 
 def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError:
@@ -77,6 +96,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     known = list(known)
     near = difflib.get_close_matches(name.casefold(), [k.casefold() for k in known], 3, 0.5)
     original = {k.casefold(): k for k in known}
+    near = near or [k for k in original if name and name.casefold() in k][:3]
     shown = [original[k] for k in near] or known[:3]
     offer = " or ".join(f"'{k}'" for k in shown)
     question = f"did you mean {offer}?" if near else f"known are {offer}, ..."

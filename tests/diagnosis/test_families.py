@@ -10,7 +10,12 @@ from tmlattice.diagnosis.families import (
     MonitorGain,
     MonitorRoll,
 )
-from tmlattice.diagnosis.fields import QuadrupoleGradient, SkewGradient
+from tmlattice.diagnosis.fields import (
+    EdgeFocusing,
+    QuadrupoleGradient,
+    SkewGradient,
+    VerticalFocusing,
+)
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 
@@ -19,6 +24,8 @@ RMS = {
     CALIBRATION: 0.1,  # large, and beside the others: these two are exact
     GAIN: 0.1,
     QuadrupoleGradient(): 1e-3,
+    VerticalFocusing(): 1e-3,
+    EdgeFocusing(): 1e-3,
     EnergySpread(): 1.0,
     MonitorRoll(): 1e-3,
     CorrectorRoll(): 1e-3,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
+from tmlattice.diagnosis.strategy import outlier
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.machine import simulate
 
@@ -34,6 +35,28 @@ def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fa
     assert 0.6 < after.chi2_per_dof < 1.5  # 70 readings, correlated
     assert 0.6 < after.rms / after.expected < 1.5
     assert after.rms < 0.05 * found.heldout.misfits[0].rms  # of the design
+
+
+@pytest.mark.parametrize("amount", [-1.0, 2.0])
+def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring, amount):
+    """Four are set: the one that is far off made their family as large as itself, and one that does
+    not kick left nothing about which its error was linear."""
+    fault = Cause("corrector_calibration", "v5", amount)
+    settings = [{name: {"kick": 3e-4} for name in ("v2", "v5", "v9", "v12")}, {}] * 3
+    found = diagnose(small_ring, measured(small_ring, [fault], settings=settings))
+    (finding,) = found.findings
+    assert (finding.effect, finding.element) == (fault.effect, fault.element)
+    assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
+    assert found.priors["corrector_calibration"] < 0.3
+
+
+def test_no_outlier_where_all_of_a_family_or_all_families_are_large():
+    sizes = {"corrector_calibration": 0.04, "corrector_roll": 0.01}
+    far = [Cause("corrector_calibration", name, a) for name, a in (("h1", 0.3), ("h2", -0.02))]
+    assert outlier(far, sizes) == far[0]
+    more = [Cause("corrector_calibration", name, a) for name, a in (("h3", 0.32), ("h4", -0.35))]
+    assert outlier([far[0], *more], sizes) is None
+    assert outlier(far, {name: 5 * size for name, size in sizes.items()}) is None
 
 
 def test_small_errors_alone_are_no_fault_and_have_their_sizes(small_ring):

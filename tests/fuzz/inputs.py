@@ -1,7 +1,6 @@
 """One file of every format that is read, on a ring of ten magnets."""
 
 import contextlib
-import json
 import math
 import shutil
 from pathlib import Path
@@ -50,10 +49,11 @@ def challenge(folder):
         run(Path("set"), jobs=1, progress=False)
 
 
-def write_all(folder, challenges=True):
+def write_all(folder, challenges=True, more=True):
     """Write the files; {format: (command, file that is damaged)}."""
     import at
     from at_ring import at_lattice
+    from measured import unsealed, write_measured
 
     from tmlattice.lattice import save_ring
     from tmlattice.machine import simulate
@@ -73,10 +73,7 @@ def write_all(folder, challenges=True):
     measured = simulate_response(ten, [], seed=1, progress=False, engine="ocelot").measured
     write_measurement(folder / "response", measured)
     for kind in ("turns", "response"):
-        own = folder / kind / "measurement.json"
-        document = json.loads(own.read_text())
-        del document["table_sha256"]  # else every damaged table is refused at once
-        own.write_text(json.dumps(document))
+        unsealed(folder / kind)
     xsuite = Path(__file__).parent.parent / "lattices" / "xtrack_line.json"
     shutil.copy(xsuite, folder / "xsuite.json")
     score = ["challenge", "score", "set", "--no-oracle", "--jobs", "1"]
@@ -97,6 +94,8 @@ def write_all(folder, challenges=True):
         "response, table": (["diagnose", "ring.json", "response"], "response/response.csv"),
         "check": (["check", "ring.json", "turns"], "turns/measurement.json"),
     }
+    if more:
+        found |= write_measured(ten, folder)
     if challenges:
         challenge(folder)
         found |= {

@@ -115,7 +115,7 @@ def prepared(folder, challenges=True):
 
     import tmlattice.cli.command  # noqa: F401  (children find it loaded, whoever edits it meanwhile)
 
-    write_all(folder, challenges)
+    write_all(folder, challenges, more=False)
     for results in folder.glob("set/results/*"):
         results.unlink()
 

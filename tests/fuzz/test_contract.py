@@ -1,6 +1,7 @@
 """Some of what `make fuzz` does, with the same seeds each time."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,19 @@ def test_damaged_files_end_in_one_sentence(inputs):
     wrong = [own for own in found if own[1] is not None]
     assert not wrong, report(inputs)
     assert sum(tally.refused for tally in inputs.tallies.values()) > SOME / 2, report(inputs)
+
+
+def test_one_wrong_reading_does_not_spoil_the_others(inputs):
+    """2 cm for one monitor of the RF's orbit: a fit that follows it leaves 100 µm everywhere."""
+    from tmlattice import diagnose, load_ring, read_measurement
+
+    ring = load_ring(inputs.folder / "ring.json")
+    measured = read_measurement(inputs.folder / "response")
+    orbit = measured.rf.orbit.copy()
+    orbit[2, 0] += 0.02
+    found = diagnose(ring, replace(measured, rf=replace(measured.rf, orbit=orbit)))
+    assert found.fit_after.rms <= found.fit_before.rms
+    assert any("fitted, RF" in said for said in found.warnings)
 
 
 def test_killed_commands_and_full_disks_leave_nothing_half_written(tmp_path):

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from tmlattice.effects import Cause
+from tmlattice.beam.model import Model
+from tmlattice.effects import Cause, find, rare
 from tmlattice.inference.priors import AmountPrior, Student
+from tmlattice.machine import simulate
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 
 FREEDOMS = (1.0, 4.0, np.inf)
 AMOUNTS = np.array([-0.3, -0.02, 1e-4, 0.01, 0.07, 2.0])
@@ -51,3 +55,24 @@ def test_amounts_beyond_the_bound_cannot_be():
     prior = AmountPrior(Student(0.03, np.inf), bound=0.1)
     assert prior.log_density(Cause("quadrupole_gradient", "q", 0.11)) == -np.inf
     assert np.isfinite(prior.log_density(Cause("quadrupole_gradient", "q", -0.09)))
+
+
+def test_stray_gradient_is_rarer_than_a_magnet_whose_own_gradient_is_wrong(small_ring):
+    """In a sextupole; in the middle of a quadrupole it is but another form of its own."""
+    effects = ["quadrupole_gradient", "gradient_absolute"]
+    places = {name: len(find(name).places(small_ring)) for name in effects}
+    data = of_measurement(small_ring, simulate(small_ring, [], shots=1).measurement())
+    problem = FirstTurns(
+        model=Model(small_ring, data.settings), data=data, places=places,
+        rare=rare(small_ring, effects),
+    )  # fmt: skip
+    own, inside, stray = (
+        np.exp(problem.prior((name, place))) * places[name]
+        for name, place in (
+            ("quadrupole_gradient", "QD::5"),
+            ("gradient_absolute", "QD::5"),
+            ("gradient_absolute", "sd::5"),
+        )
+    )
+    assert [own, inside] == pytest.approx([(1 - problem.judgement.unknown) / 2] * 2)
+    assert stray == pytest.approx(0.1 * own)

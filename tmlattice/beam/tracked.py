@@ -222,6 +222,7 @@ class TrackedShots:
                 effect.set(monitors, self._monitor[cause.element or ""], cause.amount)
         return monitors
 
+    @np.errstate(over="ignore", invalid="ignore")  # of a beam that is lost
     def paths(
         self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS
     ) -> Paths:

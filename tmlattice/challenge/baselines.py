@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model, Paths
 from tmlattice.challenge.case import Case, ring_of
 from tmlattice.effects import modelled
+from tmlattice.errors import missing_package
 from tmlattice.fitting import fine_tune
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.measurement import Measurement
@@ -80,7 +81,10 @@ def pursuits(rows: Array, residual: Array) -> dict[str, Array]:
         rows: signatures, nuisances projected out, [hypothesis, row].
         residual: [row].
     """
-    from sklearn.linear_model import Lasso, orthogonal_mp
+    try:
+        from sklearn.linear_model import Lasso, orthogonal_mp
+    except ModuleNotFoundError as error:
+        raise missing_package(error, "the baselines need", "challenge") from error
 
     size = np.sqrt(np.einsum("hr,hr->h", rows, rows))
     seen = np.flatnonzero(size > 0)

@@ -52,11 +52,17 @@ def _cluster_options(function: Any) -> Any:
 
 
 @challenge.command("make")
-@click.argument("tier", type=click.Choice(list("ABCDERTPM"), case_sensitive=False))
-@click.option("--cases", type=click.IntRange(1), default=300, show_default=True)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.argument(
+    "tier",
+    metavar="A|B|C|D|E|R|T|P|M",
+    type=click.Choice(list("ABCDERTPM"), case_sensitive=False),
+)
+@click.option("--cases", type=click.IntRange(1), default=300, show_default=True, help="How many.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all that is drawn."
+)
 @click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
-@click.option("--lattice", default="petra3", show_default=True)
+@click.option("--lattice", default="petra3", show_default=True, help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
 @click.option(
     "--kind",

@@ -1,5 +1,6 @@
 """The group of commands, and how any of them ends: a result, or one sentence and a code."""
 
+import difflib
 import os
 import sys
 import warnings
@@ -27,6 +28,16 @@ STOPPED = 130  # as the shell has it for Ctrl-C
 
 class Sections(click.Group):
     """A group whose help lists its commands by what they are for."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command, or a sentence with the nearest one."""
+        if args and args[0] not in self.commands and not args[0].startswith("-"):
+            near = difflib.get_close_matches(args[0], self.commands, 1)
+            mend = f"did you mean '{near[0]}'?" if near else "`tmlattice --help` lists them"
+            raise click.UsageError(f"no command '{args[0]}'; {mend}", ctx)
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """In the order of `SECTIONS`."""

@@ -61,8 +61,8 @@ log = logging.getLogger(__name__)
     "--max-effects",
     type=click.IntRange(1),
     default=None,
-    help="Findings at most; of an orbit response, steps that are kept at most. 8 where nothing is "
-    "said, 40 of a change between two responses.",
+    help="Findings at most: 8 where nothing is said, 40 of a change between two responses. Of an "
+    "orbit response, steps that are kept at most: all.",
 )
 @click.option(
     "--effects",
@@ -218,7 +218,14 @@ def _read(
     paths: tuple[Path, ...], ring: "Ring", map_file: Path | None, unit: str | None, quiet: bool
 ) -> "tuple[dict[str, Measured], list[str]]":
     """Measurements by the names of their folders, by the whole path where two have one name; and
-    what was assumed of files that are none."""
+    what was assumed of files that are none.
+
+    Raises:
+        click.UsageError: one is given twice: it would count as two.
+    """
+    for k, path in enumerate(paths):
+        if path.resolve() in [other.resolve() for other in paths[:k]]:
+            raise click.UsageError(f"'{path}' is given twice; give each measurement once")
     names = [path.resolve().name for path in paths]
     twice = len(set(names)) < len(names)
     found: dict[str, Measured] = {}
@@ -269,14 +276,19 @@ def _write_rings(
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
         written[str(lattice_out)] = write_ring(result.as_found, lattice_out)
+        beside, known = calibration_beside(lattice_out), known_of(result)
         if result.calibration or result.by_steps:
-            beside = calibration_beside(lattice_out)
             write_calibration(beside, result.calibration)
             written[str(beside)] = ()
-        if (known := known_of(result)) is not None:
-            with output_file(known_beside(lattice_out)) as temporary:
-                write_json(temporary, known_document(known))
-            written[str(known_beside(lattice_out))] = ()
+        else:  # that of the ring which stood there
+            beside.unlink(missing_ok=True)
+        beside = known_beside(lattice_out)
+        if known is not None and lattice_out.is_file():
+            with output_file(beside) as temporary:
+                write_json(temporary, known_document(known, lattice_out))
+            written[str(beside)] = ()
+        else:
+            beside.unlink(missing_ok=True)
     if repaired_out:
         ring, by_hand = result.repair()
         told = write_ring(ring, repaired_out)

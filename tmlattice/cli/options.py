@@ -134,6 +134,7 @@ class Careful(click.Command):
         read = {key for path in paths for key in _identities(path)}
         for path in paths:
             read |= {key for name in OF_MEASUREMENTS for key in _identities(path / name)}
+            read |= _identities(Path(f"{path}.known.json"))
         if folder or ctx.params.get("out"):
             own = Path(folder or ctx.params["out"])
             read |= {key for name in OF_FOLDERS for key in _identities(own / name)}

@@ -20,7 +20,7 @@ SYSTEMS = ["free-fall", "lotka-volterra", "pendulum", "magnets", "cavitation"]
 
 
 @click.command("reproduce")
-@click.argument("systems", nargs=-1, type=click.Choice(SYSTEMS))
+@click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
 @click.option("--out", type=FILE, default="reproduce", show_default=True, metavar="DIR",
               help="Folder for the figures and reproduction.json.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True,

@@ -236,6 +236,7 @@ def simulate(
         _check_apart(truth, out)
     _check_options(context, kind)
     ring = open_ring(lattice, sequence, energy)
+    _warn_of_large(effects)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
     if kind != "trajectory":
@@ -330,6 +331,25 @@ def _check_apart(truth: Path, out: Path) -> None:
         raise MeasurementError(
             f"the truth '{truth}' may not lie in a measurement's folder; name another place"
         )
+
+
+FAR = 3.0
+"""Times the largest amount that is looked for: a slip of units is further off."""
+
+
+def _warn_of_large(effects: tuple[tuple[str, str | None, float], ...]) -> None:
+    """Of an amount in per cent where a share was asked for, or in mm where metres were."""
+    from tmlattice.effects import find
+
+    for name, _, amount in effects:
+        effect = find(name)
+        if abs(amount) > FAR * effect.largest:
+            share = "; a share: -0.2 is -20 %" if effect.unit == "relative" else ""
+            click.echo(
+                f"tmlattice: warning: {effect.name} of {amount:g} is far beyond the "
+                f"{effect.largest:g} that a diagnosis looks for (unit: {effect.unit}{share})",
+                err=True,
+            )
 
 
 def _named(ring: Any, cause: Any) -> Any:

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     type=click.Choice(REGULARIZATIONS),
     default="symplectic",
     show_default=True,
+    help="Of the recipe (adam): what holds its free weights.",
 )
 @click.option(
     "--out",

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from tmlattice.beam.model import Model, Paths
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, find
+from tmlattice.effects.effect import LEAST_LEFT
 from tmlattice.errors import BeamLostError
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
@@ -47,6 +48,8 @@ class SmallErrors:
         open: relative error of each size that was learnt; large where the readings hardly see it.
         evidence: log evidence that the sizes learnt have over no small errors; None: they were
             told.
+        apart: log evidence that the cause beside which they were taken is none of them, however
+            large its family may be; None: nobody asked.
     """
 
     problem: FirstTurns
@@ -57,6 +60,7 @@ class SmallErrors:
     sizes: Mapping[str, float]
     open: Mapping[str, float] = field(default_factory=dict)
     evidence: float | None = None
+    apart: float | None = None
 
     def estimate(self, explained: Fit, whitening: Whitening) -> list[Cause]:
         """The likeliest small errors beside an explanation, which was found in this whitening."""
@@ -65,7 +69,8 @@ class SmallErrors:
         weights = whitening.back(rows[None])[0]
         shares = np.einsum("esrp,srp->e", self.problem.spread, weights, optimize=True)
         amounts = (self.rms * shares).tolist()
-        return [Cause(*h, amount) for h, amount in zip(self.hypotheses, amounts, strict=True)]
+        own = zip(self.hypotheses, amounts, strict=True)
+        return [Cause(*h, _with_some_left(h[0], amount)) for h, amount in own]
 
     def made_by(self, estimate: Sequence[Cause]) -> Array:
         """What small errors make of the readings, linearly, [shot, reading, 2], m."""
@@ -73,7 +78,9 @@ class SmallErrors:
         amounts = np.array([cause.amount for cause in estimate]) / self.rms
         return np.asarray(np.einsum("e,esrp->srp", amounts, self.problem.spread, optimize=True))
 
-    def unknown(self, explained: Fit, seen: FirstTurns, other: FirstTurns) -> Array:
+    def unknown(
+        self, explained: Fit, seen: FirstTurns, other: FirstTurns, estimate: Sequence[Cause]
+    ) -> Array:
         """Covariance of what is still not known of other shots, once these have been explained.
 
         Of the small errors what the readings leave open, and of the amounts of the causes: as in
@@ -83,14 +90,20 @@ class SmallErrors:
             explained: the fit of these shots.
             seen: its problem, in whose whitening it was found.
             other: of the other shots, with the small errors of this explanation in its model.
+            estimate: those.
 
         Returns:
             [shot * reading * 2] twice, m^2.
+
+        Raises:
+            BeamLostError: the beam of the other shots is lost among these small errors.
         """
         assert self.problem.spread is not None
         point = other.at(explained.causes, other.data.launches)
+        if point.lost:
+            raise BeamLostError(f"{point.lost} among the small errors that were found")
         *_, there = background_signatures(other.model, point.view, point.nuisances, self.sizes)
-        there = there.reshape(len(there), -1)
+        there = chained(estimate)[:, None] * there.reshape(len(there), -1)
         here = self.problem.spread.reshape(len(there), -1)
         shared = (there.T @ here).reshape(-1, *seen.valid.shape)
         rows = explained.projection.out(seen.whitening.signature(shared))  # [other reading, row]
@@ -103,6 +116,13 @@ class SmallErrors:
             drift -= seen_by @ rows.T
             unknown += drift.T @ explained.covariance[np.ix_(for_each, for_each)] @ drift
         return np.asarray(unknown)
+
+
+def _with_some_left(effect: str, amount: float) -> float:
+    """The amount; of a strength that would be gone a little is kept, on which an error can act."""
+    if find(effect).multiplies and abs(1 + amount) < LEAST_LEFT:
+        return LEAST_LEFT - 1
+    return amount
 
 
 def background_signatures(
@@ -123,6 +143,11 @@ def background_signatures(
     return hypotheses, scale, scale[:, None, None, None] * signatures
 
 
+def chained(estimate: Sequence[Cause]) -> Array:
+    """By which signatures about a model with these errors are slopes in their amounts, [error]."""
+    return np.array([find(cause.effect).chain(cause.amount) for cause in estimate])
+
+
 def small_errors(
     ring: Ring,
     plain: FirstTurns,
@@ -134,6 +159,7 @@ def small_errors(
     *,
     learn: bool = False,
     noisy: bool = False,
+    weigh: bool = False,
 ) -> SmallErrors:
     """The background of a machine as these data show it.
 
@@ -147,25 +173,32 @@ def small_errors(
         estimate: the likeliest small errors beside it.
         learn: the sizes are learnt from the data; `rms` is where that starts.
         noisy: so is the noise, which is a guess.
+        weigh: whether the one cause is a small error itself is weighed too.
 
     Raises:
         BeamLostError: the beam does not come round in what is taken for the machine.
     """
     fixed, data = tuple(causes), plain.data
-    evidence, errors, opened = None, dict[str, float](), plain.open
+    evidence, errors, opened, apart = None, dict[str, float](), plain.open, None
     for _ in range(1 if estimate else ROUNDS):
         model = Model(ring, data.settings, data.turns, [*known, *estimate], active=data.active)
         alone = fit(replace(plain, model=model, fixed=fixed), (), launches)
         _on_its_way(alone)
         paths = alone.point.view
         hypotheses, scale, spread = background_signatures(model, paths, alone.nuisances, rms)
+        if estimate:
+            spread = chained(estimate)[:, None, None, None] * spread
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
         moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
         shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
         if learn:
-            found, names = _sizes(shifted, alone, hypotheses, spread, noisy)
+            found, names = _sizes(shifted, spread, alone, hypotheses, noisy)
             if evidence is None:
                 evidence = found.log_evidence
+            if weigh:
+                both = _as_one_of_them(fixed[0], data, hypotheses, amounts, scale, spread)
+                other, _ = _sizes(*both, alone, hypotheses, noisy)
+                apart = found.log_marginal - other.log_marginal
             errors = dict(zip(names, found.error.tolist(), strict=True))
             factor = dict(zip(names, found.scale, strict=True))
             each = np.array([factor[name] for name, _ in hypotheses])
@@ -186,7 +219,7 @@ def small_errors(
         small = SmallErrors(
             problem, explained, replace(plain, data=data, white=None, open=opened),
             tuple(hypotheses), scale,
-            rms, errors, evidence,
+            rms, errors, evidence, apart,
         )  # fmt: skip
         estimate = small.estimate(explained, problem.whitening)
     if fixed:
@@ -199,8 +232,26 @@ def _on_its_way(result: Fit) -> None:
         raise BeamLostError(f"{result.point.lost} among the small errors that the data ask for")
 
 
+def _as_one_of_them(
+    cause: Cause,
+    data: Data,
+    hypotheses: Sequence[Hypothesis],
+    amounts: Array,
+    scale: Array,
+    spread: Array,
+) -> tuple[Data, Array]:
+    """The readings and signatures that small errors have to make where the cause is one of them."""
+    own = list(hypotheses).index((cause.effect, cause.element))
+    spread = spread.copy()
+    spread[own] *= find(cause.effect).chain(cause.amount)
+    amounts = amounts.copy()
+    amounts[own] += cause.amount
+    moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
+    return replace(data, readings=data.readings + np.where(data.valid, moved, 0.0)), spread
+
+
 def _sizes(
-    data: Data, alone: Fit, hypotheses: Sequence[Hypothesis], spread: Array, noisy: bool
+    data: Data, spread: Array, alone: Fit, hypotheses: Sequence[Hypothesis], noisy: bool
 ) -> tuple[Sizes, list[str]]:
     """Sizes from as many shots as it takes, and the effects that they are of, in their order.
 

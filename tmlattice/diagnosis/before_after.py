@@ -108,7 +108,7 @@ def diagnose_change(
     begun = time.perf_counter()
     trials = trials_of(effects, CHANGES)
     before, after = (mended(ring, one, assume) for one in (before, after))
-    said = list(dict.fromkeys([*consulted(ring, before), *consulted(ring, after)]))
+    said = consulted(ring, after, reference=before)
     said += _lost(before, after)
     before, after = alike(ring, before, after)
     first, second = response_data(ring, before), response_data(ring, after)

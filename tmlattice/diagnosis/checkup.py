@@ -83,15 +83,18 @@ class Checkup:
         order = ("wrong", "note")
         return tuple(c for status in order for c in self.checks if c.status == status)
 
-    def stop(self) -> None:
+    def stop(self, where: str = "") -> None:
         """Raise where something has to be mended first.
+
+        Args:
+            where: in which data, said before the sentences.
 
         Raises:
             MeasurementError: with the sentences.
         """
         bad = [check.sentence for check in self.checks if check.status == "wrong"]
         if bad:
-            raise MeasurementError("; ".join(bad))
+            raise MeasurementError(where + "; ".join(bad))
 
     def as_json(self) -> dict[str, Any]:
         """The result in the format `tmlattice-check`, version 1 (see `schemas/`)."""

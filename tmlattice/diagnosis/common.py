@@ -52,13 +52,15 @@ def sought_in(
         Those of `prepare`.
     """
     common: tuple[Cause, ...] = ()
+    before: Found | None = None
     if reference is not None:
         alone = prepare(ring, reference, None, radiation, None, judgement)
         first = Search(alone.problem, alone.hypotheses, MOST)
-        common = _named(sought(ring, alone, first, background).explanation.fit.causes)
+        before = sought(ring, alone, first, background)
+        common = _named(before.explanation.fit.causes)
     for _ in range(ROUNDS):
         ready = prepare(ring, measurement, reference, radiation, effects, judgement, common)
-        found = sought(ring, ready, search_of(ready), background)
+        found = sought(ring, ready, search_of(ready), background, before)
         more = _named(_in_both(found.explanation))
         if not more:
             break

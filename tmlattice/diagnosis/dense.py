@@ -238,8 +238,13 @@ def fit_steps(
         if doubted:
             again, without = _worth(state, doubted, progress)
             worth |= again
+    if _lost(_inner(design), _inner(state)) < -VETO:  # all together spoil what they should mend
+        refused += [replace(step, kept=False) for step in steps.values()]
+        return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
+                        (before, before))  # fmt: skip
     progress("result")
-    state = settle(bend(jump(replace(state, exploring=False))))
+    # those that chose start at what they say: a column far off would weigh nothing, and stay there
+    state = settle(bend(jump(replace(state, exploring=False), beyond=1.0)))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)

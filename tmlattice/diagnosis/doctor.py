@@ -116,16 +116,26 @@ _TOLD = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
 """Of what is noted, what the diagnosis does not find by itself."""
 
 
-def consulted(ring: Ring, data: Measurement | OrbitResponse, radiation: bool = False) -> list[str]:
-    """What a diagnosis of these data has to say of them.
+def consulted(
+    ring: Ring,
+    data: Measurement | OrbitResponse,
+    radiation: bool = False,
+    reference: Measurement | OrbitResponse | None = None,
+) -> list[str]:
+    """What a diagnosis of these data, and of a reference beside them, has to say of them.
 
     Raises:
         MeasurementError: something has to be mended first.
         UnknownNameError: see `check_data`.
     """
-    checkup = check_data(ring, data, radiation=radiation)
-    checkup.stop()
-    return [check.sentence for check in checkup.told if check.name in _TOLD]
+    said = []
+    for where, one in (("", data), ("the reference: ", reference)):
+        if one is not None:
+            checkup = check_data(ring, one, radiation=radiation)
+            checkup.stop(where and "the reference alone (mend its file, --assume is of both): ")
+            told = [check.sentence for check in checkup.told if check.name in _TOLD]
+            said += [where + sentence for sentence in told if sentence not in said]
+    return said
 
 
 Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)

@@ -221,6 +221,7 @@ STEPS = (
     Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
     Trial((MonitorGain(),), 2, 0),
     Trial((QuadrupoleGradient(),), 4, 0),
+    Trial((VerticalFocusing(),), 2, 0),
     Trial((EdgeFocusing(),), 2, 0),
     Trial((EnergySpread(),), 2, 0),
     Trial((MonitorRoll(),), 0, 1),

@@ -17,6 +17,7 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
+from tmlattice.effects import rare
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
@@ -88,7 +89,11 @@ def few_causes(
     design = begin(data, split)
     places = {name: sum(h[0] == name for h in hypotheses) for name in {h[0] for h in hypotheses}}
     problem = Response(
-        base=design.at.bend(), used=_used(data, split), places=places, judgement=judgement
+        base=design.at.bend(),
+        used=_used(data, split),
+        places=places,
+        rare=rare(data.ring, list(places)),
+        judgement=judgement,
     )
     before = fit(problem, (), problem.first)
     count = int(problem.used.sum())

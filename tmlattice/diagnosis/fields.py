@@ -15,6 +15,7 @@ from tmlattice.diagnosis.magnets import families, magnets, straights
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.slices import stem
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
 
 Array = NDArray[np.float64]
@@ -153,6 +154,11 @@ class VerticalFocusing(_Thin):
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
     block, variable, trust = 0, "device", 3e-3
 
+    @property
+    def title(self) -> str:
+        """Dipoles have it too."""
+        return f"{self.effect} in straights"
+
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         devices = [*magnets(ring, ("wiggler",)), *((e,) for e in straights(ring))]
         return sorted(devices, key=lambda own: own[0].s)
@@ -163,7 +169,7 @@ class VerticalFocusing(_Thin):
 
 
 class EdgeFocusing(_Thin):
-    """Vertical focusing of dipoles: their edges and fringe fields, alike in dipoles of one type."""
+    """Vertical focusing of dipoles, by their edges and fringe fields: one number a type."""
 
     name, effect = "edge_focusing", "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
@@ -172,10 +178,14 @@ class EdgeFocusing(_Thin):
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("bend",))
 
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Of all dipoles of a type: what makes one of them alone is no edge, but something beside
+        it that would be made up with."""
+        types: dict[str, dict[str, float]] = {}
+        for pieces in super().shares(data):
+            types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
+        return list(types.values())
+
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each, and of families."""
-        places = self.places(data)
-        return [
-            Group(self.name, np.eye(len(places)), 1e-4, TAILS),
-            Group(f"{self.name} of families", families(places)[1], 1e-3),
-        ]
+        """Of each type."""
+        return [Group(self.name, np.eye(self.size(data)), 1e-3)]

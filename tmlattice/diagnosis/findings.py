@@ -193,9 +193,10 @@ def verdict_of(
     left = found.p_value(float(found.statistic.max(initial=0.0)))
     more, far_more = judgement.noise
     if explanation.full and left < judgement.false_alarm:
+        many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
         said = (
-            f"as many as {len(findings)} causes do not explain the data; a reference from before "
-            "the fault would cancel what was there anyway"
+            f"{many} not explain the data; a reference from before the fault would cancel what was "
+            "there anyway"
         )
         return "distributed", (), (said,)
     if not findings:

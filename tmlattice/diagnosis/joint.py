@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
+from tmlattice.diagnosis.left_out import spikes, with_silent
 from tmlattice.diagnosis.next_kind import next_kind
 from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
 from tmlattice.diagnosis.stages import (
@@ -36,7 +37,7 @@ from tmlattice.diagnosis.strategy import (
     strongest,
 )
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled
+from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled, rare
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
@@ -46,6 +47,7 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
+from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 
@@ -102,10 +104,13 @@ def diagnose_together(
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
     how = How(ring, places, judgement, holdout, assume, seed)
     progress("data")
-    parts = [_named(label, one, how) for label, one in measured.items()]
+    parts = [with_silent(ring, _named(label, one, how), one) for label, one in measured.items()]
     plain = replace(how, holdout=0.0)
     before = [_named(label, one, plain) for label, one in (reference or {}).items()]
-    problem = replace(stacked(parts, before, how), fixed=() if known is None else known.causes)
+    problem = replace(
+        stacked(parts, before, how), rare=rare(ring, chosen),
+        fixed=() if known is None else known.causes,
+    )  # fmt: skip
     hypotheses = [
         (name, place) for name in chosen for place in find(name).places(ring)
         if any(part.problem.sees((name, place)) for part in parts)
@@ -275,20 +280,21 @@ def _told(
     findings = findings_of(ring, found, dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
     verdict, findings, said = verdict_of(found, findings, p_value, estimated, judgement)
-    if verdict == "nothing" and small is not None and small.errors:
-        verdict = "distributed"  # the gap has a cause: many small ones
+    if verdict == "nothing" and small is not None and small.errors and all(problem.active):
+        verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
+    if result.causes and not causes:  # nothing is explained: what is left is what was there
+        p_value = float(chi2.sf(found.before.chi2, freedom(found.problem, found.before)))
     kept = problem.without(found.dropped)
     stages = stages_of(kept, found, small, causes)
     views = views_of(parts, kept, stages)
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     heldout = held_out(parts, problem.fixed, stages, aside, since)
-    if heldout is None:
-        said = (*said, "nothing is held out, so nobody but the fit judges the gap")
-    warnings = [*(f"{part.label}: {one}" for part in parts for one in part.said), *said]
+    told = (f"{part.label}: {one}" for part in parts for one in part.said)
+    warnings = [*told, *spikes(parts, problem, found), *said]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     learnt = None
@@ -312,7 +318,7 @@ def _told(
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
         noise=_noise(parts),
         noise_estimated=estimated,
-        provenance={"package": _version(), "lattice": ring.name, "measurement": None, **made},
+        provenance={"package": __version__, "lattice": ring.name, "measurement": None, **made},
         ring=ring,
         repaired=repaired,
         causes=causes,
@@ -321,12 +327,6 @@ def _told(
         prior_errors={} if small is None else dict(small.errors),
         view=JointView(found, views, learnt),
     )
-
-
-def _version() -> str:
-    from tmlattice import __version__
-
-    return __version__
 
 
 def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.prepare import prepare
+from tmlattice.diagnosis.prepare import batch, prepare
 from tmlattice.diagnosis.stored_doctor import refused
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import Judgement
@@ -121,6 +121,7 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
     ring = how.ring
     measured = mended(ring, measured, how.assume)
     said = consulted(ring, measured, False)
+    measured = batch(ring, measured, said)
     fitted, held = measured.split(how.holdout, how.seed) if how.holdout else (measured, None)
     ready = prepare(ring, fitted, None, False, None, how.judgement)
     other = None

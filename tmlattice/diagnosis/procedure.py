@@ -27,12 +27,12 @@ from tmlattice.diagnosis.findings import (
 )
 from tmlattice.diagnosis.next_kind import leading
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.prepare import Prepared, noise_of, same_monitors
+from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
 from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -43,6 +43,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
+from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -106,7 +107,9 @@ def diagnose(
     progress("data")
     measurement = mended(ring, measurement, assume)
     reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
-    said = consulted(ring, measurement, radiation)
+    said = consulted(ring, measurement, radiation, reference)
+    measurement = batch(ring, measurement, said)
+    reference, heldout = (own and batch(ring, own, said) for own in (reference, heldout))
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
@@ -122,7 +125,7 @@ def diagnose(
     small, explanation = found.small, found.explanation
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
-    gap = None if heldout is None else _held_out(ring, heldout, ready, told, small, explanation)
+    gap = _held_out(ring, heldout, ready, told, small, explanation, said)
     repaired = apply(ring, told.causes)
     noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
@@ -143,7 +146,7 @@ def diagnose(
         noise=noise,
         noise_estimated=ready.estimated,
         provenance={
-            "package": _version(),
+            "package": __version__,
             "lattice": ring.name,
             "measurement": measurement.lattice,
             "options": options,
@@ -158,12 +161,6 @@ def diagnose(
         prior_errors={} if small is None else small.open,
         view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
     )
-
-
-def _version() -> str:
-    from tmlattice import __version__
-
-    return __version__
 
 
 # --- what is told ----
@@ -240,15 +237,18 @@ def _noise(ready: Prepared, small: SmallErrors | None) -> tuple[float, float]:
 
 def _held_out(
     ring: Ring,
-    heldout: Measurement,
+    heldout: Measurement | None,
     ready: Prepared,
     told: _Told,
     small: SmallErrors | None,
     explanation: Explanation,
-) -> Gap:
+    said: list[str],
+) -> Gap | None:
     """The gap on shots that the fit did not see: the design's; with the small errors in it, as the
     fit without causes leaves them; with the findings, one by one where there are no small errors.
     """
+    if heldout is None:
+        return None
     other = of_measurement(ring, heldout).with_sigma(np.array(_noise(ready, small)))
     dropped = ready.problem.valid & ~told.problem.valid
     other = same_monitors(other, ready.problem.data, dropped)
@@ -264,7 +264,11 @@ def _held_out(
     seen_by = (small.problem, turns_of(explanation))
     fits = (explanation.before, explanation.fit)[: len(told.estimates)]
     for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
-        unknown = small.unknown(one, seen, problem(errors, ()))
+        try:
+            unknown = small.unknown(one, seen, problem(errors, ()), errors)
+        except BeamLostError as error:
+            said.append(f"{error}: the held-out shots do not judge the gap")
+            return None
         scored.append(judged(problem(errors, one.causes), other.launches, unknown))
     return held_out_gap(scored, since=max(len(scored) - 2, 0))
 

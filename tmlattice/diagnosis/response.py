@@ -57,7 +57,7 @@ def diagnose_response(
     *,
     holdout: float = 0.2,
     effects: Sequence[str] | None = None,
-    max_effects: int = 8,
+    max_effects: int = len(STEPS),
     false_alarm: float = DEFAULT.false_alarm,
     missing: bool = False,
     assume: Sequence[str] = (),
@@ -193,7 +193,7 @@ def _view(fit: DenseFit) -> ResponseView:
 
 def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
     """What made a diagnosis."""
-    from tmlattice import __version__
+    from tmlattice.version import __version__
 
     return {
         "package": __version__,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
+from tmlattice.diagnosis.numbers import NumberRead
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.effects import Cause, apply
@@ -189,6 +190,7 @@ class PartView:
         monitors: names.
         left: rms of what is left at each monitor in units of the noise, before and after,
             [2, monitor]; NaN where nothing was read.
+        numbers: of tunes, each as read and as both models have it.
     """
 
     label: str
@@ -198,6 +200,7 @@ class PartView:
     after: Misfit
     monitors: tuple[str, ...]
     left: NDArray[np.float64] = field(repr=False)
+    numbers: tuple[NumberRead, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -207,6 +210,7 @@ class PartView:
             "readings": self.readings,
             "before": dict(vars(self.before)),
             "after": dict(vars(self.after)),
+            **({"numbers": [n.as_json() for n in self.numbers]} if self.numbers else {}),
         }
 
 

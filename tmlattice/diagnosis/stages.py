@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.kinds import Part
+from tmlattice.diagnosis.numbers import numbers_read
 from tmlattice.diagnosis.result import Finding, PartView
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
@@ -95,8 +96,9 @@ def views_of(
         before, after = (misfit_of([(own, point)]) for point in points)
         count = int(own.valid.sum())
         views.append(
-            PartView(part.label, part.kind, count, before, after, tuple(own.monitors), by_monitor)
-        )
+            PartView(part.label, part.kind, count, before, after, tuple(own.monitors), by_monitor,
+                     numbers_read(own, *points))
+        )  # fmt: skip
     return tuple(views)
 
 

@@ -6,7 +6,7 @@ neighbouring monitors disagree all along the ring. Where it leaves more than noi
 small errors are learnt from what is left, and their evidence says whether they are there.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -37,6 +37,14 @@ which few causes are not tried: a few leave most gaps between monitors as the de
 DOUBT = 8.0
 """Statistic of the likeliest fault from which on it is weighed with sizes learnt without it."""
 
+OUTLYING = 5.0
+"""Times its usual size from which a small error that outweighs its family is weighed as a fault:
+of machines in good order one in a million has it."""
+
+AMOUNT = 5.0
+"""Log evidence that an amount costs which may be anything: even over four decades, of both signs,
+known to some per cent."""
+
 CLEAR = 10.0
 """Log evidence above which small errors are there."""
 
@@ -54,7 +62,13 @@ class Found:
     small: SmallErrors | None = None
 
 
-def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float] | None) -> Found:
+def sought(
+    ring: Ring,
+    ready: Prepared,
+    search: Search,
+    told: Mapping[str, float] | None,
+    earlier: Found | None = None,
+) -> Found:
     """What explains the data.
 
     Args:
@@ -62,6 +76,8 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
         ready: the data.
         search: what is searched.
         told: rms of small errors by effect; empty: there are none; None: the data say.
+        earlier: what explains a reference by itself. Where the small errors that all shots ask for
+            lose the beam, for a fault is no small error, they start at the reference's.
     """
     if told is not None:
         if not told:
@@ -80,17 +96,29 @@ def sought(ring: Ring, ready: Prepared, search: Search, told: Mapping[str, float
     start = ready.before if few is None else few.fit
     about = [] if few is None or not few.named else [strongest(few)]
     usual = background_rms({"all": None})
+    starts: list[tuple[Mapping[str, float], list[Cause]]] = [(usual, [])]
+    if earlier is not None and earlier.small is not None:
+        starts.append((earlier.small.sizes, _errors(earlier, earlier.small)))
     small: SmallErrors | None = None
-    with suppress(BeamLostError):  # then they are none that anybody learns
-        small = small_errors(
-            ring, ready.problem, ready.known, usual, start.nuisances, about,
-            learn=True, noisy=ready.estimated,
-        )  # fmt: skip
+    for sizes, errors in starts:
+        with suppress(BeamLostError):  # then they are none that anybody learns
+            small = small_errors(
+                ring, ready.problem, ready.known, sizes, start.nuisances, about, errors,
+                learn=True, noisy=ready.estimated,
+            )  # fmt: skip
+            break
     if small is None or (small.evidence is not None and small.evidence < CLEAR):
-        if few is None or (few.full and search.most > FEW):
+        if few is None:  # errors all along the ring: a few names at most, nothing without one
+            few = explain(replace(search, most=min(FEW, search.most), unnamed=False), ready.before)
+        elif few.full and search.most > FEW:
             few = explain(search, ready.before)
         return Found(few)
     return Found(*_among(ring, ready, search, small))
+
+
+def _errors(found: Found, small: SmallErrors) -> list[Cause]:
+    """The likeliest small errors beside an explanation."""
+    return small.estimate(found.explanation.fit, turns_of(found.explanation).whitening)
 
 
 def _crowded(ready: Prepared) -> bool:
@@ -119,25 +147,32 @@ def _among(
     narrow = replace(search, most=few, names_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(ready.problem.judgement.retaken):
-        tried = _beside(explanation, doubted=learn)
+        tried = _beside(explanation, small if learn else None)
         if tried is None:
             break
         search.progress("background with what was found")
         beside, causes = tried
-        errors = small.estimate(beside, turns_of(explanation).whitening)
+        weigh = not explanation.count and beside is explanation.fit  # one of the small errors
+        errors = [
+            replace(error, amount=0.0) if error in causes else error
+            for error in small.estimate(beside, turns_of(explanation).whitening)
+        ]
         try:
             again = small_errors(
                 ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
-                learn=learn, noisy=learn and ready.estimated,
+                learn=learn, noisy=learn and ready.estimated, weigh=weigh,
             )  # fmt: skip
         except BeamLostError:
             break  # what was found is no place from which they can be taken again
+        if again.apart is not None and again.apart > AMOUNT:
+            narrow = replace(narrow, granted=frozenset((c.effect, c.element) for c in causes))
         other = explain(replace(narrow, problem=again.problem), again.before)
         if not explanation.count and not other.count:
             break  # it was a small error after all
         small, explanation = again, other
     if explanation.full and search.most > few:
-        explanation = explain(replace(search, problem=small.problem), small.before)
+        whole = replace(search, problem=small.problem, granted=narrow.granted)
+        explanation = explain(whole, small.before)
     if explanation.fit.causes and not explanation.fit.kicks:
         return _settled(ring, ready, explanation, small)
     return explanation, small
@@ -169,7 +204,9 @@ def strongest(explanation: Explanation) -> Cause:
     return explanation.fit.causes[int(np.argmax(clear))]
 
 
-def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Cause, ...]] | None:
+def _beside(
+    explanation: Explanation, learnt: SmallErrors | None
+) -> tuple[Fit, tuple[Cause, ...]] | None:
     """Beside which fit, and with which causes, small errors have to be taken again; None: they
     stand.
 
@@ -179,13 +216,15 @@ def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Caus
     for a small error: where nothing was found the likeliest fault has to be weighed without it.
     """
     if not explanation.count:
-        scan = explanation.first
-        top = int(np.argmax(scan.statistic)) if doubted and len(scan.statistic) else -1
-        if top < 0 or scan.statistic[top] < DOUBT:
+        if learnt is None:
             return None
-        name, place = scan.hypotheses[top]
-        amount = np.copysign(abs(scan.amount[top]) ** (1 / find(name).power), scan.amount[top])
-        cause = Cause(name, place, float(amount))
+        estimate = learnt.estimate(explanation.fit, turns_of(explanation).whitening)
+        cause = outlier(estimate, learnt.sizes)
+        if cause is not None:
+            return explanation.fit, (cause,)
+        cause = _likeliest(explanation)
+        if cause is None:
+            return None
         tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
         return (tried, tried.causes) if tried.good else None
     found = explanation.fit
@@ -194,6 +233,39 @@ def _beside(explanation: Explanation, *, doubted: bool) -> tuple[Fit, tuple[Caus
         return None
     # the others may be the background's
     return found, (strongest(explanation),) if explanation.named else ()
+
+
+def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | None:
+    """The small error that no machine in good order has: it outweighs its family by far.
+
+    A family of which the readings see few (four correctors that are set) takes its size from such a
+    one, and so hides it.
+
+    Args:
+        estimate: the likeliest small errors.
+        sizes: rms of their families, as learnt: where all are large, so is what is usual.
+    """
+    usual = {name: find(name).background or np.inf for name in sizes}
+    common = max(1.0, float(np.median([sizes[name] / usual[name] for name in sizes])))
+    squares = dict.fromkeys(sizes, 0.0)
+    for cause in estimate:
+        squares[cause.effect] += cause.amount**2
+    far = [c for c in estimate if 2 * c.amount**2 > squares[c.effect]]
+    worst = max(far, key=lambda c: abs(c.amount) / usual[c.effect], default=None)
+    if worst is None or abs(worst.amount) < OUTLYING * common * usual[worst.effect]:
+        return None
+    return worst
+
+
+def _likeliest(explanation: Explanation) -> Cause | None:
+    """What the scan sees most of, if that is to be doubted."""
+    scan = explanation.first
+    top = int(np.argmax(scan.statistic)) if len(scan.statistic) else -1
+    if top < 0 or scan.statistic[top] < DOUBT:
+        return None
+    name, place = scan.hypotheses[top]
+    amount = np.copysign(abs(scan.amount[top]) ** (1 / find(name).power), scan.amount[top])
+    return Cause(name, place, float(amount))
 
 
 def freedom(problem: Problem, result: Fit) -> int:

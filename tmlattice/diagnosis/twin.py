@@ -6,6 +6,7 @@ lattice file starts from both.
 """
 
 import base64
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,13 @@ from tmlattice.measurement.documents import read_document
 Array = NDArray[np.float64]
 
 FORMAT = "tmlattice-known"
+BESIDE = ".known.json"
+"""What the name of a lattice file ends in besides."""
 
 
 def known_beside(lattice: Path) -> Path:
     """Where the knowledge of a lattice file stands."""
-    return lattice.with_name(f"{lattice.name}.known.json")
+    return Path(f"{lattice}{BESIDE}")
 
 
 def known_of(diagnosis: Diagnosis) -> Known | None:
@@ -64,14 +67,15 @@ def _in_ring(cause: Cause) -> bool:
     return isinstance(effect, RingEffect) and not effect.calibrates
 
 
-def known_document(known: Known) -> dict[str, Any]:
-    """As it stands in a file."""
+def known_document(known: Known, lattice: Path) -> dict[str, Any]:
+    """As it stands in a file, beside the lattice file that it belongs to."""
     from tmlattice import __version__
 
     return {
         "format": FORMAT,
         "version": 1,
         "package": __version__,
+        "lattice_sha256": hashlib.sha256(lattice.read_bytes()).hexdigest(),
         "causes": [
             {"effect": c.effect, "element": c.element, "amount": c.amount} for c in known.causes
         ],
@@ -93,10 +97,19 @@ def read_known(path: Path, ring: Ring) -> Known:
     """What stands beside a lattice file.
 
     Raises:
-        MeasurementError: it is damaged, or of another ring.
+        MeasurementError: it is damaged, or of another ring, or the lattice file was changed since.
     """
     document = read_document(path, "known", FORMAT)
+    lattice = path.with_name(path.name.removesuffix(BESIDE))
+    made_for = document.get("lattice_sha256")
+    if made_for is not None and hashlib.sha256(lattice.read_bytes()).hexdigest() != made_for:
+        raise MeasurementError(
+            f"{path}: '{lattice}' is not the file any more that it was written with; remove it, or "
+            "write both anew (--lattice-out)"
+        )
     rows = document["small_errors"]
+    if len({(row["effect"], row["element"]) for row in rows}) < len(rows):
+        raise MeasurementError(f"{path}: a small error stands twice; write it anew")
     seen = _directions(path, document["seen"], len(rows))
     share = np.array(document["seen"]["share"], dtype=float)
     places: dict[str, set[str | None]] = {}

@@ -34,7 +34,6 @@ from tmlattice.effects.effect import (
     CATALOGUE,
     Effect,
     LaunchEffect,
-    Monitors,
     ReadingEffect,
     RingEffect,
     find,
@@ -43,7 +42,8 @@ from tmlattice.effects.effect import (
     register,
 )
 from tmlattice.effects.radiation import expected_loss, expected_radiation
-from tmlattice.effects.sizes import background_rms
+from tmlattice.effects.reading import Monitors
+from tmlattice.effects.sizes import background_rms, rare
 
 __all__ = [
     "CATALOGUE",
@@ -67,6 +67,7 @@ __all__ = [
     "modelled",
     "monitors_with",
     "names",
+    "rare",
     "register",
     "set_elements",
 ]

@@ -7,7 +7,6 @@ To add an effect, write a class of one of them and `register` it: see docs/new_e
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from tmlattice.effects.build import Build, Where
 from tmlattice.effects.cause import Cause
+from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
@@ -26,6 +26,10 @@ Group = Literal[
     "quadrupoles", "bends", "correctors", "sextupoles", "insertion devices", "monitors", "beam"
 ]
 """Effects that a figure draws in one colour."""
+
+
+LEAST_LEFT = 0.01
+"""Share of a strength below which nothing is left of it."""
 
 
 class Effect(ABC):
@@ -61,6 +65,9 @@ class Effect(ABC):
         remedy: what takes it away, of the element's name in {}: "turn {} upright".
         to_check: what to look at on the machine, one sentence.
         natural: no fault: known physics that the model leaves out, and nothing is to be repaired.
+        odds: how often it is the fault where it stands for itself (see `stands_for`), beside an
+            ordinary kind of fault: a field that no magnet there makes is rarer than a magnet whose
+            own field is wrong.
     """
 
     name: ClassVar[str]
@@ -90,6 +97,7 @@ class Effect(ABC):
     remedy: ClassVar[str] = "find out what acts at {}"
     to_check: ClassVar[str] = "Look at what stands there, and at what its record says."
     natural: ClassVar[bool] = False
+    odds: ClassVar[float] = 1.0
 
     @property
     def label(self) -> str:
@@ -108,6 +116,17 @@ class Effect(ABC):
         the quadrupole's own gradient. Most stand for themselves.
         """
         return self.name, 1.0
+
+    def chain(self, amount: float) -> float:
+        """d readings / d amount of what is there, over a signature, which is of more on top of it.
+
+        Where two amounts multiply, as (1 + a)(1 + b), nothing is left at a = -1 that more of the
+        effect could act on: near to it, `LEAST_LEFT` is taken.
+        """
+        if not self.multiplies:
+            return float(self.power * amount ** (self.power - 1))
+        left = 1 + amount
+        return float(1 / np.copysign(max(abs(left), LEAST_LEFT), left))
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.
@@ -293,90 +312,6 @@ class LaunchEffect(Effect):
     @abstractmethod
     def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
         """Launches whose weighted mean reading is the reading: weights [node], [node, shot, 6]."""
-
-
-@dataclass
-class Monitors:
-    """What each monitor makes of the beam: all errors at once.
-
-    reading = diag(1 + gain) C Rot(roll) beam + offset, C = [[1, c], [c, 1]], then the swap, then
-    noise; Rot: x_read = x cos + y sin, y_read = -x sin + y cos.
-
-    Attributes:
-        gain, offset: [monitor, 2], relative and m.
-        roll, coupling: [monitor], rad and 1.
-        late: how many turns after the beam's turn t comes what it calls turn t, [monitor].
-        swapped, silent, frozen: [monitor], true or false.
-    """
-
-    gain: Array
-    offset: Array
-    roll: Array
-    coupling: Array
-    late: Array
-    swapped: NDArray[np.bool_]
-    silent: NDArray[np.bool_]
-    frozen: NDArray[np.bool_]
-
-    @classmethod
-    def perfect(cls, count: int) -> "Monitors":
-        """Monitors that read where the beam is."""
-        plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
-        one = np.zeros(count)
-        return cls(plane, plane.copy(), one, one.copy(), one.copy(), flag, flag.copy(), flag.copy())
-
-    def copy(self) -> "Monitors":
-        """Monitors of their own with the same errors."""
-        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
-
-    def matrix(self) -> Array:
-        """diag(1 + gain) C Rot(roll), then the swap: d reading / d beam, [monitor, 2, 2]."""
-        cos, sin, c = np.cos(self.roll), np.sin(self.roll), self.coupling
-        turned = np.array([[cos + -c * sin, sin + c * cos], [c * cos - sin, c * sin + cos]])
-        matrix = (1 + self.gain)[:, :, None] * np.moveaxis(turned, -1, 0)
-        matrix[self.swapped] = matrix[self.swapped][:, ::-1]
-        return np.asarray(matrix)
-
-    def constant(self) -> Array:
-        """What they read without a beam, [monitor, 2], m."""
-        return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
-
-    @property
-    def ahead(self) -> int:
-        """Turns of the beam, behind those that are asked for, of which some monitor tells."""
-        return int(max(np.ceil(self.late.max(initial=0.0)), 0))
-
-    def counted(self, beam: Array, turns: int, before: Array | float = np.nan) -> Array:
-        """The beam on the turns that each monitor counts, [shot, turn, monitor, 2].
-
-        Args:
-            beam: on turns from 0 on, `ahead` more than are asked for.
-            turns: of each shot.
-            before: where it was before turn 0, of a shape that fits [shot, turn, monitor, 2].
-
-        Raises:
-            EffectError: a monitor is off by a part of a turn.
-        """
-        if not self.late.any():
-            return beam[:, :turns]
-        if (self.late != np.round(self.late)).any():
-            raise EffectError("monitor_turn_offset is a whole number of turns, as 1 or -2")
-        seen = beam[:, :turns].copy()
-        for monitor in np.flatnonzero(self.late):
-            at = np.arange(turns) + round(self.late[monitor])
-            own = beam[:, np.maximum(at, 0), monitor]
-            outside = np.broadcast_to(before, seen.shape)[:, :, monitor]
-            seen[:, :, monitor] = np.where((at < 0)[None, :, None], outside, own)
-        return seen
-
-    def read(self, beam: Array) -> Array:
-        """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
-
-        A frozen monitor goes on telling what it does: see `machine`.
-        """
-        readings = np.einsum("mij,...mj->...mi", self.matrix(), beam) + self.constant()
-        readings[..., self.silent, :] = np.nan
-        return np.asarray(readings)
 
 
 class Catalogue(dict[str, Effect], Speaks):

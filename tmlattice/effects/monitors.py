@@ -5,7 +5,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects.effect import Monitors, ReadingEffect, register
+from tmlattice.effects.effect import ReadingEffect, register
+from tmlattice.effects.reading import Monitors
 
 Array = NDArray[np.float64]
 

@@ -43,6 +43,7 @@ class _Gradient(RingEffect):
     responds = True
     unit = "1/m"
     largest = 0.03
+    odds = 0.1
     sits_on_text = "quadrupoles, skew quadrupoles, sextupoles, wigglers, markers"
 
     def sits_on(self, element: Element) -> bool:

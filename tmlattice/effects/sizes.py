@@ -1,11 +1,12 @@
-"""How large the small errors of a machine in good order are."""
+"""What is likely beforehand: how large small errors are, and which faults are rare."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tmlattice.effects.effect import CATALOGUE, find
+from tmlattice.effects.effect import CATALOGUE, RingEffect, find
 from tmlattice.errors import EffectError
+from tmlattice.lattice import Ring
 
 
 def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
@@ -43,3 +44,19 @@ def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
     if any(not 0 <= rms < np.inf for rms in chosen.values()):
         raise EffectError("a background's rms is zero or more")
     return {name: rms for name, rms in chosen.items() if rms}
+
+
+def rare(ring: Ring, effects: Sequence[str]) -> dict[tuple[str, str | None], float]:
+    """Odds of each (effect, place) that is less likely than an ordinary fault.
+
+    Args:
+        ring: the design.
+        effects: names.
+    """
+    return {
+        (name, place): effect.odds
+        for name in effects
+        if (effect := find(name)).odds != 1 and isinstance(effect, RingEffect)
+        for place in effect.places(ring)
+        if any(effect.stands_for(ring.elements[i])[0] == name for i in effect.members(ring, place))
+    }

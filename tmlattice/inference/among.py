@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky
 from scipy.linalg.lapack import dtrtri
 
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.newton import Fit, fit, settled
@@ -320,6 +320,8 @@ def small_errors_of(
         if alone.projection is None:
             raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
         slopes = _signatures(inner, alone, known.hypotheses)
+        on = [find(n).chain(a) for (n, _), a in zip(known.hypotheses, amounts, strict=True)]
+        slopes = np.array(on)[:, None] * slopes
         shift = (amounts - known.amounts) @ slopes
         spread = known.mixed(known.rms[:, None] * slopes)
         if learn:
@@ -332,8 +334,9 @@ def small_errors_of(
             known = replace(known, rms=known.rms * found.scale[belongs])
             spread = found.scale[belongs][:, None] * spread
         among = Among(
-            places=problem.places, fixed=(), amounts=problem.amounts, judgement=problem.judgement,
-            inner=inner, known=known, spread=spread.reshape(-1, *inner.valid.shape),
+            places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
+            judgement=problem.judgement, inner=inner, known=known,
+            spread=spread.reshape(-1, *inner.valid.shape),
             shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
         point = settled(among, causes, alone.nuisances)

@@ -64,12 +64,14 @@ class Problem(ABC):
 
     Attributes:
         places: number of places of each effect, for the prior.
+        rare: hypotheses that are less likely than others of their kind, and by which factor.
         fixed: causes that are there and are not fitted.
         amounts: prior of an amount.
         judgement: thresholds.
     """
 
     places: Mapping[str, float]
+    rare: Mapping[Hypothesis, float] = field(default_factory=dict, repr=False)
     fixed: tuple[Cause, ...] = ()
     amounts: AmountPrior = EVEN
     judgement: Judgement = DEFAULT
@@ -77,7 +79,8 @@ class Problem(ABC):
     def prior(self, hypothesis: Hypothesis) -> float:
         """Log probability of one effect at one place, before the data."""
         count = len(self.places) * self.places.get(hypothesis[0], 1)
-        return float(np.log((1 - self.judgement.unknown) / count))
+        odds = self.rare.get(hypothesis, 1.0)
+        return float(np.log((1 - self.judgement.unknown) * odds / count))
 
     def unknown_prior(self, places: int) -> float:
         """The same for something unknown at one of so many places."""

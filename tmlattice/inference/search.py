@@ -32,6 +32,9 @@ from tmlattice.inference.scan import (
 
 log = logging.getLogger(__name__)
 
+AMONG = 10
+"""Readings for each one that is wrong for once: of a few, such as two tunes, none is."""
+
 Flags = NDArray[np.bool_]
 Reading = tuple[int, ...]
 """Where it stands among the problem's readings."""
@@ -51,6 +54,7 @@ class Search:
         names_first: what has a name goes before a free kick. Else that is tried where a free kick
             took what a name nearly explains, and the evidence decides.
         enough: chi-square at which nothing is left to be explained, and no further look is taken.
+        granted: hypotheses of which it is decided already that something is there.
         seed: of the threshold's simulation.
         progress: told what was found.
     """
@@ -62,6 +66,7 @@ class Search:
     by_evidence: bool = False
     names_first: bool = False
     enough: float = -np.inf
+    granted: frozenset[Hypothesis] = frozenset()
     seed: int = 0
     progress: Callable[[str], None] = lambda _: None
 
@@ -175,6 +180,7 @@ def _run(search: Search, before: Fit) -> Explanation:
     state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
     seen: set[frozenset[object]] = set()
     first: Look | None = None
+    spiked = False  # readings were left out since the choices were revised
     while True:
         state, look = _look(search, state)
         first = first or look
@@ -186,13 +192,17 @@ def _run(search: Search, before: Fit) -> Explanation:
         told = () if seen or search.by_evidence else ("named",)
         options = [option for option in options if option.gain > 0 or option.kind in told]
         seen.add(state.names)
-        if not options:
+        if not options and not spiked:
             break
+        if not options:
+            state, spiked = _revised(search, state), False
+            continue
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
         search.progress(best.name)
         state = _taken(search, state, best, look)
-        if state.count > 1:
+        spiked = best.kind == "reading" and state.count > 1
+        if state.count > 1 and not spiked:
             state = _revised(search, state)
         if state.fit.chi2 <= search.enough:
             break
@@ -243,8 +253,8 @@ def _options(search: Search, state: State, look: Look) -> list[Option]:
     statistic = float(look.named.statistic.max(initial=0.0))
     rate = judge.rate("named")
     detection = Detection(statistic, look.named.threshold(rate), look.named.p_value(statistic))
-    if detection.p_value < rate:
-        top = look.named.hypotheses[int(look.named.statistic.argmax())]
+    top = look.named.hypotheses[int(look.named.statistic.argmax())] if statistic > 0 else None
+    if top is not None and top not in search.granted and detection.p_value < rate:
         freedom = problem.certainty(state.fit.point, top)
         detection = Detection(
             statistic,
@@ -291,9 +301,9 @@ def _unnamed(
 
 def _spike(search: Search, state: State) -> list[Option]:
     """The reading that is least explained, left out."""
-    if not search.unnamed:
-        return []
     problem, judge = state.problem, state.problem.judgement
+    if not search.unnamed or int(problem.valid.sum()) < AMONG * (len(state.spikes) + 1):
+        return []
     clean, size = problem.left(state.fit.point)
     statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
     worst = tuple(int(i) for i in np.unravel_index(int(statistic.argmax()), statistic.shape))

@@ -41,12 +41,14 @@ class Sizes:
         covariance: of their logarithms, [family, family].
         noise: scale of each part of the noise, over its first guess, [part].
         log_evidence: over that of no small errors and the noise as guessed.
+        log_marginal: of the readings, up to a constant.
     """
 
     scale: Array
     covariance: Array
     noise: Array
     log_evidence: float
+    log_marginal: float
 
     @property
     def error(self) -> Array:
@@ -101,6 +103,7 @@ def learn_sizes(
         np.asarray(covariance[:count, :count], dtype=float),
         np.exp(size[count:]),
         float(now.value + occam - none),
+        float(now.value + occam),
     )
 
 

@@ -90,7 +90,8 @@ class Together(Problem):
         names = dict.fromkeys(name for part in parts for name in part.monitors)
         one = parts[0]
         return cls(
-            places=one.places, fixed=one.fixed, amounts=one.amounts, judgement=one.judgement,
+            places=one.places, rare=one.rare, fixed=one.fixed, amounts=one.amounts,
+            judgement=one.judgement,
             parts=tuple(replace(part, fixed=()) for part in parts), names=tuple(names),
             starts=tuple(part.first for part in parts), active=active,
         )  # fmt: skip

@@ -94,7 +94,7 @@ class Tracker:
 
         if self._child is None:
             self._child = subprocess.Popen(
-                [sys.executable, "-c", _CHILD],
+                [sys.executable, "-P", "-c", _CHILD],  # nothing of the working directory
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -121,9 +121,7 @@ class Tracker:
 
 
 _CHILD = """
-import sys
-sys.path = [place for place in sys.path if place]  # not the working directory
-import os, pickle, struct, warnings
+import os, pickle, struct, sys, warnings
 source, sink = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)  # what AT prints is no answer
 warnings.simplefilter("ignore")

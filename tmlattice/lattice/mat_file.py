@@ -28,7 +28,7 @@ def check_mat(path: Path) -> None:
     """
     if not path.is_file():
         raise LatticeError(f"no MATLAB file '{path}'; check the path")
-    command = [sys.executable, "-c", _CHILD, str(path)]
+    command = [sys.executable, "-P", "-c", _CHILD, str(path)]  # nothing of the working directory
     try:
         child = subprocess.run(
             command, capture_output=True, timeout=SECONDS, check=False, text=True, errors="replace"

@@ -1,7 +1,7 @@
 """The closed orbit of the stored beam, as it is."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +12,16 @@ from tmlattice.measurement.checks import (
     check_values,
     checked_shots,
     keep,
-    monitor_places,
-    shot_places,
-    spread,
 )
 from tmlattice.measurement.monitors import Names, noise_table
-from tmlattice.measurement.shown import Shown
+from tmlattice.measurement.shots import Shots
 from tmlattice.measurement.trajectory import Settings
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ClosedOrbit(Shown):
+class ClosedOrbit(Shots):
     """Closed orbits, absolute: what the monitors read, offsets and all.
 
     Attributes:
@@ -39,6 +36,8 @@ class ClosedOrbit(Shown):
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
     """
+
+    READ: ClassVar[str] = "orbit"
 
     orbit: Array
     monitors: tuple[str, ...]
@@ -66,38 +65,4 @@ class ClosedOrbit(Shown):
             noise=noise_table(self.noise, monitors),
             settings=settings,
             shots=shots,
-        )
-
-    def in_order_of(self, monitors: Sequence[str]) -> "ClosedOrbit":
-        """The same with other monitors, such as a ring's: NaN where one was not read.
-
-        Raises:
-            UnknownNameError: this measurement has a monitor that is not among them.
-        """
-        places, number = monitor_places(monitors, self.monitors), len(monitors)
-        return replace(
-            self,
-            orbit=spread(self.orbit, places, number),
-            monitors=tuple(monitors),
-            noise=spread(self.noise, places, number),
-        )
-
-    def select(
-        self, shots: Sequence[int] | None = None, monitors: Sequence[str] | None = None
-    ) -> "ClosedOrbit":
-        """A part of the shots and monitors, in the order asked for; None: all.
-
-        Raises:
-            UnknownNameError: a monitor that is not there.
-            MeasurementError: a shot that is not there, or nothing is left.
-        """
-        at = shot_places(self.shots, self.shots if shots is None else shots)
-        here = monitor_places(self.monitors, self.monitors if monitors is None else monitors)
-        return replace(
-            self,
-            orbit=self.orbit[at][:, here],
-            monitors=tuple(self.monitors[i] for i in here),
-            noise=None if self.noise is None else self.noise[here],
-            settings=tuple(self.settings[i] for i in at) if self.settings else (),
-            shots=tuple(self.shots[i] for i in at),
         )

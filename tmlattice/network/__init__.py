@@ -6,10 +6,15 @@
 >>> symplectic_penalty(network.W1, network.W2).sum()
 """
 
-from tmlattice.network.network import TaylorNetwork
-from tmlattice.network.stored import load_network, save_network
-from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
-from tmlattice.network.symplectic_network import SymplecticNetwork
+from tmlattice.errors import missing_package
+
+try:
+    from tmlattice.network.network import TaylorNetwork
+    from tmlattice.network.stored import load_network, save_network
+    from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
+    from tmlattice.network.symplectic_network import SymplecticNetwork
+except ModuleNotFoundError as error:  # torch, of which a diagnosis needs nothing
+    raise missing_package(error, "networks, and fits of their weights, need", "network") from error
 
 __all__ = [
     "SymplecticNetwork",

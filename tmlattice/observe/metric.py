@@ -19,6 +19,8 @@ from tmlattice.inference.whitening import Projection, Whitening
 
 Array = NDArray[np.float64]
 
+ROOM = 20_000_000
+"""Numbers of signatures that are held at once: many shots, and fewer hypotheses at a time."""
 KICKS = 128
 """Layers at a time, of free kicks."""
 
@@ -53,6 +55,7 @@ class TurnMetric(Metric):
         self.active = active
         self.shots = np.flatnonzero(active)
         self.weight = whitening.weight * active[:, None, None]
+        self.chunk = int(np.clip(ROOM // self.weight.size, 1, Metric.chunk))
 
     # --- named hypotheses -----------------------------------------------------------------------
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
@@ -99,8 +102,9 @@ class TurnMetric(Metric):
             independent.
         """
         grams, inners = [], []
-        for start in range(0, len(layers), KICKS):
-            rows, parts = self._free_rows(layers[start : start + KICKS], clean)
+        count = min(self.chunk, KICKS)
+        for start in range(0, len(layers), count):
+            rows, parts = self._free_rows(layers[start : start + count], clean)
             grams.append(np.einsum("kbpr,kbqr->kbpq", rows, rows, optimize=True))
             inners.append(np.einsum("kbpr,br->kbp", rows, parts, optimize=True))
         return np.concatenate(grams), np.concatenate(inners)

@@ -95,10 +95,7 @@ class Steady(Problem):
         if effect.multiplies and abs(1 + amount) < LEAST:
             return self._difference(point, cause, LEAST)
         (slope,) = self.signatures(point.view, point.nuisances, [(own.effect, own.element)])
-        chain = (
-            1 / (1 + amount) if effect.multiplies else effect.power * amount ** (effect.power - 1)
-        )
-        return self.as_rows(chain * slope)
+        return self.as_rows(effect.chain(amount) * slope)
 
     def _difference(self, point: Point, cause: int, h: float) -> Array:
         own = point.causes[cause]

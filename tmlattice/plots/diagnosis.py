@@ -72,8 +72,8 @@ def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]
         "anywhere in the scan.",
         plot_scan(diagnosis),
     )
-    first = next((f for f in diagnosis.findings if np.isfinite(f.detection.statistic)), None)
-    if first is not None and first.where is not None and np.ptp(first.where) < WIDE:
+    first = clearest(diagnosis)
+    if first is not None:
         yield (
             "scan-near",
             "The same scan around the clearest finding, linear, with the monitors. Later findings "
@@ -87,6 +87,14 @@ def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]
             "Readings of shots that the fit never saw less the model, as findings are added.",
             _figure(ax),
         )
+
+
+def clearest(diagnosis: Diagnosis) -> Finding | None:
+    """The first finding that the scan saw, if its place is narrow enough to be drawn near by."""
+    first = next((f for f in diagnosis.findings if np.isfinite(f.detection.statistic)), None)
+    if first is None or first.where is None or np.ptp(first.where) >= WIDE:
+        return None
+    return first
 
 
 def _figure(ax: Axes) -> Figure:
@@ -143,7 +151,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     assert finding.where is not None
     figure = plt.figure(figsize=(11, 5), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[6, 0.8])
-    low, high = _around(diagnosis, finding)
+    low, high = around(diagnosis, finding)
     _draw_scan(ax, diagnosis, 7.0)
     seen = [line.get_ydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
     places = [line.get_xdata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
@@ -174,7 +182,8 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     return figure
 
 
-def _around(diagnosis: Diagnosis, finding: Finding) -> tuple[float, float]:
+def around(diagnosis: Diagnosis, finding: Finding) -> tuple[float, float]:
+    """From and to which s a finding with a place is drawn near by, m."""
     assert finding.where is not None
     low, high = finding.where
     return max(low - ROOM, 0.0), min(high + ROOM, diagnosis.ring.length)

@@ -1,17 +1,20 @@
 """How a fit went."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from tmlattice.fitting.adam import FitResult
 from tmlattice.plots.strip import METHOD_COLOURS
+
+if TYPE_CHECKING:
+    from tmlattice.fitting import FitResult
 
 
 def plot_loss(
-    fit: FitResult,
+    fit: "FitResult",
     ax: Axes | None = None,
     floor: float | None = None,
     others: Mapping[str, float] | None = None,

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.plots.readings import AFTER, BEFORE, mark
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import lattice_strip, plain_log
 
 
 def plot_parts(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
@@ -29,7 +29,7 @@ def plot_parts(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
         ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label="design")
         ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with what was found")
         ax.axhline(1.0, color="k", linestyle="--", linewidth=1)
-        ax.set_yscale("log")
+        plain_log(ax)
         ax.set_ylabel("left / noise")
         ax.set_title(part.label, loc="left", fontsize="medium")
         ax.grid(alpha=0.25)

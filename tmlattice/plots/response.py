@@ -6,12 +6,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from tmlattice.beam.chain import Chain
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.optics import twiss
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import lattice_strip, plain_log
 
 
 def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
@@ -58,7 +57,7 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
         image[view.held[:-1][order]] = np.nan if title.endswith("result") else image[
             view.held[:-1][order]
         ]  # fmt: skip
-        limit = float(np.nanpercentile(abs(image), 99))
+        limit = 4.0 * float(np.nanmedian(abs(image)))  # a plane with few correctors sets no scale
         colours = plt.get_cmap("RdBu_r").with_extremes(bad="0.8")
         shown = ax.imshow(
             image.T, aspect="auto", cmap=colours, vmin=-limit, vmax=limit, origin="lower",
@@ -69,6 +68,27 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
         ax.set_title(title, loc="left", fontsize=10)
         figure.colorbar(shown, ax=ax, label="µm")
     axes[-1].set_xlabel("corrector, along s: horizontal, then vertical")
+    return figure
+
+
+def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
+    """What is left of each fitted corrector in its own plane before and after, in one scale."""
+    figure = plt.figure(figsize=(11, 4.2), layout="constrained") if figure is None else figure
+    view = result.response
+    plane = np.array([int(p == "y") for p in view.measured.planes])
+    shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
+    axes = figure.subplots(1, 2, sharey=True)
+    limit = 0.0
+    for ax, name, model in zip(axes, ("before", "after"), (view.design, view.model), strict=True):
+        left = 1e6 * (view.data - model)[shown][:, view.good]
+        left = left[np.arange(len(shown)), :, plane[shown]]
+        limit = limit or float(np.nanpercentile(abs(left), 98))
+        image = ax.imshow(left.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
+        rms = float(np.sqrt(np.nanmean(left**2)))
+        ax.set_title(f"{name}: {rms:.2g} µm rms", loc="left", fontsize="medium")
+        ax.set_xlabel("corrector: horizontal, then vertical")
+    axes[0].set_ylabel("monitor, along the ring")
+    figure.colorbar(image, ax=axes, label="measured less model [µm]")
     return figure
 
 
@@ -87,12 +107,10 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
         ax.plot(at, [1e6 * getattr(step, name) for step in steps], style, label=label)
     sigma = 1e6 * result.gap["noise"]
     ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    plain_log(ax)
     ax.set_ylabel("held-out rms [µm]")
-    ax.set_xticks(at, [s.effect.replace(", ", ",\n") for s in steps], fontsize=7)
+    names = [s.effect.replace(", ", ",\n").replace("_", " ") for s in steps]
+    ax.set_xticks(at, names, fontsize=7)
     ax.grid(alpha=0.25)
     ax.legend(frameon=False, fontsize=8)
     return ax

@@ -83,7 +83,7 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
     """
     known = ring if ring is None or isinstance(ring, Ring) else load_ring(ring)  # type: ignore[arg-type]
     if isinstance(measured, TuneReading):
-        return _tunes(measured)
+        return _tunes(measured, known)
     heights = [3, 3, 0.8] if known is not None else [3, 3]
     figure, axes = plt.subplots(
         len(heights), 1, figsize=(11, 6), sharex=True, height_ratios=heights, layout="constrained"
@@ -104,7 +104,9 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
     if known is None:
         axes[1].set_xlabel("monitor")
     if len(axes[0].lines) <= MOST:
-        axes[0].legend(fontsize="small", ncols=4, loc="upper right")
+        axes[0].legend(
+            fontsize="small", ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False
+        )
     axes[0].set_title(in_words(measured), loc="left", fontsize="medium")
     return figure
 
@@ -130,13 +132,30 @@ def _lines(measured: Any) -> Iterator[tuple[str, Array]]:
             yield f"{name} ({plane})", orbit
 
 
-def _tunes(measured: TuneReading) -> Figure:
-    figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
-    error = measured.tune_error
-    for plane, ax in enumerate(axes):
-        bars = None if error is None else error[:, plane]
-        ax.errorbar(measured.shots, measured.tune[:, plane], bars, fmt="o", capsize=3)
-        ax.set_ylabel(f"Q{'xy'[plane]}")
-        ax.grid(alpha=0.25)
-    axes[1].set_xlabel("shot")
+def _tunes(measured: TuneReading, ring: Ring | None) -> Figure:
+    """Tunes, and chromaticities where there are some, by shot; the ring's own beside them."""
+    told = [("Q{}", measured.tune, measured.tune_error)]
+    if measured.chromaticity is not None:
+        told.append(("chromaticity {}", measured.chromaticity, measured.chromaticity_error))
+    figure, axes = plt.subplots(
+        2, len(told), figsize=(4.5 + 3.5 * len(told), 5), sharex=True, squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
+    design = None if ring is None else np.mod(twiss(Chain.from_ring(ring)).total_tunes, 1.0)
+    shots = np.arange(len(measured.tune))
+    for column, (name, values, error) in enumerate(told):
+        for plane, ax in enumerate(axes[:, column]):
+            bars = None if error is None else error[:, plane]
+            ax.errorbar(shots, values[:, plane], bars, fmt="o", capsize=3, label="read")
+            if design is not None and not column:
+                ax.axhline(design[plane], color="0.4", linestyle="--", label="design")
+                ax.legend(fontsize="small")
+            ax.set_ylabel(name.format("xy"[plane]))
+            ax.ticklabel_format(axis="y", useOffset=False)
+            ax.grid(alpha=0.25)
+        axes[1, column].set_xlabel("shot")
+        if len(shots) <= MOST:
+            axes[1, column].set_xticks(shots, [str(shot) for shot in measured.shots])
+            axes[1, column].set_xlim(-0.5, len(shots) - 0.5)
+    figure.suptitle(in_words(measured), x=0.01, ha="left", fontsize="medium")
     return figure

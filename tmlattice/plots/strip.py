@@ -5,6 +5,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from tmlattice.lattice import Element, Ring
 
@@ -61,3 +62,11 @@ def extent(element: Element) -> tuple[float, float]:
 def _sign(element: Any) -> float:
     strength = element.k1 if element.kind == "quadrupole" else element.k2
     return float(strength)
+
+
+def plain_log(ax: Axes) -> None:
+    """A logarithmic axis upwards with 1, 2, 5, 10 beside it, not powers."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())

@@ -23,6 +23,8 @@ from tmlattice.plots import strip as strip_view
 from tmlattice.plots.diagnosis import (
     COLOURS,
     FLOOR,
+    around,
+    clearest,
     gap_labels,
     middles,
     noise_rms,
@@ -46,6 +48,9 @@ def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
         if left or not diagnosis.parts:
             made["readings"] = parts(diagnosis, left) if left else readings(diagnosis)
         made["scan"] = scan(diagnosis)
+        first = clearest(diagnosis)
+        if first is not None:
+            made["scan-near"] = scan(diagnosis, around(diagnosis, first))
         if diagnosis.heldout is not None:
             made["gap"] = gap(diagnosis)
         return made
@@ -265,14 +270,21 @@ def _amount(effect: str, power_of_it: float) -> str:
     return amount_text(effect, float(np.sign(power_of_it) * abs(power_of_it) ** (1 / power)))
 
 
-def scan(diagnosis: Diagnosis) -> Figure:
-    """How much better each hypothesis alone explains the data, before anything was found."""
+def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figure:
+    """How much better each hypothesis alone explains the data, before anything was found.
+
+    Args:
+        diagnosis: with a scan.
+        span: from and to which s, m: then linear, so that neighbours can be told apart.
+    """
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
     s = middles(diagnosis)
-    drawn = np.flatnonzero(np.isfinite(s) & (found.statistic > FLOOR))
+    low, high = span or (0.0, diagnosis.ring.length)
+    drawn = np.flatnonzero((s >= low) & (s <= high) & (found.statistic > FLOOR))
     drawn = drawn[np.argsort(-found.statistic[drawn])][:MOST]
     layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
     order = np.argsort(layers)
+    order = order[(layers[order] >= low) & (layers[order] <= high)]
     order_of = {group: k for k, group in enumerate(COLOURS)}
     kicks = np.maximum(free.statistic[order], FLOOR)
     traces = [_trace(layers[order], kicks, "a free kick in each shot", "@faint")]
@@ -290,7 +302,7 @@ def scan(diagnosis: Diagnosis) -> Figure:
         )  # fmt: skip
         shown.add(group)
     named, of_kicks = thresholds(diagnosis)
-    ends = [0.0, diagnosis.ring.length]
+    ends = [low, high]
     traces.append(_trace(ends, [named] * 2, f"threshold {named:.1f}", "@ink", dash="dash"))
     text = f"of free kicks {of_kicks:.1f}"
     traces.append(_trace(ends, [of_kicks] * 2, text, "@faint", dash="dot"))
@@ -301,6 +313,9 @@ def scan(diagnosis: Diagnosis) -> Figure:
         yaxis=_axis("fall of chi²", type="log", dtick=1, domain=[0.13, 1], exponentformat="power"),
         yaxis2={**_STRIP_AXIS, "domain": [0, 0.09]},
     )  # fmt: skip
+    if span is not None:
+        layout["xaxis"]["range"] = [low, high]
+        layout["yaxis"] = _axis("fall of chi²", domain=[0.13, 1], rangemode="tozero")
     return {"data": traces, "layout": layout, "strip": "y2"}
 
 

@@ -48,10 +48,15 @@ def render(template: str, provenance: Mapping[str, Any], **context: Any) -> str:
         lstrip_blocks=True,
     )
     stated = {
-        key: value if isinstance(value, str) else json.dumps(value)
+        key: value if isinstance(value, str) else json.dumps(_rounded(value))
         for key, value in provenance.items()
     }
     return environment.get_template(template).render(provenance=stated, **context)
+
+
+def _rounded(value: Any) -> Any:
+    """What a clock measured is not known to a nanosecond."""
+    return round(value, 1) if isinstance(value, float) else value
 
 
 def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Picture]:

@@ -7,6 +7,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
+from tmlattice.report.tables import NUMBERS, number_rows
 from tmlattice.report.text import (
     advice,
     closed_text,
@@ -25,6 +26,9 @@ from tmlattice.report.text import (
 )
 
 WIDTH = 100
+
+MOST = 8
+"""Tunes that are listed; the page has all."""
 
 SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 
@@ -76,7 +80,12 @@ def _gap_table(diagnosis: Diagnosis) -> list[str]:
     rows = [
         ("readings less model, rms", "before", "after"),
         *gap_rows(diagnosis),
-        ("noise of a reading", noise_text(diagnosis), ""),
         ("fractional tunes Qx, Qy", before, after),
     ]
-    return columns(rows)
+    noise = noise_text(diagnosis)
+    lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows)
+    numbers = number_rows(diagnosis)
+    if numbers:
+        lines += ["", *columns([NUMBERS, *numbers[:MOST]])]
+        lines += [f"and {len(numbers) - MOST} more"] if len(numbers) > MOST else []
+    return lines

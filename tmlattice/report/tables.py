@@ -14,6 +14,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.amounts import amount_text, scaled, words
+from tmlattice.report.text import NOT_HELD_OUT
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
 """By the group of an effect; all other elements are magnets."""
@@ -139,6 +140,33 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     ]
 
 
+NUMBERS = ("tunes", "read", "design", "as found")
+"""Head of `number_rows`."""
+
+
+def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
+    """Tunes and chromaticities: (which, read with its error, of the design, of the ring as found).
+
+    With the measurement and the shot where there are several.
+    """
+    rows: list[tuple[str, ...]] = []
+    told = [part for part in diagnosis.parts if part.numbers]
+    for part in told:
+        several = len({number.shot for number in part.numbers}) > 1
+        for number in part.numbers:
+            kind, _, plane = number.quantity.partition("_")
+            name = f"Q{plane}" if kind == "tune" else f"chromaticity {plane}"
+            name += f", shot {number.shot + 1}" if several else ""
+            name = f"{part.label}: {name}" if len(told) > 1 else name
+            digits = _digits(number.error)
+            read, *models, error = (
+                f"{value:.{digits}f}"
+                for value in (number.read, number.before, number.after, number.error)
+            )
+            rows.append((name, f"{read} ± {error}", *models))
+    return rows
+
+
 def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """All that limits what was said, in one place: (what, text).
 
@@ -148,6 +176,9 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
     """
     for warning in diagnosis.warnings:
         yield "warning", warning
+    if diagnosis.heldout is None:
+        what, _, judges = NOT_HELD_OUT.partition(": ")
+        yield what.lower(), judges
     if diagnosis.bad_monitors:
         yield "bad monitors, left out", ", ".join(diagnosis.bad_monitors)
     if diagnosis.left_out:

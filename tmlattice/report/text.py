@@ -41,11 +41,14 @@ def place_text(finding: Finding) -> str:
     return f"s = {finding.s:.2f} m; from {span}{between}"
 
 
+NOT_HELD_OUT = "Nothing was held out: nobody but the fit judges the gap"
+
+
 def closed_text(diagnosis: Diagnosis) -> str:
     """How much of the gap is closed on held-out shots."""
     gap = diagnosis.heldout
     if gap is None:
-        return "No shot was held out: nobody but the fit judges the gap"
+        return NOT_HELD_OUT
     if diagnosis.by_steps and len(diagnosis.steps) < 2:
         return "Nothing was put into the model, so the gap stays"
     if diagnosis.findings and not diagnosis.causes:
@@ -120,10 +123,9 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return steps_sentence(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.priors:
-        return (
-            "Small errors all along the ring explain the readings; no single fault stands out "
-            "among them."
-        )
+        much = "the readings" if diagnosis.unexplained["p_value"] >= MUCH_MORE else "much, not all"
+        everywhere = f"Small errors all along the ring explain {much}"
+        return f"{everywhere}; no single fault stands out among them."
     if diagnosis.verdict == "distributed":
         return (
             "The data differ from the model all along the ring; no single place, and no few "
@@ -228,8 +230,12 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 def gap_sentence(diagnosis: Diagnosis) -> str:
     """How far the gap falls, on the readings that judge."""
     rows = gap_rows(diagnosis)
-    name, before, after = rows[-1]
-    return f"{name}: from {before} to {after}"
+    judges = rows if diagnosis.heldout is None else rows[-1:]
+    return "; ".join(f"{name}: from {before} to {after}" for name, before, after in judges)
+
+
+MUCH_MORE = 1e-4
+"""Chance that noise leaves as much, below which what is left is no noise."""
 
 
 def left_text(diagnosis: Diagnosis) -> str:
@@ -237,7 +243,7 @@ def left_text(diagnosis: Diagnosis) -> str:
     p_value = diagnosis.unexplained["p_value"]
     places = diagnosis.unexplained["places"]
     how = "noise" if p_value >= 0.01 else "slightly more than the noise"
-    how = how if p_value >= 1e-4 else "more than the noise"
+    how = how if p_value >= MUCH_MORE else "more than the noise"
     text = f"What is left is {how} ({_chance(p_value)})"
     if diagnosis.noise_estimated:
         text += "; the noise was taken from the same data, which weakens this check"
@@ -324,7 +330,9 @@ def _chi2(value: float) -> str:
 
 
 def noise_text(diagnosis: Diagnosis) -> str:
-    """The noise of a reading."""
+    """The noise of a reading; empty where no monitor reads."""
+    if not np.isfinite(diagnosis.noise).any():
+        return ""
     x, y = (f"{1e6 * sigma:.1f} µm" if np.isfinite(sigma) else "no reading"
             for sigma in diagnosis.noise)  # fmt: skip
     return f"{x} in x, {y} in y" + (" (estimated)" if diagnosis.noise_estimated else "")

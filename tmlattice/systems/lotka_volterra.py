@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 from tqdm.auto import tqdm
 
+from tmlattice.errors import missing_package
 from tmlattice.maps import TaylorMap, right_hand_side, taylor_map_of_ode
 from tmlattice.systems.comparison import Comparison
 from tmlattice.systems.learning import fit_step_by_step, follow, weights_of
@@ -121,7 +122,10 @@ def race(
         seed: of the first weights and of dropout.
         progress: whether to show a bar.
     """
-    import torch
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise missing_package(error, "the networks of the race need", "reproduce") from error
 
     truth = solutions([LEARNED_FROM, *UNSEEN])
     learned = learn()

@@ -1,0 +1,144 @@
+"""Measured files of every kind, those of other programs too, and what an earlier diagnosis left."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+from command import tmlattice
+
+SMALL = Path(__file__).parent.parent / "lattices" / "small_ring.py"
+
+
+def unsealed(folder):
+    """A measurement that does not know its table: else every damaged one is refused at once."""
+    own = folder / "measurement.json"
+    document = json.loads(own.read_text())
+    document.pop("table_sha256", None)
+    own.write_text(json.dumps(document))
+
+
+def write_kinds(ten, folder):
+    """A folder of each kind of a stored beam's measurement: {kind: (command, its table)}."""
+    from tmlattice.machine.stored_beam import (
+        simulate_dispersion,
+        simulate_orbits,
+        simulate_tunes,
+        simulate_turns,
+    )
+    from tmlattice.measurement import write_measurement
+
+    made = {
+        "turn by turn": (simulate_turns(ten, turns=64, amplitude=3e-4, seed=1), "readings.csv"),
+        "closed orbit": (simulate_orbits(ten, shots=2, seed=1), "readings.csv"),
+        "dispersion": (simulate_dispersion(ten, seed=1), "readings.csv"),
+        "tunes": (simulate_tunes(ten, shots=2, seed=1), "tunes.csv"),
+    }
+    found = {}
+    for kind, (simulation, table) in made.items():
+        name = kind.replace(" ", "-")
+        write_measurement(folder / name, simulation.measured)
+        unsealed(folder / name)
+        words = ["diagnose", "ring.json", name]
+        found[f"{kind}, JSON"] = words, f"{name}/measurement.json"
+        found[f"{kind}, table"] = words, f"{name}/{table}"
+    return found
+
+
+def write_known(folder):
+    """What a diagnosis leaves known beside the ring that it found, for the next one."""
+    words = ["diagnose", "ring.json", "closed-orbit", "--background", "all"]
+    tmlattice(*words, "--lattice-out", "twin.json", "-q", cwd=folder, check=0)
+    return {"known beside a twin": (["diagnose", "twin.json", "closed-orbit"],
+                                    "twin.json.known.json")}  # fmt: skip
+
+
+def write_network(ten, folder):
+    """Weights of a network, beside turns."""
+    from tmlattice.network import TaylorNetwork
+    from tmlattice.network.stored import save_network
+
+    save_network(TaylorNetwork.from_ring(ten), folder / "network.pt")
+    words = ["diagnose", "ring.json", "turns", "--network", "network.pt"]
+    return {"network.pt": (words, "network.pt")}
+
+
+def write_sdds(path, monitors, readings):
+    """Arrays of one page, after the format's definition."""
+    lines = ["SDDS1", "!# little-endian"]
+    names = [f"{m}:{p}" for m in monitors for p in "XY"]
+    lines += [f"&array name={n}, type=double, units=mm, dimensions=1, &end" for n in names]
+    body = np.int32(0).tobytes()
+    for values in 1e3 * readings.reshape(len(readings), -1).T:
+        body += np.int32(len(values)).tobytes() + values.astype("<f8").tobytes()
+    path.write_bytes("\n".join([*lines, "&data mode=binary, &end", ""]).encode() + body)
+
+
+def write_control_room(folder):
+    """The templates of `import --example`, SDDS, and what reads each."""
+    from tmlattice import read_measurement
+
+    words = ["import", "--example", "--lattice", "ring.json", "--out", "room"]
+    tmlattice(*words, "-q", cwd=folder, check=0)
+    turns = read_measurement(folder / "turns")
+    write_sdds(folder / "room/readings.sdds", turns.monitors, turns.readings[:, 0])
+    wide = ["diagnose", "ring.json", "room/readings_wide.csv", "--map", "room/map.yaml"]
+    tmlattice("import", "room/response.csv", "--lattice", "ring.json", "--out", "bring", "-q",
+              cwd=folder, check=0)  # fmt: skip
+    check = lambda name: (["check", "ring.json", name], name)  # noqa: E731
+    return {
+        "table, a row a shot": (wide, "room/readings_wide.csv"),
+        "map of a table": (wide, "room/map.yaml"),
+        "table, a row a reading": check("room/readings_long.csv"),
+        "table, HDF5": check("room/readings.h5"),
+        "table, SDDS": check("room/readings.sdds"),
+        "table of a response": (
+            ["import", "room/response.csv", "--lattice", "ring.json", "--out", "bring", "--force"],
+            "room/response.csv",
+        ),
+    }
+
+
+def write_loco(folder):
+    """A LOCO file, whose variables the tests of the importer make."""
+    import scipy.io
+    from test_import import simulated
+
+    scipy.io.savemat(folder / "loco.mat", simulated.__wrapped__())
+    tmlattice("import", "loco.mat", "--out", "loco", "-q", cwd=folder, check=0)
+    return {"LOCO .mat": (["import", "loco.mat", "--out", "loco", "--force"], "loco.mat")}
+
+
+def write_calibration(folder):
+    """What monitors and correctors do, of `predict`."""
+    from tmlattice.effects import Cause
+    from tmlattice.observe import calibration
+
+    causes = [Cause("monitor_gain_x", "m::0", 0.01), Cause("corrector_calibration", "ch::0", 0.02)]
+    calibration.write_calibration(folder / "calibration.json", causes)
+    words = ["predict", "ring.json", "--calibration", "calibration.json", "--out", "told.csv"]
+    tmlattice(*words, "-q", cwd=folder, check=0)
+    return {"calibration": (words, "calibration.json")}
+
+
+def write_lattices(ten, folder):
+    """MAD-X's TWISS table, and OCELOT's code, which is run: what is wrong in it is a sentence."""
+    from test_other_codes import table
+
+    table(ten, folder)
+    shutil.copy(SMALL, folder / "small.py")
+    return {"TFS": (["info", "twiss.tfs"], "twiss.tfs"),
+            "OCELOT .py": (["info", "small.py"], "small.py")}  # fmt: skip
+
+
+def write_measured(ten, folder):
+    """All of them, in a folder that has `ring.json` and first turns: {format: (command, file)}."""
+    return {
+        **write_kinds(ten, folder),
+        **write_known(folder),
+        **write_network(ten, folder),
+        **write_control_room(folder),
+        **write_loco(folder),
+        **write_calibration(folder),
+        **write_lattices(ten, folder),
+    }

@@ -1,0 +1,94 @@
+"""What monitors make of where the beam is."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import EffectError
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Monitors:
+    """What each monitor makes of the beam: all errors at once.
+
+    reading = diag(1 + gain) C Rot(roll) beam + offset, C = [[1, c], [c, 1]], then the swap, then
+    noise; Rot: x_read = x cos + y sin, y_read = -x sin + y cos.
+
+    Attributes:
+        gain, offset: [monitor, 2], relative and m.
+        roll, coupling: [monitor], rad and 1.
+        late: how many turns after the beam's turn t comes what it calls turn t, [monitor].
+        swapped, silent, frozen: [monitor], true or false.
+    """
+
+    gain: Array
+    offset: Array
+    roll: Array
+    coupling: Array
+    late: Array
+    swapped: NDArray[np.bool_]
+    silent: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
+
+    @classmethod
+    def perfect(cls, count: int) -> "Monitors":
+        """Monitors that read where the beam is."""
+        plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
+        one = np.zeros(count)
+        return cls(plane, plane.copy(), one, one.copy(), one.copy(), flag, flag.copy(), flag.copy())
+
+    def copy(self) -> "Monitors":
+        """Monitors of their own with the same errors."""
+        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
+
+    def matrix(self) -> Array:
+        """diag(1 + gain) C Rot(roll), then the swap: d reading / d beam, [monitor, 2, 2]."""
+        cos, sin, c = np.cos(self.roll), np.sin(self.roll), self.coupling
+        turned = np.array([[cos + -c * sin, sin + c * cos], [c * cos - sin, c * sin + cos]])
+        matrix = (1 + self.gain)[:, :, None] * np.moveaxis(turned, -1, 0)
+        matrix[self.swapped] = matrix[self.swapped][:, ::-1]
+        return np.asarray(matrix)
+
+    def constant(self) -> Array:
+        """What they read without a beam, [monitor, 2], m."""
+        return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
+
+    @property
+    def ahead(self) -> int:
+        """Turns of the beam, behind those that are asked for, of which some monitor tells."""
+        return int(max(np.ceil(self.late.max(initial=0.0)), 0))
+
+    def counted(self, beam: Array, turns: int, before: Array | float = np.nan) -> Array:
+        """The beam on the turns that each monitor counts, [shot, turn, monitor, 2].
+
+        Args:
+            beam: on turns from 0 on, `ahead` more than are asked for.
+            turns: of each shot.
+            before: where it was before turn 0, of a shape that fits [shot, turn, monitor, 2].
+
+        Raises:
+            EffectError: a monitor is off by a part of a turn.
+        """
+        if not self.late.any():
+            return beam[:, :turns]
+        if (self.late != np.round(self.late)).any():
+            raise EffectError("monitor_turn_offset is a whole number of turns, as 1 or -2")
+        seen = beam[:, :turns].copy()
+        for monitor in np.flatnonzero(self.late):
+            at = np.arange(turns) + round(self.late[monitor])
+            own = beam[:, np.maximum(at, 0), monitor]
+            outside = np.broadcast_to(before, seen.shape)[:, :, monitor]
+            seen[:, :, monitor] = np.where((at < 0)[None, :, None], outside, own)
+        return seen
+
+    def read(self, beam: Array) -> Array:
+        """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
+
+        A frozen monitor goes on telling what it does: see `machine`.
+        """
+        readings = np.einsum("mij,...mj->...mi", self.matrix(), beam) + self.constant()
+        readings[..., self.silent, :] = np.nan
+        return np.asarray(readings)
