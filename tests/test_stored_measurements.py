@@ -7,13 +7,11 @@ from importlib.resources import files
 import jsonschema
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tmlattice import read_measurement, write_measurement
-from tmlattice.cli.command import tmlattice
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 
@@ -280,11 +278,3 @@ def test_too_large_readings_are_not_written(tmp_path):
         with pytest.raises(MeasurementError, match=r"monitor 'a' reads 0.3 m in x"):
             write_measurement(tmp_path / "m", measured)
     assert not (tmp_path / "m").exists()
-
-
-def test_command_that_cannot_use_tunes_says_so(tmp_path):
-    write_measurement(tmp_path / "m", TuneReading([[0.1, 0.2]]))
-    with pytest.raises(MeasurementError, match="is a tune measurement; the check knows"):
-        CliRunner().invoke(
-            tmlattice, ["check", "petra3", str(tmp_path / "m")], catch_exceptions=False
-        )

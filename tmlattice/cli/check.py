@@ -52,7 +52,7 @@ def check(
 
     Wrong signs, units, names and orders everywhere; launches and noise that are not what is
     stated; silent, frozen, copied monitors; single readings far off. MEASUREMENT is a folder of
-    first turns or of an orbit response. The exit code is 0 where a diagnosis means something, 1
+    any kind. The exit code is 0 where a diagnosis means something, 1
     where something has to be mended first.
     """
     from contextlib import nullcontext
@@ -62,15 +62,9 @@ def check(
 
     with output_file(json_file) if json_file else nullcontext() as path:
         from tmlattice.diagnosis.doctor import check_data
-        from tmlattice.measurement import Measurement, OrbitResponse, in_words
 
         ring = open_ring(lattice, sequence, energy)
         data, _ = read_data(measurement, ring, map_file, unit, quiet)
-        if not isinstance(data, Measurement | OrbitResponse):
-            raise MeasurementError(
-                f"'{measurement}' is {in_words(data)}; the check knows first turns and orbit "
-                "responses"
-            )
         try:
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
         except (MeasurementError, UnknownNameError) as error:

@@ -62,7 +62,7 @@ class Checkup:
     """All that was looked at in a measurement.
 
     Attributes:
-        kind: "trajectory" or "orbit_response".
+        kind: of the measurement, as its folder has it.
         checks: in their order.
         provenance: what made it.
     """

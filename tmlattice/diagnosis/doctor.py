@@ -17,9 +17,20 @@ from numpy.typing import NDArray
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
+from tmlattice.diagnosis.stored_doctor import StoredData, stored_checks
 from tmlattice.effects import Cause, expected_radiation
+from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement import (
+    AnyMeasurement,
+    ClosedOrbit,
+    Dispersion,
+    Measurement,
+    OrbitResponse,
+    TuneReading,
+    TurnByTurn,
+    in_words,
+)
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.evidence import Names, Verdict, certain
 from tmlattice.observe.global_errors import Judge
@@ -51,7 +62,7 @@ SPIKE = 20.0
 @by_name
 def check_data(
     ring: Ring,
-    data: Measurement | OrbitResponse,
+    data: AnyMeasurement,
     *,
     assumed: Sequence[str] = (),
     radiation: bool = False,
@@ -60,8 +71,9 @@ def check_data(
 
     Args:
         ring: the design.
-        data: first turns, or an orbit response.
-        assumed: what was written down wrongly, names of `ASSUMPTIONS`; it is undone first.
+        data: of any kind.
+        assumed: what was written down wrongly, names of `ASSUMPTIONS`; it is undone first. Of first
+            turns and of orbit responses alone.
         radiation: the model radiates as expected.
 
     Raises:
@@ -70,6 +82,8 @@ def check_data(
     """
     begun = time.perf_counter()
     names = [monitor.name for monitor in ring.monitors]
+    if not isinstance(data, Measurement | OrbitResponse):
+        return _of_stored(ring, data, assumed, begun)
     kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
     few = signals.few(ring, data)
     checks = [_stated(ring, data)]
@@ -82,6 +96,19 @@ def check_data(
     else:
         checks += _of_response(ring, assume(in_beam_order(data, names), assumed, names))
     return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
+
+
+def _of_stored(ring: Ring, data: StoredData, assumed: Sequence[str], begun: float) -> Checkup:
+    if assumed:
+        raise MeasurementError(
+            f"'{assumed[0]}' cannot be assumed of {in_words(data)}: mend the data themselves"
+        )
+    kinds = {
+        TurnByTurn: "turn_by_turn", ClosedOrbit: "closed_orbit", Dispersion: "dispersion",
+        TuneReading: "tunes",
+    }  # fmt: skip
+    checks = (_stated(ring, data), *stored_checks(ring, data))
+    return Checkup(kinds[type(data)], checks, _provenance(ring, assumed, False, begun))
 
 
 _GLOBAL = "signs, units and order"
@@ -135,7 +162,7 @@ def _provenance(
     }
 
 
-def _stated(ring: Ring, data: Measurement | OrbitResponse) -> Check:
+def _stated(ring: Ring, data: AnyMeasurement) -> Check:
     """What the data say of their lattice and energy."""
     if data.energy is None:
         return fine("energy", "the data state no energy")

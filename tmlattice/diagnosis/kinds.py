@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.prepare import batch, prepare
+from tmlattice.diagnosis.stored_doctor import refused
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Problem
@@ -168,6 +169,8 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
         problem = make(how.ring, measured, how.places)
+        if isinstance(problem, Stored):
+            refused(how.ring, measured, problem)
         said = problem.said if isinstance(problem, ManyTurns) else ()
         return Part(label, kind, problem, held and make(how.ring, held, how.places), said=said)
 
@@ -179,7 +182,10 @@ def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]
 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
         _check_assumed(label, kind, how)
-        return Part(label, kind, make(how.ring, measured, how.places))
+        problem = make(how.ring, measured, how.places)
+        if isinstance(problem, Stored):
+            refused(how.ring, measured, problem)
+        return Part(label, kind, problem)
 
     return made
 

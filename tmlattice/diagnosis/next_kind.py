@@ -17,7 +17,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import rf_of
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.findings import credible
-from tmlattice.diagnosis.kinds import How, part_of
+from tmlattice.diagnosis.kinds import How
 from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.effects import Cause, find
@@ -31,8 +31,10 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, RfStep, TuneReading
 from tmlattice.measurement import TurnByTurn as Turns
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.spectra import Lines
+from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import many_turns
 
 log = logging.getLogger(__name__)
@@ -154,7 +156,7 @@ def _monitors(ring: Ring) -> tuple[tuple[str, ...], Array]:
 def _orbit(ring: Ring, how: How) -> Problem:
     names, nothing = _monitors(ring)
     orbit = ClosedOrbit(orbit=nothing[None], monitors=names, noise=nothing + NOISE)
-    return part_of("next", orbit, how).problem
+    return closed_orbits(ring, orbit, how.places)
 
 
 def _dispersion(ring: Ring, how: How) -> Problem:
@@ -166,9 +168,8 @@ def _dispersion(ring: Ring, how: How) -> Problem:
     step = RfStep(
         rf.frequency(ring), rf.harmonic, ENERGY_ORBIT / size * rf.frequency(ring), nothing
     )
-    return part_of(
-        "next", Dispersion(steps=(step,), monitors=names, noise=nothing + NOISE), how
-    ).problem
+    proposed = Dispersion(steps=(step,), monitors=names, noise=nothing + NOISE)
+    return dispersion(ring, proposed, how.places)
 
 
 def _tunes(ring: Ring, how: How) -> Problem:
@@ -177,7 +178,7 @@ def _tunes(ring: Ring, how: How) -> Problem:
         tune=0.25 * two, tune_error=TUNE * two, chromaticity=two,
         chromaticity_error=CHROMATICITY * two,
     )  # fmt: skip
-    return part_of("next", reading, how).problem
+    return tune_readings(ring, reading, how.places)
 
 
 def _turns(ring: Ring, how: How) -> Problem:
