@@ -106,3 +106,15 @@ def test_an_unstable_ring_has_no_modes(small_ring):
     strong = [Cause("family_gradient", "QF", 1.5)]
     with pytest.raises(UnstableRingError):
         StoredBeam(ResponseModel(apply(small_ring, strong), 4))
+
+
+def test_a_bends_field_is_spread_over_its_arc(small_ring):
+    """As one kick by the whole angle in the middle it made an orbit that was 1.6e-3 too large."""
+    from tmlattice.machine.stored_beam import simulate_orbits
+
+    for place in ("bend::3", "bend::16"):
+        causes = [Cause("dipole_field", place, 2.5e-4)]
+        at = simulate_orbits(small_ring, causes, noise=0.0).measured.orbit[0]
+        model = ResponseModel(apply(small_ring, causes)).readings
+        # where in the arc the beam is moved changes its path's length, and so its energy, by 5e-4
+        assert np.linalg.norm(at - model) < 6e-4 * np.linalg.norm(at)

@@ -1,7 +1,7 @@
 """What goes wrong with bends: the design geometry stays, the field differs from it.
 
 OCELOT's `tilt` and `angle` change the geometry, so neither is an error: a bend's errors are kicks
-spread over its body (in its middle, which for a body of 28 mrad is the same to 3e-5).
+spread over its body.
 """
 
 from tmlattice.effects.build import Build

@@ -48,7 +48,7 @@ class Errors:
     Attributes:
         dx, dy: offset of the magnet's centre, m.
         roll: about the beam axis, rad; positive turns x towards y.
-        kick_x, kick_y: px and py gain these at the middle, rad.
+        kick_x, kick_y: px and py gain these at the middle, rad; in a bend they are spread over it.
         k1l, k1sl: thin quadrupole at the middle: px -= k1l x, py += k1l y; thin skew quadrupole:
             px += k1sl y, py += k1sl x; 1/m.
         entrance_k1l: thin quadrupole at the entrance, 1/m.

@@ -190,13 +190,14 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
         total = composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
     else:
         first, second = _halves(element, energy, n)
+        kick = errors.kick_x * _in_the_middle(element)
         total = composed(
             [
                 _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
                 _shift(n, -errors.dx, -errors.dy),
                 _turn(n, errors.roll),
                 first,
-                _thin(n, errors.kick_x, errors.kick_y, errors.k1l, errors.k1sl, errors.middle),
+                _thin(n, kick, errors.kick_y, errors.k1l, errors.k1sl, errors.middle),
                 _loss(n, errors.loss, element),
                 second,
                 _turn(n, -errors.roll),
@@ -209,6 +210,16 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
             f"OCELOT's map of {element.kind} '{element.name}' is not finite; check its strengths"
         )
     return total
+
+
+def _in_the_middle(element: Element) -> float:
+    """One kick in the middle that moves and turns the beam as one in the bend's plane does that is
+    spread over the body, over that: rho a (1 - cos angle) and a sin angle are those of 2 a
+    sin(angle / 2), and a gradient k1 in the body focuses like angle^2 / length^2."""
+    if element.kind != "bend":
+        return 1.0
+    half = np.emath.sqrt(element.angle**2 + element.k1 * element.length**2) / 2
+    return float(np.real(np.sinc(half / np.pi)))
 
 
 def _empty(element: Element) -> Element:
