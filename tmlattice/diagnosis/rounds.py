@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import Family
 from tmlattice.diagnosis.state import Kept, State
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Normal, normal_equations, solve
 from tmlattice.inference.priors import Group
 
@@ -200,11 +201,17 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         )
         return float(np.sum(weights * left**2)) + penalty
 
-    return Moved(then, cost(state), cost(then))
+    try:
+        after = cost(then)
+    except UnstableRingError:  # astray: nothing is stored there
+        after = np.inf
+    return Moved(then, cost(state), after)
 
 
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
     """What the priors of one variable, which add up, ask for its values."""
+    if not groups:  # of numbers that a ring has none of
+        return 0.0
     spread = np.concatenate([group.basis[rows] * group.scale for group in groups], axis=1)
     return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
 
