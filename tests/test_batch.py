@@ -30,6 +30,11 @@ def test_a_failed_case_does_not_stop_the_rest_and_is_done_again(tmp_path):
     assert finished(tmp_path) == again
 
 
+def test_a_number_with_which_nothing_can_be_worked_out_is_no_result(tmp_path):
+    (tmp_path / "a.json").write_text('{"mass": 1' + 400 * "0" + "}")
+    assert finished(tmp_path) == {}
+
+
 def test_a_case_that_cannot_be_loaded_is_recorded(tmp_path):
     def broken():
         raise OSError("no such file")

@@ -30,13 +30,24 @@ PATIENCE = 60.0
 Work = Callable[[Any], dict[str, Any]]
 
 
+def _whole(text: str) -> int:
+    """A whole number that can be worked with; OverflowError where it has hundreds of digits."""
+    float(number := int(text))
+    return number
+
+
 def finished(folder: Path) -> dict[str, dict[str, Any]]:
     """The results that are there, by case; failed ones have a key "error"."""
     results = {}
     for path in sorted(folder.glob("*.json")):
         try:
-            result = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):  # another program's, or cut off: done again
+            result = json.loads(path.read_text(encoding="utf-8"), parse_int=_whole)
+        except (
+            OSError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+        ):  # another program's, or cut off: done again
             result = None
         if isinstance(result, dict):
             results[path.stem] = result
