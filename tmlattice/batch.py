@@ -220,8 +220,10 @@ def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
         import dask
         from distributed import Client, LocalCluster
     except ModuleNotFoundError as error:
-        what = "more than one process (--workers 1, --jobs 1) needs"
-        raise missing_package(error, what, "study") from error
+        what = "more than one process needs"
+        raise missing_package(
+            error, what, "study", "--workers 1 or --jobs 1 does without"
+        ) from error
 
     if scheduler is not None:
         try:

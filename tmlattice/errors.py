@@ -72,17 +72,21 @@ class EffectError(TmlatticeError):
     """An effect that cannot be as it was asked for."""
 
 
-def missing_package(error: ImportError, what: str, extra: str) -> MissingPackageError:
+def missing_package(
+    error: ImportError, what: str, extra: str, instead: str = ""
+) -> MissingPackageError:
     """The error for a package of an extra.
 
     Args:
         error: of the import.
         what: needs it, as the subject of the sentence.
         extra: brings it.
+        instead: another way, if there is one.
     """
     return MissingPackageError(
         f"{what} the package '{error.name}', which is not installed: "
         f"`pip install 'tmlattice[{extra}]'` brings it (README.md, Install)"
+        + (f"; {instead}" if instead else "")
     )
 
 
