@@ -14,6 +14,11 @@ from tmlattice.inference.scan import Scan
 Array = NDArray[np.float64]
 
 
+EXPLAINS = 1.0
+"""Chi-square that a parameter takes from noise: what takes less is no explanation, however little
+its amount costs (a spread that ended at nothing)."""
+
+
 @dataclass(frozen=True)
 class Rival:
     """A hypothesis that was refitted with everything else in place."""
@@ -80,6 +85,7 @@ def rivals(
         for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
             cause = best_start(problem, others, hypothesis)
             chosen.append(Rival(hypothesis, _with(problem, others, cause, best)))
+    chosen = [rival for rival in chosen if others.chi2 - rival.fit.chi2 > EXPLAINS]
     return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
 
 
