@@ -168,7 +168,10 @@ def test_chi2_of_pure_noise_is_one(rng):
         ({"launch_sigma": np.full((5, 5), np.nan)}, "NaN"),
         ({"shots": (1, 2, 3, 4, 4)}, "each once"),
         ({"settings": ({},)}, "one a shot"),
-        ({"settings": ({"q": {"k1": 1.0}}, {}, {}, {}, {})}, "no setting 'k1'; did you mean 'k1_relative'"),
+        (
+            {"settings": ({"q": {"k1": 1.0}}, {}, {}, {}, {})},
+            "no setting 'k1'; did you mean 'k1_relative'",
+        ),
         ({"settings": ({"q": {"kick": np.nan}}, {}, {}, {}, {})}, "finite"),
         ({"settings": ({"q": {"frequency_relative": 1.0}}, {}, {}, {}, {})}, "the name 'rf'"),
         ({"settings": ({"rf": {"kick": 1.0}}, {}, {}, {}, {})}, "the name 'rf'"),

@@ -392,16 +392,19 @@ def test_an_energy_offset_is_taken_up_by_gradients(small_ring, rng):
     assert fit.steps[-1].heldout_chi2_per_dof < 2  # 200 readings: 1 +- 0.1, and curvature
 
 
-def test_a_wiggler_that_focuses_is_named(small_ring):
+def test_a_wiggler_that_focuses_is_fitted_and_has_its_amount(small_ring):
+    """Its vertical focusing is a step of the fit, which leaves noise; weighed apart, all of it is
+    seen once more."""
     (wiggler,) = (e.name for e in small_ring.elements if e.kind == "wiggler")
     measured = simulate_response(
         small_ring, [Cause("insertion_device_focusing", wiggler, 2e-4)], kick=STEP, noise=1e-9,
         engine="ocelot", progress=False, seed=4,
     ).measured  # fmt: skip
     rows = weigh(fitted(small_ring, measured))
-    best = min(rows, key=lambda row: row.heldout_rms_in_plane)
-    assert (best.effect, best.judgement) == ("gradients of damping wigglers", "helps")
-    assert best.amount == pytest.approx(2e-4, abs=3 * best.amount_sigma)
+    assert next(r for r in rows if r.effect == "none").heldout_rms_in_plane < 1.3e-9
+    (own,) = (row for row in rows if row.effect == "gradients of damping wigglers")
+    assert own.amount == pytest.approx(2e-4, abs=3 * own.amount_sigma)
+    assert own.amount > 5 * own.amount_sigma
 
 
 def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
