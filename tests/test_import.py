@@ -16,9 +16,10 @@ from numpy.testing import assert_allclose
 
 from tmlattice import load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.errors import LatticeError, TmlatticeError
+from tmlattice.errors import LatticeError, MeasurementError, TmlatticeError
 from tmlattice.harmonics import frequency
 from tmlattice.importers import Options, bring_in
+from tmlattice.importers.hdf5 import read_hdf5
 from tmlattice.lattice import mat_file, save_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import Measurement, TurnByTurn
@@ -789,3 +790,13 @@ def test_turns_of_the_sps():
         own = [frequency((v - v.mean()).astype(complex))[0] for v in read if np.ptp(v) > 0]
         own = np.median(np.minimum(own, 1 - np.array(own)))
         assert abs(spectrum.tune[0, plane] - own) < 2e-4
+
+
+def test_a_reader_that_does_not_come_back_is_one_sentence(tmp_path, monkeypatch):
+    """Damage makes the HDF5 library go round without an end (found by tests/fuzz)."""
+    monkeypatch.setattr("tmlattice.lattice.mat_file.SECONDS", 1)
+    monkeypatch.setattr("tmlattice.lattice.mat_file._HDF5", "while True: pass")
+    path = tmp_path / "response.h5"
+    path.write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(MeasurementError, match="is not read within 1 s; save it again"):
+        read_hdf5(path)

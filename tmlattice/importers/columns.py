@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
+from tmlattice.lattice.mat_file import check_hdf5
 
 CSV, HDF5, SDDS = (".csv", ".tsv", ".txt", ".dat"), (".h5", ".hdf5", ".hdf"), (".sdds",)
 
@@ -106,6 +107,8 @@ def _hdf5(path: Path) -> list[Column]:
     """A column for each array [row]; `x`, `y` [row, monitor] beside a list of names are taken apart
     into a column a monitor. The unit is an attribute `unit` or `units`, or stands in the name."""
     import h5py
+
+    check_hdf5(path, MeasurementError)
 
     arrays: dict[str, tuple[Any, str]] = {}
 

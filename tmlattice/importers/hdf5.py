@@ -22,6 +22,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, numbers
 from tmlattice.importers.lattices import Elements
 from tmlattice.importers.matlab_ring import Roles, ring_of_elements
+from tmlattice.lattice.mat_file import check_hdf5
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
@@ -33,10 +34,11 @@ def read_hdf5(path: Path) -> dict[str, Any]:
     """Arrays, texts and attributes of an HDF5 file, all groups in one table.
 
     Raises:
-        MeasurementError: no HDF5 file.
+        MeasurementError: no HDF5 file, or one that holds its reader.
     """
     import h5py
 
+    check_hdf5(path, MeasurementError)
     content: dict[str, Any] = {}
 
     def take(name: str, item: Any) -> None:

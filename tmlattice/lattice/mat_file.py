@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, TmlatticeError
 
-SECONDS = 120
-"""Longer than any file of a ring takes to read."""
+SECONDS = 20
+"""Longer than any file of a ring takes to open, on a busy machine too."""
+RATE = 2e6
+"""Bytes that are read in a second at least, beyond that."""
 DEEPEST = 30
 """Structures within structures; a file that loops ends here."""
 
@@ -28,17 +30,42 @@ def check_mat(path: Path) -> None:
     """
     if not path.is_file():
         raise LatticeError(f"no MATLAB file '{path}'; check the path")
-    command = [sys.executable, "-P", "-c", _CHILD, str(path)]  # nothing of the working directory
+    read_in_a_child(path, "a MATLAB file", _CHILD, LatticeError)
+
+
+def check_hdf5(path: Path, error: type[TmlatticeError]) -> None:
+    """The same of an HDF5 file: damage makes its library go round without an end.
+
+    Raises:
+        error: its reader fails, or does not come back.
+    """
+    read_in_a_child(path, "HDF5", _HDF5, error)
+
+
+def read_in_a_child(path: Path, what: str, code: str, error: type[TmlatticeError]) -> None:
+    """Let a child process read a file, so that one that crashes or holds its reader is known.
+
+    Args:
+        path: the file, the child's argument.
+        what: it should be.
+        code: of the child, Python.
+        error: raised.
+
+    Raises:
+        error: the child fails, dies, or takes longer than such a file can take.
+    """
+    command = [sys.executable, "-P", "-c", code, str(path)]  # nothing of the working directory
+    seconds = SECONDS + (path.stat().st_size / RATE if path.is_file() else 0)
     try:
         child = subprocess.run(
-            command, capture_output=True, timeout=SECONDS, check=False, text=True, errors="replace"
+            command, capture_output=True, timeout=seconds, check=False, text=True, errors="replace"
         )
     except subprocess.TimeoutExpired:
-        raise LatticeError(f"'{path}' is not read within {SECONDS} s; save it again") from None
+        raise error(f"'{path}' is not read within {seconds:.0f} s; save it again") from None
     if child.returncode:
         said = child.stderr.strip().splitlines()
         why = said[-1][:200] if said and child.returncode > 0 else "its reader crashed"
-        raise LatticeError(f"'{path}' cannot be read as a MATLAB file ({why}); save it again")
+        raise error(f"'{path}' cannot be read as {what} ({why}); save it again")
 
 
 _CHILD = """
@@ -53,6 +80,16 @@ try:
         import h5py
         with h5py.File(path) as file:
             file.visititems(lambda name, item: item[()] if isinstance(item, h5py.Dataset) else None)
+except Exception as error:
+    sys.exit(" ".join(f"{type(error).__name__}: {error}".split()) or "error")
+"""
+
+_HDF5 = """
+import sys
+import h5py
+try:
+    with h5py.File(sys.argv[1]) as file:
+        file.visititems(lambda name, item: item[()] if isinstance(item, h5py.Dataset) else None)
 except Exception as error:
     sys.exit(" ".join(f"{type(error).__name__}: {error}".split()) or "error")
 """
