@@ -42,13 +42,8 @@ def finished(folder: Path) -> dict[str, dict[str, Any]]:
     for path in sorted(folder.glob("*.json")):
         try:
             result = json.loads(path.read_text(encoding="utf-8"), parse_int=_whole)
-        except (
-            OSError,
-            ValueError,
-            OverflowError,
-            RecursionError,
-        ):  # another program's, or cut off: done again
-            result = None
+        except (OSError, ValueError, OverflowError, RecursionError):
+            result = None  # another program's, or cut off: done again
         if isinstance(result, dict):
             results[path.stem] = result
         else:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tmlattice.challenge.baselines import SUSPECTS, Guesses, pursuits
 from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.challenge.kinds import problem_of
-from tmlattice.challenge.oracle import CLASS, LISTED, REFINED
+from tmlattice.challenge.oracle import REFINED, answer
 from tmlattice.effects import Cause, find, modelled
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit
@@ -97,34 +97,10 @@ def _hypotheses(case: Case, problem: Problem) -> list[Hypothesis]:
 
 
 def _said(found: Weighed) -> dict[str, Any]:
-    statistic, problem = found.statistic, found.problem
     hypotheses = found.seen.hypotheses
-    weight = statistic / 2 + np.array([problem.prior(h) for h in hypotheses])
-    weight = np.exp(weight - weight.max())
-    weight /= weight.sum()
-    by_weight = np.argsort(-weight)[:LISTED]
-    by_likelihood = np.argsort(-statistic)[:LISTED]
-
-    def listed(some: NDArray[np.intp]) -> list[dict[str, Any]]:
-        return [
-            {
-                "effect": hypotheses[h][0], "element": hypotheses[h][1],
-                "statistic": float(statistic[h]), "amount": float(found.amount[h]),
-                "probability": float(weight[h]),
-            }
-            for h in some
-        ]  # fmt: skip
-
-    top = float(statistic.max())
+    prior = np.array([found.problem.prior(h) for h in hypotheses])
     threshold = found.seen.threshold(DEFAULT.false_alarm)
-    return {
-        "statistic": top,
-        "threshold": threshold,
-        "detected": bool(top > threshold),
-        "class_size": int((statistic > top - CLASS).sum()),
-        "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
-        "posterior": listed(by_weight),
-    }
+    return answer(hypotheses, found.statistic, found.amount, prior, threshold)
 
 
 def plain_kinds(case: Case) -> dict[str, Guesses]:

@@ -188,19 +188,44 @@ def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
 def _said(oracle: Oracle, case: Case) -> dict[str, Any]:
     clean = oracle.residual(case.fit.in_order_of(oracle.model.maps.monitors).readings[:, 0])
     statistic, amount = oracle.refined(clean)
-    weight = statistic / 2 + np.array(_priors(oracle.hypotheses))
+    root = np.array([1 / find(name).power for name, _ in oracle.hypotheses])
+    return answer(
+        oracle.hypotheses,
+        statistic,
+        np.sign(amount) * np.abs(amount) ** root,
+        np.array(_priors(oracle.hypotheses)),
+        oracle.threshold,
+    )
+
+
+def answer(
+    hypotheses: Sequence[Hypothesis],
+    statistic: Array,
+    amount: Array,
+    prior: Array,
+    threshold: float,
+) -> dict[str, Any]:
+    """What an oracle says of its hypotheses, as JSON.
+
+    Args:
+        hypotheses: all that it weighed.
+        statistic, amount, prior: fall of chi-square, best amount, log probability beforehand of
+            each, [hypothesis].
+        threshold: of the largest statistic.
+    """
+    weight = statistic / 2 + prior
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
-    order = np.argsort(-weight)[:LISTED]
+    by_weight = np.argsort(-weight)[:LISTED]
     by_likelihood = np.argsort(-statistic)[:LISTED]
 
     def listed(some: NDArray[np.intp]) -> list[dict[str, Any]]:
         return [
             {
-                "effect": oracle.hypotheses[h][0],
-                "element": oracle.hypotheses[h][1],
+                "effect": hypotheses[h][0],
+                "element": hypotheses[h][1],
                 "statistic": float(statistic[h]),
-                "amount": float(np.sign(amount[h]) * abs(amount[h]) ** _root(oracle, h)),
+                "amount": float(amount[h]),
                 "probability": float(weight[h]),
             }
             for h in some
@@ -209,16 +234,12 @@ def _said(oracle: Oracle, case: Case) -> dict[str, Any]:
     top = float(statistic.max())
     return {
         "statistic": top,
-        "threshold": oracle.threshold,
-        "detected": bool(top > oracle.threshold),
+        "threshold": threshold,
+        "detected": bool(top > threshold),
         "class_size": int((statistic > top - CLASS).sum()),
         "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
-        "posterior": listed(order),
+        "posterior": listed(by_weight),
     }
-
-
-def _root(oracle: Oracle, h: np.intp) -> float:
-    return 1 / find(oracle.hypotheses[int(h)][0]).power
 
 
 def _priors(hypotheses: Sequence[Hypothesis]) -> list[float]:

@@ -16,7 +16,6 @@ from scipy.linalg import block_diag
 
 from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import Cause, find
-from tmlattice.effects.effect import LEAST_LEFT
 from tmlattice.errors import BeamLostError
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
@@ -70,7 +69,7 @@ class SmallErrors:
         shares = np.einsum("esrp,srp->e", self.problem.spread, weights, optimize=True)
         amounts = (self.rms * shares).tolist()
         own = zip(self.hypotheses, amounts, strict=True)
-        return [Cause(*h, _with_some_left(h[0], amount)) for h, amount in own]
+        return [Cause(*h, find(h[0]).some_left(amount)) for h, amount in own]
 
     def made_by(self, estimate: Sequence[Cause]) -> Array:
         """What small errors make of the readings, linearly, [shot, reading, 2], m."""
@@ -116,13 +115,6 @@ class SmallErrors:
             drift -= seen_by @ rows.T
             unknown += drift.T @ explained.covariance[np.ix_(for_each, for_each)] @ drift
         return np.asarray(unknown)
-
-
-def _with_some_left(effect: str, amount: float) -> float:
-    """The amount; of a strength that would be gone a little is kept, on which an error can act."""
-    if find(effect).multiplies and abs(1 + amount) < LEAST_LEFT:
-        return LEAST_LEFT - 1
-    return amount
 
 
 def background_signatures(
@@ -189,8 +181,7 @@ def small_errors(
         if estimate:
             spread = chained(estimate)[:, None, None, None] * spread
         amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
-        moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
-        shifted = replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
+        shifted = _moved(data, amounts / scale, spread)
         if learn:
             found, names = _sizes(shifted, spread, alone, hypotheses, noisy)
             if evidence is None:
@@ -247,8 +238,13 @@ def _as_one_of_them(
     spread[own] *= find(cause.effect).chain(cause.amount)
     amounts = amounts.copy()
     amounts[own] += cause.amount
-    moved = np.einsum("e,esrp->srp", amounts / scale, spread, optimize=True)
-    return replace(data, readings=data.readings + np.where(data.valid, moved, 0.0)), spread
+    return _moved(data, amounts / scale, spread), spread
+
+
+def _moved(data: Data, shares: Array, spread: Array) -> Data:
+    """The readings with what these shares of the errors' rms make of them, linearly."""
+    moved = np.einsum("e,esrp->srp", shares, spread, optimize=True)
+    return replace(data, readings=data.readings + np.where(data.valid, moved, 0.0))
 
 
 def _sizes(

@@ -120,13 +120,21 @@ class Effect(ABC):
     def chain(self, amount: float) -> float:
         """d readings / d amount of what is there, over a signature, which is of more on top of it.
 
-        Where two amounts multiply, as (1 + a)(1 + b), nothing is left at a = -1 that more of the
-        effect could act on: near to it, `LEAST_LEFT` is taken.
+        It is one over what is left of a strength, see `some_left`.
         """
         if not self.multiplies:
             return float(self.power * amount ** (self.power - 1))
+        return float(1 / (1 + self.some_left(amount)))
+
+    def some_left(self, amount: float) -> float:
+        """The amount; of a strength that would be gone, `LEAST_LEFT` is kept.
+
+        Two amounts of it act as (1 + a)(1 + b): at a = -1 more of the effect has nothing to act on.
+        """
         left = 1 + amount
-        return float(1 / np.copysign(max(abs(left), LEAST_LEFT), left))
+        if not self.multiplies or abs(left) >= LEAST_LEFT:
+            return amount
+        return float(np.copysign(LEAST_LEFT, left) - 1)
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.

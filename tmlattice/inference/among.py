@@ -231,7 +231,9 @@ class Among(Problem):
     def estimate(self, clean: Array) -> Array:
         """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
         known = self.known
-        return known.amounts + known.rms * known.mixed(self.rows @ (clean @ self._factor))
+        amounts = known.amounts + known.rms * known.mixed(self.rows @ (clean @ self._factor))
+        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+        return np.array([find(name).some_left(amount) for (name, _), amount in own])
 
     def learnt(self, explained: Fit) -> Known:
         """What is known of the small errors since, beside an explanation."""

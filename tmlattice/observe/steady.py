@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
+from tmlattice.effects.effect import LEAST_LEFT
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
@@ -23,9 +24,6 @@ Flags = NDArray[np.bool_]
 
 NOTHING = np.zeros(0)
 """The nuisances of a kind that has none."""
-
-LEAST = 0.01
-"""A gain this near to zero has no signature on top of it."""
 
 ROOM = 2**24
 """Numbers of signatures at a time."""
@@ -92,8 +90,8 @@ class Steady(Problem):
         """In closed form: the signature is of the same effect on top of what is there."""
         own = point.causes[cause]
         effect, amount = find(own.effect), own.amount
-        if effect.multiplies and abs(1 + amount) < LEAST:
-            return self._difference(point, cause, LEAST)
+        if effect.multiplies and abs(1 + amount) < LEAST_LEFT:
+            return self._difference(point, cause, LEAST_LEFT)
         (slope,) = self.signatures(point.view, point.nuisances, [(own.effect, own.element)])
         return self.as_rows(effect.chain(amount) * slope)
 
