@@ -20,6 +20,7 @@ PLACES = {
     "family_gradient": ["qd", "qe5"],
     "dipole_field": ["b::28", "b_in::10", "bo_out::5"],
     "dipole_roll": ["b::28", "b_in::10", "bo_out::5"],
+    "bend_gradient": ["b::28", "b_in::10", "bo_out::5"],
     "corrector_kick_x": CORRECTORS,
     "corrector_kick_y": CORRECTORS,
     "corrector_calibration": CORRECTORS,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
+from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
 from tmlattice.diagnosis.state import (
     State,
@@ -244,7 +245,8 @@ def fit_steps(
                         (before, before))  # fmt: skip
     progress("result")
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
-    state = settle(bend(jump(replace(state, exploring=False), beyond=1.0)))
+    state = bend(jump(replace(state, exploring=False), beyond=1.0))
+    state = settle(robust(state))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)

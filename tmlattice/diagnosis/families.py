@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import TAILS, Family, Told
 from tmlattice.diagnosis.fields import (
+    BendGradient,
     EdgeFocusing,
     FamilyGradient,
     OtherGradient,
@@ -221,6 +222,7 @@ STEPS = (
     Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
     Trial((MonitorGain(),), 2, 0),
     Trial((QuadrupoleGradient(),), 4, 0),
+    Trial((BendGradient(),), 2, 0),
     Trial((VerticalFocusing(),), 2, 0),
     Trial((EdgeFocusing(),), 2, 0),
     Trial((EnergySpread(),), 2, 0),

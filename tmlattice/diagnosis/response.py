@@ -29,6 +29,7 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
+from tmlattice.diagnosis.odd_readings import odd_readings
 from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.diagnosis.state import begin
@@ -41,11 +42,14 @@ from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import ResponseData, response_data, split_columns
+from tmlattice.observe.response_noise import learnt_noise
 
 Array = NDArray[np.float64]
 
 MISSING = 1.5
 """Chi2 per reading of the result above which an effect is missing."""
+UNDERSTATED = 2.0
+"""So many times the stated noise is told, where the readings show it."""
 PATTERNS = 8
 """The strongest patterns of what is left."""
 BLOCKS = ("in-plane", "coupling", "RF")
@@ -138,12 +142,31 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
             f"the noise of the readings is not stated; from what neighbouring monitors leave it is "
             f"{x} in x and {y} in y (a jitter of the beam is not in it)"
         )
+    else:
+        said += _understated(measured)
     if measured.rf is None or measured.rf.orbit is None:
         said.append(
             "there is no RF step: dispersion is not known, and only what is usual tells the scale "
             "of all correctors from that of all monitors"
         )
     return said
+
+
+def _understated(measured: OrbitResponse) -> list[str]:
+    """Where the readings scatter by far more than the noise that is stated."""
+    if measured.noise is None:
+        return []
+    try:
+        shown = learnt_noise(measured)
+    except MeasurementError:  # too few readings say nothing
+        return []
+    stated = np.nanmedian(measured.noise, axis=0)
+    return [
+        f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors leave "
+        f"{1e6 * seen:.2g} µm of each other's readings: chi-square is as much too large"
+        for plane, own, seen in zip("xy", stated, shown[0], strict=True)
+        if seen > UNDERSTATED * own
+    ]
 
 
 def as_diagnosis(
@@ -261,7 +284,7 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    return tuple(said)
+    return (*said, *odd_readings(fit.state))
 
 
 def _misfit(fit: DenseFit, read: Array) -> Misfit:

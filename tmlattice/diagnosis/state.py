@@ -50,6 +50,7 @@ class State:
         groups: the families' priors with what they have learnt, by name.
         exploring: the inner correctors choose, and are not fitted.
         kept: rows of the ring's variables, that stand until the ring has moved.
+        share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
     """
 
     data: ResponseData
@@ -62,6 +63,7 @@ class State:
     groups: Mapping[str, Group] = field(default_factory=dict)
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
+    share: Array | None = None
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

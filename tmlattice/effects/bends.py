@@ -71,3 +71,35 @@ class DipoleRoll(_OnBend):
     def build(self, it: Build, amount: float) -> None:
         """A turned magnet."""
         it.roll += amount
+
+
+@register
+class BendGradient(_OnBend):
+    """A bend's gradient is not the model's: of combined-function magnets it is a strength."""
+
+    name = "bend_gradient"
+    responds = True
+    headline = False
+    words = "wrong gradient of a bending magnet"
+    unit = "1/m2"
+    sign = "k1 becomes k1 + amount, over the whole body"
+    quantity = "additional gradient"
+    remedy = "correct the gradient of {}"
+    to_check = (
+        "Compare its gradient and its edges in the lattice file with what was measured; look for a "
+        "beam that passes beside its axis."
+    )
+    largest = 0.1
+    usual = False  # in responses, where a family of it is fitted, or where somebody names it
+
+    def changed(self, element: Element, amount: float, energy: float) -> Element:
+        """Another gradient."""
+        return element.changed(k1=element.k1 + amount)
+
+    def build(self, it: Build, amount: float) -> None:
+        """Another gradient."""
+        it.k1 += amount
+
+    def undone(self, element: Element, amount: float) -> Element | None:
+        """As much less."""
+        return self.changed(element, -amount, 0.0)

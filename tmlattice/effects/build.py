@@ -21,6 +21,7 @@ class Build:
         dx, dy: of its centre, m.
         roll: of its body, or of a corrector's kick, from x towards y, rad.
         kick_x, kick_y: of a corrector beyond its setting, along its own axes, rad.
+        k1: gradient of a bend beyond its own, 1/m2.
         loss: energy loss, in units of the expected one.
         gradients: thin quadrupoles, by place (normal, skew), 1/m; see `add_gradient`.
         slopes: other thin kicks, by place, 1/m; see `add_slopes`.
@@ -32,6 +33,7 @@ class Build:
     roll: float = 0.0
     kick_x: float = 0.0
     kick_y: float = 0.0
+    k1: float = 0.0
     loss: float = 0.0
     gradients: dict[Where, tuple[float, ...]] = field(default_factory=lambda: defaultdict(tuple))
     slopes: dict[Where, tuple[float, ...]] = field(default_factory=lambda: defaultdict(tuple))

@@ -36,7 +36,7 @@ _TAKES: Mapping[str, frozenset[str]] = {
     "octupole": _STRAIGHT,
     "multipole": _STRAIGHT,
     "bend": frozenset(
-        {"scale", "dx", "dy", "roll", "kick_x", "kick_y", "loss", "entrance", "middle"}
+        {"scale", "dx", "dy", "roll", "kick_x", "kick_y", "k1", "loss", "entrance", "middle"}
     ),
     "hcorrector": _CORRECTOR,
     "vcorrector": _CORRECTOR,
@@ -306,8 +306,8 @@ class Builder:
         horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2 - kick_x  # what px loses
         vertical = kick_y - roll * angle
         # The body is exact in a step; only its errors, losses and gradients are spread.
-        k1 = element.k1 * (1 + setting["k1_relative"])
-        steps = self.steps if element.k1 or element.k2 else 4
+        k1 = element.k1 * (1 + setting["k1_relative"]) + wrong.k1
+        steps = self.steps if k1 or element.k2 else 4
         more: dict[str, Any] = {}
         if element.tilt:
             more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}

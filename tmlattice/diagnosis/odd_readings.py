@@ -1,0 +1,75 @@
+"""Single readings that stick out of what a response's fit leaves: they count less, and are named.
+
+One monitor may read one corrector's step wrongly, by fifty times its noise, and be sound else: such
+readings are few, and the squares of most of the misfit. Student's distribution, which knows them,
+weighs each reading in the last fit.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.family import TAILS
+from tmlattice.diagnosis.state import State
+
+Array = NDArray[np.float64]
+
+OUT = 5.0
+"""A reading sticks out from so many times what the fit leaves of the column's."""
+NAMED = 3
+"""Monitors and correctors that are named."""
+OFTEN = 2
+"""Readings of one monitor, or corrector, from which it is named."""
+
+
+def robust(state: State) -> State:
+    """Every reading has a weight of its own from here on."""
+    return replace(state, share=np.ones((2, *state.data.shape)))
+
+
+def shares(state: State, block: int, left: Array) -> Array:
+    """By which each reading of the correctors counts; the RF's are few, and all count alike.
+
+    Args:
+        state: with what the model lacks now.
+        block: 0 in-plane, 1 coupling.
+        left: what the fit leaves, m, NaN where nothing is fitted, [column but the RF, monitor].
+    """
+    assert state.share is not None
+    out = state.share.copy()
+    out[block, :-1] = (TAILS + 1) / (TAILS + np.nan_to_num(_pulls(state, block, left)) ** 2)
+    return out
+
+
+def _pulls(state: State, block: int, left: Array) -> Array:
+    variance = state.data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
+    return np.asarray(left / np.sqrt(variance[:-1]))
+
+
+def odd_readings(state: State) -> list[str]:
+    """A sentence of those that stick out of a result, where there are any."""
+    if state.share is None:
+        return []
+    measured, monitors, correctors = state.data.measured, Counter[str](), Counter[str]()
+    count = total = 0
+    for block in (0, 1):
+        left = np.where(state.fitted[:, None] & state.good, state.data.pick(state.at.left, block),
+                        np.nan)[:-1]  # fmt: skip
+        out = np.nan_to_num(np.abs(_pulls(state, block, left))) > OUT
+        count, total = count + int(out.sum()), total + int(np.isfinite(left).sum())
+        monitors.update(measured.monitors[i] for i in np.nonzero(out)[1])
+        correctors.update(measured.correctors[i] for i in np.nonzero(out)[0])
+    if not count:
+        return []
+    most = [
+        f"{name} ({own})"
+        for table in (monitors, correctors)
+        for name, own in table.most_common(NAMED)
+        if own >= OFTEN
+    ]
+    return [
+        f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
+        "column and count little" + (f"; most at {', '.join(most)}" if most else "") + "."
+    ]
