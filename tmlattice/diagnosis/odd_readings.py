@@ -1,27 +1,29 @@
 """Single readings that stick out of what a response's fit leaves: they count less, and are named.
 
 One monitor may read one corrector's step wrongly, by fifty times its noise, and be sound else: such
-readings are few, and the squares of most of the misfit. Student's distribution, which knows them,
-weighs each reading in the last fit.
+readings are few, and their squares most of the misfit. In the last fit they weigh as if their noise
+were as large as makes them five times it, and no more.
 """
 
+import warnings
 from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.family import TAILS
 from tmlattice.diagnosis.state import State
 
 Array = NDArray[np.float64]
 
 OUT = 5.0
-"""A reading sticks out from so many times what the fit leaves of the column's."""
+"""A reading sticks out from so many times what is left of its column's typical one, and of its
+monitor's."""
 NAMED = 3
 """Monitors and correctors that are named."""
 OFTEN = 2
 """Readings of one monitor, or corrector, from which it is named."""
+_MAD = 1.4826  # of a Gaussian
 
 
 def robust(state: State) -> State:
@@ -33,19 +35,29 @@ def shares(state: State, block: int, left: Array) -> Array:
     """By which each reading of the correctors counts; the RF's are few, and all count alike.
 
     Args:
-        state: with what the model lacks now.
+        state: that is fitted.
         block: 0 in-plane, 1 coupling.
         left: what the fit leaves, m, NaN where nothing is fitted, [column but the RF, monitor].
     """
     assert state.share is not None
     out = state.share.copy()
-    out[block, :-1] = (TAILS + 1) / (TAILS + np.nan_to_num(_pulls(state, block, left)) ** 2)
+    pull = np.nan_to_num(np.abs(_pulls(state, block, left)))
+    out[block, :-1] = (OUT / np.maximum(pull, OUT)) ** 2
     return out
 
 
 def _pulls(state: State, block: int, left: Array) -> Array:
-    variance = state.data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
-    return np.asarray(left / np.sqrt(variance[:-1]))
+    """In units of what is left of the typical reading of the column, of the monitor in that plane,
+    or of the noise: of the largest."""
+    size = state.data.noise_of(block)[:-1].copy()
+    plane = state.data.plane_of(block)[:-1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns that are not fitted
+        size = np.fmax(size, _MAD * np.nanmedian(np.abs(left), axis=1)[:, None])
+        for p in (0, 1):
+            mine = plane == p
+            size[mine] = np.fmax(size[mine], _MAD * np.nanmedian(np.abs(left[mine]), axis=0))
+    return np.asarray(left / size)
 
 
 def odd_readings(state: State) -> list[str]:
@@ -71,5 +83,7 @@ def odd_readings(state: State) -> list[str]:
     ]
     return [
         f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
-        "column and count little" + (f"; most at {', '.join(most)}" if most else "") + "."
+        "corrector and of their monitor, and count little"
+        + (f"; most at {', '.join(most)}" if most else "")
+        + "."
     ]

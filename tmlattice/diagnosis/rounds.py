@@ -34,8 +34,6 @@ ROUNDS = 12
 """Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
 GAIN = 3e-3
 """Share of the cost that a round has to gain for another one."""
-AGREED = 10
-"""Rounds of readings' shares and columns' misfits, each from the other."""
 EACH = 4
 """Rounds of EM for the priors in a round of the fit."""
 LEARN = 10
@@ -310,26 +308,18 @@ def look(state: State, block: int) -> State:
     data = state.data
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)[:-1]
-    good = state.good if block else _good_monitors(state)
-    for _ in range(1 if state.share is None else AGREED):
-        state = _lacking(state, block, left)
-        if state.share is not None:
-            state = replace(state, share=shares(state, block, left))
-    return replace(state, good=good)
-
-
-def _lacking(state: State, block: int, left: Array) -> State:
-    """With what the model lacks, column by column."""
-    data, read = state.data, np.isfinite(left).sum(axis=1)
+    if state.share is not None:
+        state = replace(state, share=shares(state, block, left))
     typical = float(np.nanmedian(np.abs(left[:, state.good]))) / 0.6745
     noise = float(np.median(data.noise))
     squares = np.full(data.shape[0], typical**2)  # the RF's readings are few
     counts = 1.0 if state.share is None else state.share[block][:-1]
     shared = TYPICAL * typical**2 + np.nansum(counts * left**2, axis=1)
-    squares[:-1] = shared / (TYPICAL + read)
+    squares[:-1] = shared / (TYPICAL + use[:-1].sum(axis=1))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
-    return replace(state, lacking=lacking)
+    good = state.good if block else _good_monitors(state)
+    return replace(state, lacking=lacking, good=good)
 
 
 def _good_monitors(state: State) -> Flags:
