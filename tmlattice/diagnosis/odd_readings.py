@@ -81,9 +81,8 @@ def odd_readings(state: State) -> list[str]:
         for name, own in table.most_common(NAMED)
         if own >= OFTEN
     ]
+    named = f"; most at {', '.join(most)}" if most else ""
     return [
         f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
-        "corrector and of their monitor, and count little"
-        + (f"; most at {', '.join(most)}" if most else "")
-        + "."
+        f"corrector and of their monitor, and count little{named}."
     ]
