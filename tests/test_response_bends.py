@@ -29,9 +29,9 @@ def combined(small_ring):
 
 
 def test_gradients_of_bends_are_found(combined, rng):
-    """ESRF-EBS: 96 of its magnets had none to fit; 1.75 µm were left, and now 1.4."""
+    """ESRF-EBS: 96 of its magnets had none to fit; they were made up for."""
     bends = [e.name for e in combined.elements if e.kind == "bend"]
-    wrong = 0.02 + 1e-3 * rng.standard_normal(len(bends))  # a family, and its members
+    wrong = 0.02 + 1e-3 * rng.standard_normal(len(bends))  # all, and a scatter that nobody fits
     causes = [
         *(Cause("bend_gradient", n, GRADIENT * w) for n, w in zip(bends, wrong, strict=True)),
         *(Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()),

@@ -39,9 +39,12 @@ log = logging.getLogger(__name__)
 
 LEAST = 5.0
 """Log evidence that a step has to have."""
-JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.05
+JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
-25 readings), and by how much their sum may fall without a step that stays all the same."""
+25 readings), and by how much their sum may fall without a step that stays all the same: evidence
+takes what the model lacks for noise, and gladly fits it."""
+SPOILT = 0.05
+"""By how much it may fall without any."""
 SURE = 100.0
 """Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
 FIRST, ROUGH = 4, 0.03
@@ -239,7 +242,7 @@ def fit_steps(
         if doubted:
             again, without = _worth(state, doubted, progress)
             worth |= again
-    if _lost(_inner(design), _inner(state)) < -VETO:  # all together spoil what they should mend
+    if _lost(_inner(design), _inner(state)) < -SPOILT:  # all together spoil what they should mend
         refused += [replace(step, kept=False) for step in steps.values()]
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
                         (before, before))  # fmt: skip

@@ -22,9 +22,6 @@ Array = NDArray[np.float64]
 
 LARGEST_GRADIENT = 0.02
 """Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
-LARGEST_BEND_GRADIENT = 3e-3
-"""The same of one bend: its poles have the shape of the gradient, and a looser one runs away
-against the quadrupoles beside it."""
 LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
 
 
@@ -124,22 +121,22 @@ class _Thin(_Magnets):
 
 
 class BendGradient(_Magnets):
-    """Gradients of bends that have one, relative to the design's: of single magnets, and of
-    families."""
+    """Gradients of bends that have one, relative to the design's: one number a type."""
 
     name = effect = "bend_gradient"
     effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
     block, variable, trust = 0, "bend_gradient", 0.01
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Each piece's own gradient."""
-        return [{e.name: e.k1 for e in own} for own in magnets(data.ring, ("bend",), True)]
+        """Of all bends of a type: one alone would run away against the quadrupoles beside it."""
+        types: dict[str, dict[str, float]] = {}
+        for own in magnets(data.ring, ("bend",), powered=True):
+            types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
+        return list(types.values())
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each, and of families."""
-        kinds = families(self.places(data))[1]
-        single = Group(self.name, np.eye(self.size(data)), 1e-3, TAILS, most=LARGEST_BEND_GRADIENT)
-        return [single, Group(f"{self.name} of families", kinds, 0.01)]
+        """Of each type."""
+        return [Group(self.name, np.eye(self.size(data)), 3e-3)]
 
 
 class SkewGradient(_Thin):
