@@ -17,8 +17,7 @@ from tmlattice.diagnosis.state import State
 Array = NDArray[np.float64]
 
 OUT = 5.0
-"""A reading sticks out from so many times what is left of its column's typical one, and of its
-monitor's."""
+"""A reading sticks out from so many times what is left of its column's typical one."""
 NAMED = 3
 """Monitors and correctors that are named."""
 OFTEN = 2
@@ -47,17 +46,11 @@ def shares(state: State, block: int, left: Array) -> Array:
 
 
 def _pulls(state: State, block: int, left: Array) -> Array:
-    """In units of what is left of the typical reading of the column, of the monitor in that plane,
-    or of the noise: of the largest."""
-    size = state.data.noise_of(block)[:-1].copy()
-    plane = state.data.plane_of(block)[:-1]
+    """In units of what is left of the column's typical reading, or of the noise if that is more."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns that are not fitted
-        size = np.fmax(size, _MAD * np.nanmedian(np.abs(left), axis=1)[:, None])
-        for p in (0, 1):
-            mine = plane == p
-            size[mine] = np.fmax(size[mine], _MAD * np.nanmedian(np.abs(left[mine]), axis=0))
-    return np.asarray(left / size)
+        typical = _MAD * np.nanmedian(np.abs(left), axis=1)
+    return np.asarray(left / np.fmax(state.data.noise_of(block)[:-1], typical[:, None]))
 
 
 def odd_readings(state: State) -> list[str]:
@@ -84,5 +77,5 @@ def odd_readings(state: State) -> list[str]:
     named = f"; most at {', '.join(most)}" if most else ""
     return [
         f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
-        f"corrector and of their monitor, and count little{named}."
+        f"corrector's typical one, and count little{named}."
     ]
