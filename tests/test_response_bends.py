@@ -51,3 +51,14 @@ def test_gradients_of_bends_are_found(combined, rng):
     ]
     assert abs(mean - np.mean(wrong)) < 1e-3
     assert np.std(left) < 2e-4
+
+
+def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
+    """Its bends have no gradient."""
+    causes = [Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()]
+    measured = simulate_response(
+        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False
+    ).measured
+    data = response_data(small_ring, measured)
+    fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
+    assert not any(step.effect == "bend_gradient" for step in (*fit.steps, *fit.refused))
