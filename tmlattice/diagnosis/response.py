@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.exchanged import exchanged, put_right
+from tmlattice.diagnosis.exchanged import told as told_exchanged
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
@@ -97,17 +99,8 @@ def diagnose_response(
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
     if few is None:
-        odd = strangers(begin(data, split))
-        while True:
-            if odd.any:
-                said += odd.said
-                measured = odd.without(measured)
-                data = response_data(ring, measured)
-                split = split_columns(data, holdout, np.random.default_rng(seed))
-            fit = fit_steps(data, split, trials, max_effects, progress)
-            odd = strangers(fit.state)
-            if not odd.any:
-                break
+        fit, measured, odd = _families(ring, measured, trials, holdout, max_effects, seed, progress)
+        said += odd
         found, degenerate = told(fit.state)
         verdict = _verdict(fit, false_alarm)
     else:
@@ -131,6 +124,40 @@ def diagnose_response(
         reasons=None if few is not None else explain_gradients(fit.state),
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
+
+
+def _families(
+    ring: Ring,
+    measured: OrbitResponse,
+    trials: Sequence[Trial],
+    holdout: float,
+    most: int,
+    seed: int,
+    progress: Callable[[str], Any],
+) -> tuple[DenseFit, OrbitResponse, list[str]]:
+    """The dense fit of what resembles the model; what was fitted, and what was done to it."""
+    said: list[str] = []
+    known: list[tuple[str, str]] = []
+    fit: DenseFit | None = None
+    while True:
+        data = response_data(ring, measured)
+        split = split_columns(data, holdout, np.random.default_rng(seed))
+        state = begin(data, split) if fit is None else fit.state
+        pairs = [pair for pair in exchanged(state) if pair not in known]
+        if pairs:
+            said.append(told_exchanged(pairs))
+            known += pairs
+            measured, fit = put_right(measured, pairs), None
+            continue
+        odd = strangers(state)
+        if odd.any:
+            said += odd.said
+            measured = odd.without(measured)
+            data = response_data(ring, measured)
+            split = split_columns(data, holdout, np.random.default_rng(seed))
+        elif fit is not None:
+            return fit, measured, said
+        fit = fit_steps(data, split, trials, most, progress)
 
 
 def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:

@@ -1,0 +1,64 @@
+"""Neighbouring correctors whose columns are exchanged: each answers as the other one should.
+
+A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
+the model's far too well for a stranger: it seems displaced by the way to its neighbour.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.state import State
+from tmlattice.measurement import OrbitResponse
+
+Array = NDArray[np.float64]
+
+SHARE = 0.25
+"""Of the mean square left of each of the two columns, left at most once they are exchanged."""
+
+Pair = tuple[str, str]
+
+
+def exchanged(state: State) -> list[Pair]:
+    """Pairs of neighbours of a plane, in beam order; no corrector stands in two of them."""
+    data = state.data
+    model, orbits = data.pick(state.at.seen(state.at.beam)), data.pick(data.orbits)
+    names = data.measured.correctors
+
+    def left(column: int, as_one: int) -> float:
+        seen = np.isfinite(orbits[column]) & state.good
+        u, d = model[as_one, seen], orbits[column, seen]
+        gain = max(float(u @ d) / max(float(u @ u), 1e-300), 0.0)
+        return float(np.sum((d - gain * u) ** 2))
+
+    found: list[Pair] = []
+    for p in (0, 1):
+        mine = np.flatnonzero(data.plane[:-1] == p)
+        order = mine[np.argsort([data.ring[names[c]].s for c in mine])]
+        for a, b in zip(order, np.roll(order, -1), strict=True):
+            crossed = left(a, b) < SHARE * left(a, a) and left(b, a) < SHARE * left(b, b)
+            if crossed and not any(names[a] in pair for pair in found):
+                found.append((names[a], names[b]))
+    return found
+
+
+def told(pairs: Sequence[Pair]) -> str:
+    """In words."""
+    both = ", ".join(f"{a} and {b}" for a, b in pairs)
+    return (
+        f"correctors that answer each as the other one should, taken as exchanged: {both}; look at "
+        "their cables and at the table of names"
+    )
+
+
+def put_right(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
+    """The measurement with their columns exchanged."""
+    order = np.arange(len(measured.correctors))
+    for pair in pairs:
+        a, b = (measured.correctors.index(name) for name in pair)
+        order[[a, b]] = b, a
+    return replace(
+        measured, response=measured.response[order], kicks=np.asarray(measured.kicks)[order]
+    )
