@@ -1,8 +1,11 @@
 """The challenge is blind, its signal to noise is what it says, and its scores are those by hand."""
 
+import gc
 import json
 import shutil
+import warnings
 from importlib import resources
+from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -375,6 +378,17 @@ def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
         with pytest.raises(TmlatticeError, match=r"was made with another 'ring\.py'"):
             again(folder, jobs=1, progress=False, lattice="ring.py")
     ring_of.cache_clear()
+
+
+def test_a_damaged_truth_is_closed_again(made, tmp_path):
+    folder = Path(shutil.copytree(made, tmp_path / "set"))
+    (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with pytest.raises(TmlatticeError, match="cannot be read"):
+            read_truth(folder, "0001")
+        gc.collect()
+    assert not [own for own in told if own.category is ResourceWarning]
 
 
 def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):

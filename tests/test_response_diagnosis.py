@@ -156,13 +156,19 @@ def test_a_response_without_rf_step_and_noise_is_fitted_and_says_so(small_ring, 
 
 @pytest.mark.parametrize("noise", [2e-8, 5e-7])
 def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noise):
+    """Also where every monitor stands twice, under two names."""
     exact = ResponseModel(small_ring)
     monitors = [m.name for m in small_ring.monitors]
+    s = np.array([m.s for m in small_ring.monitors])
     names = [f"v{i}" for i in range(16)]
     orbits = 1e-5 * exact.response(names)
     read = orbits + noise * rng.standard_normal(orbits.shape)
     measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
-    assert 0.6 < learnt_noise(measured)[0, 1] / noise < 1.5  # of 16 columns
+    found = learnt_noise(measured, s)[0, 1]
+    assert 0.6 < found / noise < 1.5  # of 16 columns
+    both = [name + own for name in monitors for own in ("", " again")]
+    twice = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), both, np.repeat(read, 2, axis=1))
+    assert learnt_noise(twice, np.repeat(s, 2))[0, 1] == found
 
 
 def test_readings_that_resemble_nothing_are_named_and_left_out(small_ring, measured, rng):

@@ -20,12 +20,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
 
-from damage import damaged_bytes, damaged_json
+from damage import damaged_bytes, damaged_json, damaged_mat
 
 SECONDS = 5.0
 HANG = 60
 """s, of a clock."""
 BYTES = 6 << 30
+VALUES = {".json": damaged_json, ".mat": damaged_mat}
+"""By what a file is: damage to its values instead of its bytes, two times of three."""
 STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
@@ -115,9 +117,9 @@ def tried(seed, folder, inputs, rng):
     words, path = inputs.of(name)
     whole = path.read_bytes()
     tally = inputs.tallies.setdefault(name, Tally())
-    document = path.suffix == ".json" and rng.integers(3)
+    damage = VALUES[path.suffix] if path.suffix in VALUES and rng.integers(3) else damaged_bytes
     try:
-        content = damaged_json(rng, whole) if document else damaged_bytes(rng, whole)
+        content = damage(rng, whole)
         if content == whole:
             return name, None
         path.write_bytes(content)

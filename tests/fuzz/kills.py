@@ -40,8 +40,10 @@ COMMANDS = {
     "challenge run": (["challenge", "run", "set", "--jobs", "1", "-q"], ("set/results",)),
     "challenge score": (["challenge", "score", "set", "--no-oracle", "--jobs", "1", "--json",
                          "score.json", "-q"], ("score.json",)),
+    "tune-fit": (["tune-fit", "ring.json", "--method", "sparse", "--out", "fit", "--json",
+                  "fit.json", "-q"], ("fit", "fit.json")),
 }  # fmt: skip
-TIMES = re.compile(rb'"(seconds|wall)": [-0-9.e]+|"median": [-0-9.e]+')
+TIMES = re.compile(rb'"(seconds|wall)": ([-0-9.e]+|{[^}]*})|"median": [-0-9.e]+')
 
 
 def child(words, folder, limit=None):
