@@ -1,4 +1,4 @@
-"""Damage to a file, by a seed: bytes, lines, the values of a JSON document or of MATLAB variables."""
+"""Damage to a file, by a seed: bytes, lines, values of a JSON document, MATLAB variables."""
 
 import io
 import json
@@ -104,8 +104,9 @@ def damaged_json(rng, content):
 # --- MATLAB variables ---
 ODD_VARIABLES = (
     0.0, -1.0, 0.5, 1e-300, 1e300, float("nan"), float("inf"), 1j, True, np.int8(-3), "", "x",
-    "\x1b[31m", "nan", "x" * 5000, {}, {"x": 1.0}, [], [1.0, "x", {}], np.zeros(0), np.zeros((0, 7)),
-    np.full(3, np.nan), np.arange(1e5), np.zeros((3, 2, 2)), np.ones((2, 3)), np.array(["a", "bc"]),
+    "\x1b[31m", "nan", "x" * 5000, {}, {"x": 1.0}, [], [1.0, "x", {}], np.zeros(0),
+    np.zeros((0, 7)), np.full(3, np.nan), np.arange(1e5), np.zeros((3, 2, 2)), np.ones((2, 3)),
+    np.array(["a", "bc"]),
 )  # fmt: skip
 ODD_VALUES = (0.0, -1.0, 0.5, 1e9, 1e300, -1e300, 1e-300, float("nan"), float("inf"))
 

@@ -116,8 +116,10 @@ def write_loco(folder):
     scipy.io.savemat(folder / "loco.mat", variables)
     words = ["import", "loco.mat", "--out", "loco"]
     tmlattice(*words, "-q", cwd=folder, check=0)
-    return {"LOCO .mat": ([*words, "--force"], "loco.mat"),
-            "LOCO .mat, first": ([*words, "--iteration", "first", "--force"], "loco.mat")}  # fmt: skip
+    first = [*words, "--force", "--iteration", "first"]
+    return {
+        "LOCO .mat": ([*words, "--force"], "loco.mat"), "LOCO .mat, first": (first, "loco.mat")
+    }  # fmt: skip
 
 
 def write_calibration(folder):
