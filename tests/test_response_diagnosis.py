@@ -17,6 +17,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.state import allow, begin, jump
 from tmlattice.effects import Cause, apply
@@ -311,6 +312,15 @@ def test_no_hypothesis_is_wanted_where_nothing_is_missing(small_ring, measured):
     assert len(rows) == 3
     assert all(row.judgement == "excluded" for row in rows)
     assert abs(rows[0].amount) < 4 * rows[0].amount_sigma  # the simulated steps are two-sided
+
+
+def test_what_no_fitted_reading_sees_is_not_weighed(small_ring, measured, monkeypatch):
+    state = fitted(small_ring, measured)
+    pattern = np.zeros((1, *state.data.shape))
+    pattern[0, state.split.held] = 1.0
+    unseen = Hypothesis("unseen", "m", "nothing", pattern)
+    monkeypatch.setitem(HYPOTHESES, "unseen", lambda _: unseen)
+    assert [row.effect for row in weigh(state, ["unseen"])] == ["none"]
 
 
 # --- effects that the fit does not have: made without its patterns, withheld, named ---

@@ -6,6 +6,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command import tmlattice
 
@@ -13,6 +14,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from inputs import write_all
 
 from tmlattice import diagnose, load_ring, read_measurement
+from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.families import MonitorGain, Trial
+from tmlattice.diagnosis.fields import VerticalFocusing
+from tmlattice.observe.orbit_response import response_data, split_columns
 
 TURNS = ("diagnose", "ring.json", "turns")
 RESPONSE = ("diagnose", "ring.json", "response")
@@ -121,6 +126,17 @@ def test_responses_of_nothing(folder, what):
     }[what]
     rows_of(folder / "response/response.csv", change)
     told(tmlattice(*RESPONSE, cwd=folder))
+
+
+def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
+    """Linear algebra of no numbers at all prints what nobody asked for, past Python."""
+    data = response_data(load_ring(whole / "ring.json"), read_measurement(whole / "response"))
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    straights = Trial((VerticalFocusing(),), 2, 0)
+    assert not straights.families[0].count(data)
+    found = fit_steps(data, split, (straights, Trial((MonitorGain(),), 2, 0)))
+    tried = [step.effect for step in (*found.steps[1:], *found.refused)]
+    assert tried == [MonitorGain().title]
 
 
 def test_a_pipe_in_place_of_a_table_is_not_waited_for(folder):
