@@ -195,7 +195,7 @@ def filled(name, results, master, folder, limit):
         return f"left: {litter(folder)}"
     if (
         code == 2
-        and name in ("simulate", "check", "import")
+        and name in ("simulate", "check", "import", "tune-fit")
         and contents(folder, outputs) != before
     ):
         return "a part is there"
@@ -211,6 +211,8 @@ def main(kills=200, file=None):
         master, folder = Path(place) / "master", Path(place) / "work"
         master.mkdir()
         prepared(master)
+        import tmlattice.fitting  # noqa: F401  (torch, as above)
+
         whole, results = references(master, folder)
         names = list(COMMANDS)
         rng = np.random.default_rng(19)
