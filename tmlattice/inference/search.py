@@ -11,6 +11,7 @@ step every earlier choice is held against its rivals again, with all the others 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +117,9 @@ class State:
         return self.names, frozenset(self.monitors), frozenset(self.spikes)
 
 
+AnyState = TypeVar("AnyState", bound=State)
+
+
 @dataclass(frozen=True)
 class Explanation(State):
     """What was found, and the scans that saw it.
@@ -182,7 +186,7 @@ def _run(search: Search, before: Fit) -> Explanation:
         if not options and not spiked:
             break
         if not options:
-            state, spiked = _revised(search, state), False
+            state, spiked = revised(search, state), False
             continue
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
@@ -193,7 +197,7 @@ def _run(search: Search, before: Fit) -> Explanation:
             break
         spiked = best.kind == "reading" and state.count > 1
         if state.count > 1 and not spiked:
-            state = _revised(search, state)
+            state = revised(search, state)
         if state.fit.chi2 <= search.enough:
             break
         if state.choices in been or (best.kind in ("named", "kick") and state.names in seen):
@@ -309,7 +313,7 @@ def _taken(search: Search, state: State, option: Option, look: Look) -> State:
     return _again(search, replace(state, monitors=aside), dropped)
 
 
-def _again(search: Search, state: State, dropped: Flags) -> State:
+def _again(search: Search, state: AnyState, dropped: Flags) -> AnyState:
     """The same causes on the readings that are left."""
     problem = search.problem.without(dropped)
     found = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
@@ -317,8 +321,13 @@ def _again(search: Search, state: State, dropped: Flags) -> State:
 
 
 # --- revising ----
-def _revised(search: Search, state: State) -> State:
-    """Every choice held against its rivals, all the others in place, until none changes."""
+def revised(search: Search, state: AnyState) -> AnyState:
+    """Every choice held against its rivals, all the others in place, until none changes.
+
+    Args:
+        search: what is searched; its problem has all readings.
+        state: what is explained so far.
+    """
     for _ in range(3):
         names = state.names
         for monitor in list(state.monitors):
@@ -332,7 +341,7 @@ def _revised(search: Search, state: State) -> State:
     return state
 
 
-def _monitor_revised(search: Search, state: State, monitor: int) -> State:
+def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
     """A monitor that was set aside comes back where a named cause, or none, does as well."""
     own = state.problem.owner() == monitor
     others = {m: seen for m, seen in state.monitors.items() if m != monitor}
@@ -354,7 +363,7 @@ def _monitor_revised(search: Search, state: State, monitor: int) -> State:
     return state
 
 
-def _kick_revised(search: Search, state: State, place: int) -> State:
+def _kick_revised(search: Search, state: AnyState, place: int) -> AnyState:
     """A free kick gives way to a named cause, or to none, where that explains more."""
     now = state.fit
     kicks = {k: v for k, v in now.kicks.items() if k != place}
@@ -372,7 +381,7 @@ def _kick_revised(search: Search, state: State, place: int) -> State:
     return state
 
 
-def _cause_revised(search: Search, state: State, hypothesis: Hypothesis) -> State:
+def _cause_revised(search: Search, state: AnyState, hypothesis: Hypothesis) -> AnyState:
     """A named cause gives way to a better one, or to none; its rivals are weighed anew."""
     now = state.fit
     own = [i for i, c in enumerate(now.causes) if (c.effect, c.element) == hypothesis]
@@ -385,7 +394,7 @@ def _cause_revised(search: Search, state: State, hypothesis: Hypothesis) -> Stat
     without = replace(state, fit=alone, named=named)
     if alone.point.lost:
         return state
-    if alone.log_evidence > now.log_evidence:
+    if hypothesis not in search.granted and alone.log_evidence > now.log_evidence:
         return without
     tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 12)
     if hypothesis not in [rival.hypothesis for rival in tried]:
