@@ -74,7 +74,7 @@ def test_a_search_ends_where_it_has_been(ring, measured, looks, monkeypatch):
         return replace(state, monitors={0: seen})
 
     monkeypatch.setattr(own, "_options", options)
-    monkeypatch.setattr(own, "_revised", revised)
+    monkeypatch.setattr(own, "revised", revised)
     found = own.explain(own.Search(problem, []), fit(problem, (), data.launches))
     assert list(found.monitors) == [0]
     assert len(looks) == 2
