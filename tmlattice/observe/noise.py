@@ -2,8 +2,8 @@
 
 Between two errors a trajectory is free: the reading of a monitor follows from those of the two
 before it, in each plane. What is left of a reading has the noise of three, with known weights; the
-median over all monitors does not see a few errors. Of monitors at one place one counts: they may
-be one signal under two names, which has no noise against itself.
+median over all monitors does not see a few errors. One signal under two names, of monitors at one
+place, counts once: it has no noise against itself.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def local_misfit(data: Data, paths: Paths) -> Array:
     """Each reading's difference from the model less what its two predecessors make of it, divided
     by the norm of the weights, [shot, reading, 2]; NaN where it cannot be said."""
     result = np.full(data.valid.shape, np.nan)
-    own = _places(data, paths)
+    own = _signals(data, paths)
     difference = np.where(data.valid, data.readings - paths.readings, np.nan)[:, own]
     for plane, columns in ((0, (0, 1)), (1, (2, 3))):
         slope = paths.launch[:, own, plane][:, :, columns]  # [shot, reading, 2]
@@ -41,12 +41,12 @@ def local_misfit(data: Data, paths: Paths) -> Array:
     return result
 
 
-def _places(data: Data, paths: Paths) -> NDArray[np.intp]:
-    """One reading of each place, the first that there is."""
+def _signals(data: Data, paths: Paths) -> NDArray[np.intp]:
+    """The readings that are no copies, to the last digit, of the one before at the same place."""
     moved = np.abs(np.diff(paths.beam_launch[..., :4], axis=1)).max(axis=(0, 2, 3))
-    place = np.cumsum(np.append(True, ~(moved <= SAME_PLACE)))
-    order = np.lexsort((~data.valid.any(axis=(0, 2)), place))
-    return np.asarray(order[np.unique(place[order], return_index=True)[1]])
+    copied = (np.diff(data.readings, axis=1) == 0) & (data.valid[:, 1:] == data.valid[:, :-1])
+    copied = copied.all(axis=(0, 2)) & data.valid[:, 1:].any(axis=(0, 2))
+    return np.flatnonzero(np.append(True, ~(copied & (moved <= SAME_PLACE))))
 
 
 def _cross(a: Array, b: Array) -> Array:

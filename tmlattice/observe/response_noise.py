@@ -28,7 +28,7 @@ def learnt_noise(measured: OrbitResponse, s: Array) -> Array:
 
     Args:
         measured: in beam order.
-        s: where its monitors stand, m; of several at one place one counts (see `noise`).
+        s: where its monitors stand, m; one signal under two names counts once (see `noise`).
 
     Raises:
         MeasurementError: too few monitors or columns.
@@ -38,8 +38,9 @@ def learnt_noise(measured: OrbitResponse, s: Array) -> Array:
     for p in (0, 1):
         own = measured.response[planes == p, :, p]
         seen = np.isfinite(own).mean(axis=0) > 0.5 if len(own) else np.zeros(0, dtype=bool)
-        places = np.flatnonzero(seen)
-        read = own[:, places[np.diff(s[places], prepend=-np.inf) > SAME_PLACE]]
+        read, places = own[:, seen], s[seen]
+        copied = (np.diff(read, axis=1) == 0).all(axis=0) & (np.diff(places) < SAME_PLACE)
+        read = read[:, ~np.append(False, copied)[: len(places)]]
         read = read[np.isfinite(read).all(axis=1)]
         found.append(_left(read))
     sizes = np.array(found)
