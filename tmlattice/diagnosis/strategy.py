@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.background import SmallErrors, small_errors
+from tmlattice.diagnosis.background import SmallErrors, damped, small_errors
 from tmlattice.diagnosis.prepare import Prepared
 from tmlattice.effects import Cause, background_rms, find
 from tmlattice.errors import BeamLostError
@@ -44,6 +44,9 @@ of machines in good order one in a million has it."""
 AMOUNT = 5.0
 """Log evidence that an amount costs which may be anything: even over four decades, of both signs,
 known to some per cent."""
+
+POOR = 0.01
+"""Chance that noise leaves as much as an explanation, below which its small errors are doubted."""
 
 NEAR = 7.0
 """Log evidence by which a rival is behind that sizes learnt with the fault among them may hide."""
@@ -140,7 +143,12 @@ def _crowded(ready: Prepared) -> bool:
 def explained(found: Explanation) -> bool:
     """Whether few causes leave nothing but noise."""
     more, _ = found.problem.judgement.noise
-    return bool(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)) >= more)
+    return _left(found) >= more
+
+
+def _left(found: Explanation) -> float:
+    """Chance that noise leaves as much."""
+    return float(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)))
 
 
 def _among(
@@ -159,10 +167,12 @@ def _among(
         search.progress("background with what was found")
         beside, causes = tried
         weigh = not explanation.count and beside is explanation.fit  # one of the small errors
-        causes, errors = _parted(causes, small.estimate(beside, turns_of(explanation).whitening))
+        likeliest = small.estimate(beside, turns_of(explanation).whitening)
+        errors, there = damped(ring, small, ready.known, likeliest, causes, beside.nuisances)
+        causes, errors = _parted(causes, errors, small)
         try:
             again = small_errors(
-                ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
+                ring, small.plain, ready.known, small.sizes, there.nuisances, causes, errors,
                 learn=learn, noisy=learn and ready.estimated, weigh=weigh,
             )  # fmt: skip
         except BeamLostError:
@@ -214,39 +224,45 @@ def _settled(
     weighed: by ten in the log evidence, for a fault of 50 times the noise.
     """
     found = explanation.fit
-    estimate = small.estimate(found, turns_of(explanation).whitening)
-    causes, errors = _parted(found.causes, estimate)
+    likeliest = small.estimate(found, turns_of(explanation).whitening)
+    errors, there = damped(ring, small, ready.known, likeliest, found.causes, found.nuisances)
+    causes, errors = _parted(there.causes, errors, small)
     try:
         about = small_errors(
-            ring, small.plain, ready.known, small.sizes, found.nuisances, causes, errors,
+            ring, small.plain, ready.known, small.sizes, there.nuisances, causes, errors,
             learn=learn, noisy=learn and ready.estimated,
         )  # fmt: skip
     except BeamLostError:
         return explanation, small
     problem = about.problem.without(explanation.dropped)
-    again = fit(problem, causes, found.nuisances)
+    again = fit(problem, causes, there.nuisances)
     if not again.good:
         return explanation, small
     settled = replace(explanation, problem=problem, fit=again, before=about.before)
-    seen = frozenset((cause.effect, cause.element) for cause in found.causes)
-    settled = revised(replace(search, problem=about.problem, granted=seen), settled)
+    if _left(settled) < POOR:  # so large that they are linear nowhere: slopes as good as any
+        return settled, replace(about, open=small.open, evidence=small.evidence)
+    settled = revised(replace(search, problem=about.problem, keep=True), settled)
     known = about.open if learn else small.open
     return settled, replace(about, open=known, evidence=small.evidence)
 
 
 def _parted(
-    causes: Sequence[Cause], estimate: Sequence[Cause]
+    causes: Sequence[Cause], errors: list[Cause], small: SmallErrors
 ) -> tuple[tuple[Cause, ...], list[Cause]]:
-    """Causes and small errors without a share in both: all of a cause is the cause's."""
-    own = {(error.effect, error.element): error.amount for error in estimate}
-    whole = []
+    """Causes, and the small errors beside them, without a share in both: all is the cause's.
+
+    Small errors are in a reference too, and causes are not: beside one both have their own.
+    """
+    if not small.plain.data.active.all():
+        return tuple(causes), errors
+    own = {(error.effect, error.element): error.amount for error in errors}
+    whole = {}
     for cause in causes:
-        amount = own.get((cause.effect, cause.element), 0.0)
-        whole.append(replace(cause, amount=find(cause.effect).joined(cause.amount, amount)))
-    names = {(cause.effect, cause.element) for cause in causes}
-    return tuple(whole), [
-        replace(e, amount=0.0) if (e.effect, e.element) in names else e for e in estimate
-    ]
+        where = (cause.effect, cause.element)
+        amount = find(cause.effect).joined(cause.amount, own.get(where, 0.0))
+        whole[where] = replace(cause, amount=amount)
+    kept = [replace(e, amount=0.0) if (e.effect, e.element) in whole else e for e in errors]
+    return tuple(whole.values()), kept
 
 
 def strongest(explanation: Explanation) -> Cause:
@@ -271,7 +287,7 @@ def _beside(
             return None
         estimate = learnt.estimate(explanation.fit, turns_of(explanation).whitening)
         cause = outlier(estimate, learnt.sizes)
-        if cause is not None:
+        if cause is not None and learnt.plain.data.active.all():  # else it is in the reference too
             return explanation.fit, (replace(cause, amount=0.0),)  # so far all is a small error's
         cause = _likeliest(explanation)
         if cause is None:
@@ -279,8 +295,8 @@ def _beside(
         tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
         return (tried, tried.causes) if tried.good else None
     found = explanation.fit
-    left = chi2.sf(found.chi2, freedom(explanation.problem, found))
-    if not (explanation.monitors or (found.causes and (explanation.count > 1 or left < 0.01))):
+    doubtful = explanation.count > 1 or _left(explanation) < POOR
+    if not (explanation.monitors or (found.causes and doubtful)):
         return None
     # the others may be the background's
     return found, (strongest(explanation),) if explanation.named else ()

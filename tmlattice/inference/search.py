@@ -50,6 +50,7 @@ class Search:
             took what a name nearly explains, and the evidence decides.
         enough: chi-square at which nothing is left to be explained, and no further look is taken.
         granted: hypotheses of which it is decided already that something is there.
+        keep: whether a cause may only give way to a better one, not to none.
         seed: of the threshold's simulation.
         progress: told what was found.
     """
@@ -62,6 +63,7 @@ class Search:
     names_first: bool = False
     enough: float = -np.inf
     granted: frozenset[Hypothesis] = frozenset()
+    keep: bool = False
     seed: int = 0
     progress: Callable[[str], None] = lambda _: None
 
@@ -394,7 +396,7 @@ def _cause_revised(search: Search, state: AnyState, hypothesis: Hypothesis) -> A
     without = replace(state, fit=alone, named=named)
     if alone.point.lost:
         return state
-    if hypothesis not in search.granted and alone.log_evidence > now.log_evidence:
+    if not search.keep and alone.log_evidence > now.log_evidence:
         return without
     tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 12)
     if hypothesis not in [rival.hypothesis for rival in tried]:
