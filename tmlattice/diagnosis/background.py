@@ -255,7 +255,9 @@ def damped(
             replace(goal, amount=start.amount + share * (goal.amount - start.amount))
             for start, goal in zip(small.about, likeliest, strict=True)
         ]
-        model = Model(ring, data.settings, data.turns, [*known, *errors], active=data.active)
+        model = small.problem.model
+        if share:
+            model = Model(ring, data.settings, data.turns, [*known, *errors], active=data.active)
         found = fit(replace(plain, model=model), causes, launches)
         prior = sum((error.amount / small.sizes[error.effect]) ** 2 for error in errors)
         return errors, found, found.chi2 + prior
