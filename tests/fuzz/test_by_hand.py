@@ -6,12 +6,14 @@ import shutil
 import sys
 from pathlib import Path
 
+import at
 import numpy as np
 import pytest
+from at_ring import at_lattice
 from command import tmlattice
 
 sys.path.insert(0, str(Path(__file__).parent))
-from inputs import write_all
+from inputs import ring, write_all
 
 from tmlattice import diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.dense import fit_steps
@@ -126,6 +128,16 @@ def test_responses_of_nothing(folder, what):
     }[what]
     rows_of(folder / "response/response.csv", change)
     told(tmlattice(*RESPONSE, cwd=folder))
+
+
+@pytest.mark.parametrize("suffix", ["json", "mat", "m", "repr"])
+def test_an_order_of_a_field_lays_out_no_memory(tmp_path, monkeypatch, suffix):
+    """AT would make tables of 8 GB."""
+    monkeypatch.setattr("tmlattice.lattice.at_file.check_mat", lambda path: None)
+    lattice = at.Lattice([*at_lattice(ring())], energy=3e9, periodicity=1)
+    next(e for e in lattice if isinstance(e, at.Quadrupole)).__dict__["MaxOrder"] = 10**9
+    at.save_lattice(lattice, tmp_path / f"a.{suffix}")
+    assert "has the MaxOrder 1e+09" in told(tmlattice("info", f"a.{suffix}", cwd=tmp_path))
 
 
 def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
