@@ -395,6 +395,10 @@ def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):
     folder = tmp_path / "set"
     shutil.copytree(made, folder)
     run(folder, jobs=1, progress=False, lattice=LATTICE)
+    whole = (folder / "results" / "0000.json").read_text()
+    (folder / "results" / "0000.json").write_text(json.dumps(json.loads(whole) | {"seconds": "x"}))
+    found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
+    assert set(found["failed"]) == {"0000"}
     (folder / "results" / "0000.json").write_text('{"verdict": null}')
     (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
     found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
