@@ -26,6 +26,7 @@ from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 ROUNDS = 2
 """Linearisations: about the design, and about the likeliest errors."""
@@ -231,6 +232,7 @@ def damped(
     likeliest: Sequence[Cause],
     causes: Sequence[Cause],
     launches: Array,
+    dropped: Flags,
 ) -> tuple[list[Cause], Fit]:
     """As much of the way to the likeliest small errors as makes them likelier: Gauss and Newton.
 
@@ -243,11 +245,12 @@ def damped(
         likeliest: small errors by that background.
         causes: what was found; amounts and launches follow.
         launches: first guess.
+        dropped: readings that were left out.
 
     Returns:
         The small errors, and the fit beside them; those in the model where no step helps.
     """
-    plain = small.plain
+    plain = small.plain.without(dropped)
     data = plain.data
 
     def tried(share: float) -> tuple[list[Cause], Fit, float]:

@@ -168,7 +168,9 @@ def _among(
         beside, causes = tried
         weigh = not explanation.count and beside is explanation.fit  # one of the small errors
         likeliest = small.estimate(beside, turns_of(explanation).whitening)
-        errors, there = damped(ring, small, ready.known, likeliest, causes, beside.nuisances)
+        errors, there = damped(
+            ring, small, ready.known, likeliest, causes, beside.nuisances, explanation.dropped
+        )
         causes, errors = _parted(causes, errors, small)
         try:
             again = small_errors(
@@ -225,7 +227,9 @@ def _settled(
     """
     found = explanation.fit
     likeliest = small.estimate(found, turns_of(explanation).whitening)
-    errors, there = damped(ring, small, ready.known, likeliest, found.causes, found.nuisances)
+    errors, there = damped(
+        ring, small, ready.known, likeliest, found.causes, found.nuisances, explanation.dropped
+    )
     causes, errors = _parted(there.causes, errors, small)
     try:
         about = small_errors(
