@@ -46,6 +46,13 @@ def test_rivals_are_weighed_among_small_errors_without_the_fault(small_ring):
     assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
 
 
+def test_an_exchanged_monitor_has_no_small_errors_of_what_it_exchanged(small_ring):
+    """It is set aside first; small errors taken again without it leave its readings to a name."""
+    found = diagnose(small_ring, measured(small_ring, [Cause("monitor_swap", "end_1", 1.0)], seed=4))
+    assert found.verdict == "named"
+    assert [(f.effect, f.element) for f in found.findings] == [("monitor_swap", "end_1")]
+
+
 @pytest.mark.parametrize("amount", [-1.0, 2.0])
 def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring, amount):
     """Four are set: the one that is far off made their family as large as itself, and one that does
