@@ -48,7 +48,8 @@ def test_rivals_are_weighed_among_small_errors_without_the_fault(small_ring):
 
 def test_an_exchanged_monitor_has_no_small_errors_of_what_it_exchanged(small_ring):
     """It is set aside first; small errors taken again without it leave its readings to a name."""
-    found = diagnose(small_ring, measured(small_ring, [Cause("monitor_swap", "end_1", 1.0)], seed=4))
+    fault = Cause("monitor_swap", "end_1", 1.0)
+    found = diagnose(small_ring, measured(small_ring, [fault], seed=4))
     assert found.verdict == "named"
     assert [(f.effect, f.element) for f in found.findings] == [("monitor_swap", "end_1")]
 

@@ -17,15 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.inference import chi2
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.newton import Fit, Outcome, fit
+from tmlattice.inference.options import Option, Reading, spike, unnamed
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.rivals import Detection, Rival, rivals
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,
     Scan,
-    free_threshold,
-    look_elsewhere,
     scan,
     scan_kicks,
     scan_monitors,
@@ -33,12 +32,7 @@ from tmlattice.inference.scan import (
 
 log = logging.getLogger(__name__)
 
-AMONG = 10
-"""Readings for each one that is wrong for once: of a few, such as two tunes, none is."""
-
 Flags = NDArray[np.bool_]
-Reading = tuple[int, ...]
-"""Where it stands among the problem's readings."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +90,6 @@ class State:
         dropped: all readings left out, of the problem's shape.
         effective: number of independent hypotheses that pure noise sees; None: not known yet.
         passed_over: whether a free kick took what a name nearly explains.
-        tried: every explanation that was refitted, with its evidence: what else it could be.
     """
 
     problem: Problem
@@ -119,6 +112,11 @@ class State:
         """Of causes and places of kicks."""
         causes = ((c.effect, c.element) for c in self.fit.causes)
         return frozenset([*causes, *self.fit.kicks])
+
+    @property
+    def choices(self) -> object:
+        """All of them, what was left out too."""
+        return self.names, frozenset(self.monitors), frozenset(self.spikes)
 
 
 AnyState = TypeVar("AnyState", bound=State)
@@ -143,19 +141,6 @@ class Explanation(State):
     left: FreeScan = NO_SCAN
     full: bool = False
     beyond: tuple[Rival, ...] = ()
-
-
-@dataclass(frozen=True)
-class Option:
-    """What could be done next: by how much the log evidence grows, and how it was seen."""
-
-    kind: str
-    name: str
-    gain: float
-    detection: Detection
-    where: int = -1
-    reading: Reading = ()
-    rivals: tuple[Rival, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -185,6 +170,7 @@ def explain(search: Search, before: Fit) -> Explanation:
 def _run(search: Search, before: Fit) -> Explanation:
     state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
     seen: set[frozenset[object]] = set()
+    been: set[object] = set()
     first: Look | None = None
     spiked = False  # readings were left out since the choices were revised
     while True:
@@ -198,6 +184,7 @@ def _run(search: Search, before: Fit) -> Explanation:
         told = () if seen or search.by_evidence else ("named",)
         options = [option for option in options if option.gain > 0 or option.kind in told]
         seen.add(state.names)
+        been.add(state.choices)
         if not options and not spiked:
             break
         if not options:
@@ -215,7 +202,7 @@ def _run(search: Search, before: Fit) -> Explanation:
             state = revised(search, state)
         if state.fit.chi2 <= search.enough:
             break
-        if best.kind in ("named", "kick") and state.names in seen:
+        if state.choices in been or (best.kind in ("named", "kick") and state.names in seen):
             break  # what was added went again
     return Explanation(
         **vars(state), before=before, first=first.named, first_kicks=first.kicks,
@@ -281,49 +268,20 @@ def _options(search: Search, state: State, look: Look) -> list[Option]:
         ("monitor", look.monitors, problem.monitors, state.monitors),
     ):
         if len(free.places):
-            options += _unnamed(problem, kind, free, names, taken)
-    return [*options, *_spike(search, state)]
+            options += unnamed(problem, kind, free, names, taken)
+    if search.unnamed:
+        options += spike(problem, state.fit.point, len(state.spikes))
+    if state.fit.outcome is Outcome.STUCK:
+        options = [_refitted(search, state, option, look) for option in options]
+    return options
 
 
-def _unnamed(
-    problem: Problem,
-    kind: str,
-    free: FreeScan,
-    names: Sequence[str],
-    taken: Mapping[int, Detection],
-) -> list[Option]:
-    """Something without a name at the place where it explains most."""
-    rate = problem.judgement.rate(kind)
-    place = int(free.gain.argmax())
-    where = int(free.places[place])
-    freedom = max(int(free.freedom[place]), 1)
-    seen = Detection(
-        float(free.statistic[place]),
-        free_threshold(rate, freedom, len(names)),
-        look_elsewhere(float(free.statistic[place]), freedom, len(names)),
-    )
-    if not seen.p_value < rate or where in taken:
-        return []
-    gain = float(free.gain[place]) + problem.unknown_prior(len(names))
-    return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
-
-
-def _spike(search: Search, state: State) -> list[Option]:
-    """The reading that is least explained, left out."""
-    problem, judge = state.problem, state.problem.judgement
-    if not search.unnamed or int(problem.valid.sum()) < AMONG * (len(state.spikes) + 1):
-        return []
-    clean, size = problem.left(state.fit.point)
-    statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
-    worst = tuple(int(i) for i in np.unravel_index(int(statistic.argmax()), statistic.shape))
-    value, count = float(statistic[worst]), float(problem.valid.sum())
-    rate = judge.rate("reading")
-    seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
-    if not seen.p_value < rate:
-        return []
-    # an amount even over its logarithm, as for every other cause
-    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.spike
-    return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]
+def _refitted(search: Search, state: State, option: Option, look: Look) -> Option:
+    """With what it takes of chi-square in fact: about a fit that is stuck a scan says little."""
+    if option.kind == "named":
+        return option
+    fell = state.fit.chi2 - _taken(search, state, option, look).fit.chi2
+    return replace(option, gain=option.gain + 0.5 * (fell - option.detection.statistic))
 
 
 def _choice(search: Search, state: State, options: Sequence[Option]) -> tuple[Option, State]:
@@ -396,6 +354,8 @@ def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
     about = back.problem.metric(back.fit.point)
     free = scan_monitors(about, back.fit.residual)
     alone = float(free.gain[monitor]) + back.problem.unknown_prior(len(free.gain))
+    if back.fit.outcome is Outcome.STUCK:  # see `_refitted`
+        alone += 0.5 * (back.fit.chi2 - state.fit.chi2 - float(free.statistic[monitor]))
     if alone <= 0:
         return back
     tried = rivals(back.problem, back.fit, _scan(search, back), search.hypotheses, 8)
