@@ -10,9 +10,12 @@ from tests.command import tmlattice
 from tmlattice import Cause, diagnose, simulate, write_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
+from tmlattice.diagnosis import stages
+from tmlattice.diagnosis.kinds import How, part_of, stacked
 from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
@@ -226,6 +229,21 @@ def test_what_has_no_meaning_is_a_sentence(small_ring):
     unknown = ClosedOrbit(orbit=orbit.orbit, monitors=orbit.monitors)
     with pytest.raises(MeasurementError, match="noise of a closed orbit is not known"):
         diagnose(small_ring, unknown)
+
+
+def test_small_errors_that_leave_no_stored_beam_are_told(small_ring):
+    """Half of them stood in the model that is shown, and nobody said so."""
+    places = {"quadrupole_gradient": 1.0}
+    how = How(small_ring, places, DEFAULT)
+    problem = stacked([part_of("orbit", _orbit(small_ring, []), how)], [], how)
+    far = tuple(Cause("quadrupole_gradient", f"QF::{i}", 0.9) for i in range(16))
+    some = stages._settled(problem, far, ())
+    assert not some.point.lost
+    assert some.share in (0.5, 0.25, 0.125)
+    assert some.static[0].amount == some.share * 0.9
+    assert f"for {some.share:.4g} of each" in stages.too_large([some])[0]
+    whole = stages._settled(problem, some.static[:1], ())
+    assert (whole.share, stages.too_large([some, whole])) == (1.0, [])
 
 
 # --- a model that learns --------------------------------------------------------------------------

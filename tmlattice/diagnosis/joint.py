@@ -26,6 +26,7 @@ from tmlattice.diagnosis.stages import (
     pairs_of,
     seen_by,
     stages_of,
+    too_large,
     views_of,
 )
 from tmlattice.diagnosis.strategy import (
@@ -300,7 +301,7 @@ def _told(
         said = (*said, f"held-out readings leave {np.sqrt(left):.1f} times the noise: something is "
                 "there that the fitted ones do not see")  # fmt: skip
     told = (f"{part.label}: {one}" for part in parts for one in part.said)
-    warnings = [*told, *spikes(parts, problem, found), *said]
+    warnings = [*told, *spikes(parts, problem, found), *said, *too_large(stages)]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     learnt = None
