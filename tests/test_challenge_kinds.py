@@ -131,6 +131,9 @@ def test_all_sextupoles_of_a_family_are_one_change(small_ring, tmp_path):
     row = row_of(result, truth, None, None, Places(small_ring))
     assert row["answers"]["tool"]["first"]
     assert row["answers"]["tool"]["place"]
+    result |= {"verdict": "nothing", "findings": []}
+    row = row_of(result, truth, None, None, Places(small_ring))
+    assert not row["answers"]["tool"]["place"]  # it could not be scored
 
 
 def test_what_many_find_where_one_does_not_by_hand(small_ring):

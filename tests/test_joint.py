@@ -17,6 +17,7 @@ from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
+from tmlattice.machine.stored_beam import simulate_orbits
 from tmlattice.maps import ring_matrix
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 from tmlattice.optics import matrix_tunes
@@ -160,6 +161,28 @@ def test_a_fault_among_small_errors_by_turns_and_dispersion(small_ring):
     assert ("quadrupole_gradient", "QD::3") in _found(diagnosis)
     assert len(diagnosis.findings) == 1
     assert 0.3 < diagnosis.priors["quadrupole_gradient"] / 1e-3 < 3
+
+
+def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring):
+    """Four are set: the one that does not kick made their family as large as itself."""
+    fault = Cause("corrector_calibration", "v5", -1.0)
+    settings = [{name: {"kick": 1e-4} for name in ("v2", "v5", "v9", "v12")}, {}]
+    orbits = simulate_orbits(
+        small_ring, [fault], shots=2, settings=settings, background={"all": None}, seed=1
+    ).measured
+    diagnosis = diagnose(small_ring, orbits)
+    assert _found(diagnosis) == {(fault.effect, fault.element)}
+    assert diagnosis.priors["corrector_calibration"] < 0.1
+
+
+def test_what_is_sought_beside_a_doubt_makes_the_readings_likelier(small_ring):
+    """Small errors taken beside a supply 30 % off, which the scan of a sound machine doubted, left
+    that supply to be found."""
+    orbit = simulate_orbits(
+        small_ring, [], noise=(2.53e-6, 2.53e-6), background={"all": None}, seed=758855874,
+        machine_seed=758855873,
+    ).measured  # fmt: skip
+    assert not diagnose(small_ring, orbit).findings
 
 
 def test_a_reference_cancels_what_was_there(small_ring):

@@ -17,10 +17,11 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
-from tmlattice.effects import rare
+from tmlattice.effects import find, rare
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.observe.orbit_response import ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
@@ -97,20 +98,23 @@ def few_causes(
     )
     before = fit(problem, (), problem.first)
     count = int(problem.used.sum())
-    if not before.chi2 / count > NOISE and chi2.sf(before.chi2, count) > judgement.false_alarm:
-        return None
     number = min(most, MOST)
     gap = max(before.chi2 - count, 1.0)
     enough = float(chi2.isf(judgement.noise[1], count))
     enough = max(enough, min(NOISE * count, count + REST * gap))
+    strongest = hypotheses
     if _beyond(problem, before, PATTERNS * number + SPARE) > enough:
-        return None
+        strongest = [h for h in hypotheses if not find(h[0]).responds]
+    metric = problem.metric(before.point)
+    seen = scan(metric, strongest, before.residual, effective=1.0).statistic
+    if seen.max(initial=0.0) < gap / (2 * number):
+        return None  # the strongest of a few would explain its share
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
     found = explain(search, before)
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
-        return None  # the strongest of a few would explain its share
+        return None
     if found.fit.chi2 > search.enough and number > 1:
         found = explain(replace(search, most=number), before)
     if found.fit.chi2 > search.enough:
