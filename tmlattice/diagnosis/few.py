@@ -42,6 +42,10 @@ PATTERNS, SPARE = 2, 2
 kicks by what the corrector does there, and the monitors see that kick): two patterns a cause. What
 a magnet's length and sextupoles add has the spare ones."""
 
+KICKS = 50_000
+"""Readings up to which kicks are sought too, which bend the orbit in all sextupoles and so make
+many patterns: of more, a scan of them takes longer than of all others."""
+
 
 @dataclass(frozen=True)
 class Few:
@@ -98,23 +102,23 @@ def few_causes(
     )
     before = fit(problem, (), problem.first)
     count = int(problem.used.sum())
+    if count > KICKS:
+        hypotheses = [h for h in hypotheses if find(h[0]).responds]
     number = min(most, MOST)
     gap = max(before.chi2 - count, 1.0)
     enough = float(chi2.isf(judgement.noise[1], count))
     enough = max(enough, min(NOISE * count, count + REST * gap))
-    strongest = hypotheses
     if _beyond(problem, before, PATTERNS * number + SPARE) > enough:
-        strongest = [h for h in hypotheses if not find(h[0]).responds]
-    metric = problem.metric(before.point)
-    seen = scan(metric, strongest, before.residual, effective=1.0).statistic
-    if seen.max(initial=0.0) < gap / (2 * number):
-        return None  # the strongest of a few would explain its share
+        kicks = [h for h in hypotheses if not find(h[0]).responds]
+        seen = scan(problem.metric(before.point), kicks, before.residual, effective=1.0)
+        if seen.statistic.max(initial=0.0) < gap / 2:
+            return None
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
     found = explain(search, before)
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
-        return None
+        return None  # the strongest of a few would explain its share
     if found.fit.chi2 > search.enough and number > 1:
         found = explain(replace(search, most=number), before)
     if found.fit.chi2 > search.enough:
