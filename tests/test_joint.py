@@ -164,8 +164,9 @@ def test_a_fault_among_small_errors_by_turns_and_dispersion(small_ring):
 
 
 def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring):
-    """Four are set: the one that does not kick made their family as large as itself."""
-    fault = Cause("corrector_calibration", "v5", -1.0)
+    """Four are set: the one that kicks three times too much made their family as large as itself;
+    and once it was found the next look beside it lost it again."""
+    fault = Cause("corrector_calibration", "v5", 2.0)
     settings = [{name: {"kick": 1e-4} for name in ("v2", "v5", "v9", "v12")}, {}]
     orbits = simulate_orbits(
         small_ring, [fault], shots=2, settings=settings, background={"all": None}, seed=1

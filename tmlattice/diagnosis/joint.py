@@ -215,7 +215,7 @@ def _sought(
             hidden = _hidden(narrow, found, small, learnt, learn)
             if hidden is None:
                 break
-            found, small = hidden
+            found, small, narrow = hidden
             continue
         try:
             about = learnt((*found.fit.causes, *_doubted(found)), found.fit.nuisances)
@@ -227,7 +227,7 @@ def _sought(
         if same:
             break
     if found.full and search.most > narrow.most:
-        whole = replace(search, unnamed=False, problem=small.problem)
+        whole = replace(narrow, most=search.most, problem=small.problem)
         found = explain(whole, small.before)
     return found, small
 
@@ -238,13 +238,13 @@ def _hidden(
     small: Learnt,
     learnt: Callable[[Sequence[Cause], Array], Learnt],
     learn: bool,
-) -> tuple[Explanation, Learnt] | None:
+) -> tuple[Explanation, Learnt, Search] | None:
     """A fault among small errors that hides it: with sizes learnt beside it the readings are
     likelier than without. One that outweighs its family needs no statistic of its own; it made the
     family as large as itself."""
-    own = small.problem.known.hypotheses
     amounts = small.problem.estimate(found.fit.clean).tolist()
-    estimate = [Cause(*h, a) for h, a in zip(own, amounts, strict=True)]
+    errors = zip(small.problem.known.hypotheses, amounts, strict=True)
+    estimate = [Cause(*h, a) for h, a in errors]
     far = outlier(estimate, small.sizes) if learn else None
     for beside in dict.fromkeys(((far,) if far is not None else (), _doubted(found))):
         if not beside:
@@ -254,9 +254,10 @@ def _hidden(
         except UnstableRingError:  # a cause that is no cause
             continue
         granted = frozenset((c.effect, c.element) for c in beside if c is far)
-        again = explain(replace(search, problem=about.problem, granted=granted), about.before)
+        own = replace(search, granted=granted)
+        again = explain(replace(own, problem=about.problem), about.before)
         if again.named and _density(again, about) > _density(found, small):
-            return again, about
+            return again, about, own
     return None
 
 
