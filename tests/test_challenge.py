@@ -1,8 +1,11 @@
 """The challenge is blind, its signal to noise is what it says, and its scores are those by hand."""
 
+import gc
 import json
 import shutil
+import warnings
 from importlib import resources
+from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -377,10 +380,25 @@ def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
     ring_of.cache_clear()
 
 
+def test_a_damaged_truth_is_closed_again(made, tmp_path):
+    folder = Path(shutil.copytree(made, tmp_path / "set"))
+    (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with pytest.raises(TmlatticeError, match="cannot be read"):
+            read_truth(folder, "0001")
+        gc.collect()
+    assert not [own for own in told if own.category is ResourceWarning]
+
+
 def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):
     folder = tmp_path / "set"
     shutil.copytree(made, folder)
     run(folder, jobs=1, progress=False, lattice=LATTICE)
+    whole = (folder / "results" / "0000.json").read_text()
+    (folder / "results" / "0000.json").write_text(json.dumps(json.loads(whole) | {"seconds": "x"}))
+    found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
+    assert set(found["failed"]) == {"0000"}
     (folder / "results" / "0000.json").write_text('{"verdict": null}')
     (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
     found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)

@@ -312,6 +312,58 @@ def test_pass_methods_of_a_file_load_nothing(simulated, brought, tmp_path):
     assert found.ring.elements[2].kind == "drift"
 
 
+def one(array, value, place=1):
+    array = np.array(array, dtype=float)
+    array.flat[place] = value
+    return array
+
+
+WRONG = {
+    "a field is missing": (lambda v: {"CMData_HCMIndex": None}, "HCMIndex holds no numbers"),
+    "numbers are text": (lambda v: {"LocoMeasData_M": "text"}, "M holds no numbers"),
+    "numbers are complex": (lambda v: {"LocoMeasData_M": 1j * v["LocoMeasData"]["M"]}, "complex"),
+    "a table in a row": (
+        lambda v: {"LocoMeasData_M": v["LocoMeasData"]["M"].ravel()}, "M has the shape"),
+    "a place is no number": (
+        lambda v: {"CMData_HCMIndex": one(v["CMData"]["HCMIndex"], np.nan)}, "list of places"),
+    "a place is infinite": (
+        lambda v: {"CMData_HCMIndex": one(v["CMData"]["HCMIndex"], np.inf)}, "list of places"),
+    "a place before the first": (
+        lambda v: {"CMData_HCMIndex": one(v["CMData"]["HCMIndex"], 0)}, "beyond the lattice's"),
+    "a good list beyond its monitors": (
+        lambda v: {"BPMData_HBPMGoodDataIndex": np.array([1.0, 99.0])}, "counts beyond the 16"),
+    "a good list of halves": (
+        lambda v: {"CMData_HCMGoodDataIndex": np.array([1.0, 2.5])}, "list of places"),
+    "a step without bounds": (
+        lambda v: {"CMData_HCMKicks": one(v["CMData"]["HCMKicks"], 1e300)}, "has a step of"),
+    "an RF without bounds": (lambda v: {"LocoMeasData_RF": 9e299}, "cannot be"),
+    "a harmonic without bounds": (lambda v: {"RINGData_CavityHarmNumber": 1e299}, "cannot be"),
+    "an order of a field that would fill the memory": (
+        lambda v: {"RINGData_Lattice": np.array(
+            [{**e, "MaxOrder": 1e9} if e["FamName"] == "QF" else e
+             for e in v["RINGData"]["Lattice"]], dtype=object)}, "MaxOrder 1e"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_variables_that_are_wrong_are_refused_in_one_sentence(simulated, tmp_path, what):
+    change, word = WRONG[what]
+    fields = {k: "" if v is None else v for k, v in change(simulated).items()}
+    scipy.io.savemat(tmp_path / "a.mat", changed(simulated, **fields))
+    done = tmlattice("import", "a.mat", "--out", "m", cwd=tmp_path, check=2)
+    assert word in done.stderr
+    assert not (tmp_path / "m").exists()
+
+
+def test_parameters_of_no_place_are_not_followed(simulated, brought):
+    """Counted from 1; place 0 would be the last element."""
+    moved = {"ElemIndex": 0.0, "FieldName": "Length", "FieldIndex": np.array([1.0])}
+    steps = [{"Params": np.array([moved], dtype=object), "Values": np.array([0.0])}] * 2
+    variables = {**simulated, "FitParameters": np.array(steps, dtype=object)}
+    found = brought(variables, iteration="first")
+    assert any("cannot be followed" in sentence for sentence in found.assumed)
+
+
 def test_command_writes_a_folder_that_reads_back(simulated, tmp_path):
     scipy.io.savemat(tmp_path / "a.loco.mat", simulated)
     done = tmlattice("import", "a.loco.mat", "--out", "m", cwd=tmp_path, check=0)
@@ -795,6 +847,7 @@ def test_turns_of_the_sps():
 def test_a_reader_that_does_not_come_back_is_one_sentence(tmp_path, monkeypatch):
     """Damage makes the HDF5 library go round without an end (found by tests/fuzz)."""
     monkeypatch.setattr("tmlattice.lattice.mat_file.SECONDS", 1)
+    monkeypatch.setattr("tmlattice.lattice.mat_file.BUSY", 100)  # the processor's seconds end it
     monkeypatch.setattr("tmlattice.lattice.mat_file._HDF5", "while True: pass")
     path = tmp_path / "response.h5"
     path.write_bytes(b"\x89HDF\r\n\x1a\n")

@@ -17,6 +17,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.state import allow, begin, jump
 from tmlattice.effects import Cause, apply
@@ -156,13 +157,19 @@ def test_a_response_without_rf_step_and_noise_is_fitted_and_says_so(small_ring, 
 
 @pytest.mark.parametrize("noise", [2e-8, 5e-7])
 def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noise):
+    """Also where every monitor stands twice, under two names."""
     exact = ResponseModel(small_ring)
     monitors = [m.name for m in small_ring.monitors]
+    s = np.array([m.s for m in small_ring.monitors])
     names = [f"v{i}" for i in range(16)]
     orbits = 1e-5 * exact.response(names)
     read = orbits + noise * rng.standard_normal(orbits.shape)
     measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
-    assert 0.6 < learnt_noise(measured)[0, 1] / noise < 1.5  # of 16 columns
+    found = learnt_noise(measured, s)[0, 1]
+    assert 0.6 < found / noise < 1.5  # of 16 columns
+    both = [name + own for name in monitors for own in ("", " again")]
+    twice = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), both, np.repeat(read, 2, axis=1))
+    assert learnt_noise(twice, np.repeat(s, 2))[0, 1] == found
 
 
 def test_readings_that_resemble_nothing_are_named_and_left_out(small_ring, measured, rng):
@@ -305,6 +312,15 @@ def test_no_hypothesis_is_wanted_where_nothing_is_missing(small_ring, measured):
     assert len(rows) == 3
     assert all(row.judgement == "excluded" for row in rows)
     assert abs(rows[0].amount) < 4 * rows[0].amount_sigma  # the simulated steps are two-sided
+
+
+def test_what_no_fitted_reading_sees_is_not_weighed(small_ring, measured, monkeypatch):
+    state = fitted(small_ring, measured)
+    pattern = np.zeros((1, *state.data.shape))
+    pattern[0, state.split.held] = 1.0
+    unseen = Hypothesis("unseen", "m", "nothing", pattern)
+    monkeypatch.setitem(HYPOTHESES, "unseen", lambda _: unseen)
+    assert [row.effect for row in weigh(state, ["unseen"])] == ["none"]
 
 
 # --- effects that the fit does not have: made without its patterns, withheld, named ---

@@ -2,8 +2,8 @@
 
 A damaged file is accepted, with some meaning, or refused: one sentence that begins with
 `tmlattice: `, exit code 2, within `SECONDS` of the processor, with less than `BYTES` of memory,
-nothing printed that steers a terminal, nothing left behind, and the process alive. A verdict's exit
-code is 0 or 1.
+nothing printed that steers a terminal or past the package, nothing left behind, and the process
+alive. A verdict's exit code is 0 or 1.
 """
 
 import contextlib
@@ -14,23 +14,41 @@ import re
 import resource
 import signal
 import sys
+import tempfile
 import traceback
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
 
-from damage import damaged_bytes, damaged_json
+from damage import damaged_bytes, damaged_json, damaged_mat
 
 SECONDS = 5.0
 HANG = 60
 """s, of a clock."""
 BYTES = 6 << 30
+VALUES = {".json": damaged_json, ".mat": damaged_mat}
+"""By what a file is: damage to its values instead of its bytes, two times of three."""
 STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
 class Hang(BaseException):
     """No `except Exception` keeps it."""
+
+
+@contextlib.contextmanager
+def past_python():
+    """A file of what a library or a child prints past Python's own streams."""
+    with tempfile.TemporaryFile() as seen:
+        kept = [(place, os.dup(place)) for place in (1, 2)]
+        try:
+            for place, _ in kept:
+                os.dup2(seen.fileno(), place)
+            yield seen
+        finally:
+            for place, own in kept:
+                os.dup2(own, place)
+                os.close(own)
 
 
 @dataclass
@@ -87,7 +105,11 @@ def broken(words, folder, tally):
     """What of the contract a command breaks, or None."""
     before = set(folder.rglob("*"))
     try:
-        code, out, errors, seconds = called(words, folder)
+        with past_python() as seen:
+            code, out, errors, seconds = called(words, folder)
+            seen.seek(0)
+            if printed := seen.read():
+                return f"printed past Python: {printed[:300]!r}"
     except Hang:
         return f"no end in {HANG} s"
     except BaseException:
@@ -115,9 +137,9 @@ def tried(seed, folder, inputs, rng):
     words, path = inputs.of(name)
     whole = path.read_bytes()
     tally = inputs.tallies.setdefault(name, Tally())
-    document = path.suffix == ".json" and rng.integers(3)
+    damage = VALUES[path.suffix] if path.suffix in VALUES and rng.integers(3) else damaged_bytes
     try:
-        content = damaged_json(rng, whole) if document else damaged_bytes(rng, whole)
+        content = damage(rng, whole)
         if content == whole:
             return name, None
         path.write_bytes(content)

@@ -1,7 +1,11 @@
-"""Damage to a file, by a seed: bytes, lines, and the values of a JSON document."""
+"""Damage to a file, by a seed: bytes, lines, values of a JSON document, MATLAB variables."""
 
+import io
 import json
 import re
+import warnings
+
+import numpy as np
 
 ODD = (
     None, True, [], {}, "", "x", "\x1b[31m", "\u202e", "nan", 0, -1, 1, 10**30, 10**400, -(10**19),
@@ -95,3 +99,85 @@ def damaged_json(rng, content):
                 text = json.dumps(document).replace('"HERE"', "[" * deep + "1" + "]" * deep)
                 return text.encode()
     return json.dumps(document).encode()
+
+
+# --- MATLAB variables ---
+ODD_VARIABLES = (
+    0.0, -1.0, 0.5, 1e-300, 1e300, float("nan"), float("inf"), 1j, True, np.int8(-3), "", "x",
+    "\x1b[31m", "nan", "x" * 5000, {}, {"x": 1.0}, [], [1.0, "x", {}], np.zeros(0),
+    np.zeros((0, 7)), np.full(3, np.nan), np.arange(1e5), np.zeros((3, 2, 2)), np.ones((2, 3)),
+    np.array(["a", "bc"]),
+)  # fmt: skip
+ODD_VALUES = (0.0, -1.0, 0.5, 1e9, 1e300, -1e300, 1e-300, float("nan"), float("inf"))
+
+
+def damaged_mat(rng, content):
+    """Variables and fields that are gone, misspelt, of another type or shape, or out of range."""
+    import scipy.io
+
+    variables = scipy.io.loadmat(io.BytesIO(content), simplify_cells=True)
+    variables = {name: v for name, v in variables.items() if not name.startswith("__")}
+    for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
+        every = list(places(variables))[1:]
+        # of hundreds of elements' fields as many as of the others: first how deep, then where
+        depth = int(rng.choice(sorted({len(path) for path in every})))
+        every = [path for path in every if len(path) == depth]
+        path = every[int(rng.integers(len(every)))]
+        owner = variables
+        for key in path[:-1]:
+            owner = owner[key]
+        _damage_variable(rng, owner, path[-1])
+        if not variables:
+            break
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of names that MATLAB would not have
+        scipy.io.savemat(file, variables, long_field_names=True)
+    return file.getvalue()
+
+
+def _damage_variable(rng, owner, key):
+    value = owner[key]
+    match int(rng.integers(8)):
+        case 0 if isinstance(owner, dict):
+            del owner[key]
+        case 1 if isinstance(owner, dict):
+            owner[key.lower() if rng.integers(2) else f"{key}\x1b[2J"] = owner.pop(key)
+        case 0 | 1:
+            owner.pop(key)
+        case 2:
+            owner[key] = [value] * int(rng.integers(1, 4))
+        case 3:
+            for _ in range(int(rng.choice([2, 35]))):
+                value = {"x": value}
+            owner[key] = value
+        case 4 | 5 | 6 if isinstance(value, int | float | np.ndarray) and np.size(value):
+            owner[key] = _damaged_numbers(rng, value)
+        case _:
+            owner[key] = ODD_VARIABLES[int(rng.integers(len(ODD_VARIABLES)))]
+
+
+def _damaged_numbers(rng, value):
+    array = np.array(value)
+    if array.dtype.kind not in "fiu":
+        return "x"
+    if not rng.integers(3):  # another shape or type
+        flat = array.ravel()
+        return [flat[:-1], np.append(flat, flat[:1]), array.T, flat, array[None, ..., None],
+                np.concatenate([flat, flat]), flat.astype("S8").astype(str), flat.astype(np.int8),
+                flat.astype(complex) * (1 + 1j)][int(rng.integers(9))]  # fmt: skip
+    array = array.astype(float)
+    flat = array.reshape(-1)
+    some = rng.integers(0, flat.size, int(rng.choice([1, 1, 3, flat.size])))
+    match int(rng.integers(5)):
+        case 0:
+            flat[some] = ODD_VALUES[int(rng.integers(len(ODD_VALUES)))]
+        case 1:
+            flat[some] *= 10.0 ** int(rng.integers(-12, 13))
+        case 2:
+            flat[some] += int(rng.choice([-1000, -1, 1, 1000]))
+        case 3:
+            flat[some] *= -1
+        case _:
+            rng.shuffle(flat)
+    return array

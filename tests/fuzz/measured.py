@@ -100,13 +100,26 @@ def write_control_room(folder):
 
 
 def write_loco(folder):
-    """A LOCO file, whose variables the tests of the importer make."""
+    """A LOCO file, whose variables the tests of the importer make, with a fit of two iterations."""
     import scipy.io
     from test_import import simulated
 
-    scipy.io.savemat(folder / "loco.mat", simulated.__wrapped__())
-    tmlattice("import", "loco.mat", "--out", "loco", "-q", cwd=folder, check=0)
-    return {"LOCO .mat": (["import", "loco.mat", "--out", "loco", "--force"], "loco.mat")}
+    variables = simulated.__wrapped__()
+    lattice = variables["RINGData"]["Lattice"]
+    at = next(i for i, fields in enumerate(lattice) if fields["FamName"] == "QF")
+    moved = {"ElemIndex": at + 1.0, "FieldName": "PolynomB", "FieldIndex": np.array([1, 2.0])}
+    last = float(lattice[at]["PolynomB"][1])
+    fits = [{"Params": np.array([moved], dtype=object), "Values": np.array([value])}
+            for value in (0.9 * last, last)]  # fmt: skip
+    variables["FitParameters"] = np.array(fits, dtype=object)
+    variables["LocoModel"] = {"Eta": 1.1 * variables["LocoMeasData"]["Eta"]}
+    scipy.io.savemat(folder / "loco.mat", variables)
+    words = ["import", "loco.mat", "--out", "loco"]
+    tmlattice(*words, "-q", cwd=folder, check=0)
+    first = [*words, "--force", "--iteration", "first"]
+    return {
+        "LOCO .mat": ([*words, "--force"], "loco.mat"), "LOCO .mat, first": (first, "loco.mat")
+    }  # fmt: skip
 
 
 def write_calibration(folder):

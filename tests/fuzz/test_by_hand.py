@@ -6,13 +6,20 @@ import shutil
 import sys
 from pathlib import Path
 
+import at
+import numpy as np
 import pytest
+from at_ring import at_lattice
 from command import tmlattice
 
 sys.path.insert(0, str(Path(__file__).parent))
-from inputs import write_all
+from inputs import ring, write_all
 
 from tmlattice import diagnose, load_ring, read_measurement
+from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.families import MonitorGain, Trial
+from tmlattice.diagnosis.fields import VerticalFocusing
+from tmlattice.observe.orbit_response import response_data, split_columns
 
 TURNS = ("diagnose", "ring.json", "turns")
 RESPONSE = ("diagnose", "ring.json", "response")
@@ -121,6 +128,27 @@ def test_responses_of_nothing(folder, what):
     }[what]
     rows_of(folder / "response/response.csv", change)
     told(tmlattice(*RESPONSE, cwd=folder))
+
+
+@pytest.mark.parametrize("suffix", ["json", "mat", "m", "repr"])
+def test_an_order_of_a_field_lays_out_no_memory(tmp_path, monkeypatch, suffix):
+    """AT would make tables of 8 GB."""
+    monkeypatch.setattr("tmlattice.lattice.at_file.check_mat", lambda path: None)
+    lattice = at.Lattice([*at_lattice(ring())], energy=3e9, periodicity=1)
+    next(e for e in lattice if isinstance(e, at.Quadrupole)).__dict__["MaxOrder"] = 10**9
+    at.save_lattice(lattice, tmp_path / f"a.{suffix}")
+    assert "has the MaxOrder 1e+09" in told(tmlattice("info", f"a.{suffix}", cwd=tmp_path))
+
+
+def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
+    """Linear algebra of no numbers at all prints what nobody asked for, past Python."""
+    data = response_data(load_ring(whole / "ring.json"), read_measurement(whole / "response"))
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    straights = Trial((VerticalFocusing(),), 2, 0)
+    assert not straights.families[0].count(data)
+    found = fit_steps(data, split, (straights, Trial((MonitorGain(),), 2, 0)))
+    tried = [step.effect for step in (*found.steps[1:], *found.refused)]
+    assert tried == [MonitorGain().title]
 
 
 def test_a_pipe_in_place_of_a_table_is_not_waited_for(folder):

@@ -1,18 +1,21 @@
 """Some of what `make fuzz` does, with the same seeds each time."""
 
+import os
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contract import broken, made, report, tried
-from kills import filled, killed, prepared, references
+from kills import child, filled, killed, litter, prepared, references
 
-SOME = 104
-"""Inputs, eight of each format; `make fuzz` takes 10,000."""
+SOME = 120
+"""Inputs, four or so of each format; `make fuzz` takes 10,000."""
 WRITING = ("simulate", "check", "import")
 """Of the commands, the quick ones; `make fuzz` kills all of them."""
 
@@ -65,3 +68,15 @@ def test_killed_commands_and_full_disks_leave_nothing_half_written(tmp_path):
     for name in WRITING:
         assert killed(name, whole, results, master, folder, rng)[0] is None, name
         assert filled(name, results, master, folder, 100) is None, name
+
+
+def test_a_disk_that_fills_up_while_weights_are_written(inputs, tmp_path):
+    shutil.copy(inputs.folder / "ring.json", tmp_path)
+    words = ["tune-fit", "ring.json", "--method", "sparse", "--out", "fit", "-q"]
+    # figures are larger than the weights: they would end it first
+    with mock.patch("tmlattice.cli.tune_fit._draw", return_value=[]):
+        for limit, code in ((1000, 2), (None, 0)):
+            _, status = os.waitpid(child(words, tmp_path, limit), 0)
+            assert os.waitstatus_to_exitcode(status) == code
+            assert (tmp_path / "fit" / "network.pt").exists() == (limit is None)
+            assert not litter(tmp_path)

@@ -308,7 +308,8 @@ def _truth(folder: Path, name: str) -> Truth:
     secret = _read(folder / "truth" / f"{name}.json", TRUTH)
     launches: dict[str, Array] = {}
     clean: dict[str, Array] = {}
-    with np.load(folder / "truth" / f"{name}.npz") as arrays:
+    path = folder / "truth" / f"{name}.npz"
+    with path.open("rb") as file, np.load(file) as arrays:  # NumPy leaves a damaged one open
         for key in arrays:
             kind, part = key.split("_", 1)
             (launches if kind == "launches" else clean)[part] = arrays[key]

@@ -26,9 +26,13 @@ from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 ROUNDS = 2
 """Linearisations: about the design, and about the likeliest errors."""
+
+SHARES = (1.0, 0.5, 0.25, 0.0625)
+"""Of a step to the likeliest small errors that are tried, until one makes them likelier."""
 
 ROWS = 1600
 """Readings from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
@@ -43,6 +47,7 @@ class SmallErrors:
         before: launches alone, in this model.
         plain: without them, with the noise as learnt.
         hypotheses, rms: of every error.
+        about: the amounts in its model.
         sizes: rms by effect.
         open: relative error of each size that was learnt; large where the readings hardly see it.
         evidence: log evidence that the sizes learnt have over no small errors; None: they were
@@ -56,6 +61,7 @@ class SmallErrors:
     plain: FirstTurns
     hypotheses: tuple[Hypothesis, ...]
     rms: Array
+    about: tuple[Cause, ...]
     sizes: Mapping[str, float]
     open: Mapping[str, float] = field(default_factory=dict)
     evidence: float | None = None
@@ -180,7 +186,8 @@ def small_errors(
         hypotheses, scale, spread = background_signatures(model, paths, alone.nuisances, rms)
         if estimate:
             spread = chained(estimate)[:, None, None, None] * spread
-        amounts = np.array([cause.amount for cause in estimate] or np.zeros(len(scale)))
+        estimate = estimate or [Cause(*h, 0.0) for h in hypotheses]
+        amounts = np.array([cause.amount for cause in estimate])
         shifted = _moved(data, amounts / scale, spread)
         if learn:
             found, names = _sizes(shifted, spread, alone, hypotheses, noisy)
@@ -209,14 +216,61 @@ def small_errors(
         problem = replace(problem, fixed=())
         small = SmallErrors(
             problem, explained, replace(plain, data=data, white=None, open=opened),
-            tuple(hypotheses), scale,
-            rms, errors, evidence, apart,
+            tuple(hypotheses), scale, tuple(estimate), rms, errors, evidence, apart,
         )  # fmt: skip
         estimate = small.estimate(explained, problem.whitening)
     if fixed:
         small = replace(small, before=fit(problem, (), launches))
         _on_its_way(small.before)
     return small
+
+
+def damped(
+    ring: Ring,
+    small: SmallErrors,
+    known: Sequence[Cause],
+    likeliest: Sequence[Cause],
+    causes: Sequence[Cause],
+    launches: Array,
+    dropped: Flags,
+) -> tuple[list[Cause], Fit]:
+    """As much of the way to the likeliest small errors as makes them likelier: Gauss and Newton.
+
+    They are worked out linearly about those in the model, which large ones mislead.
+
+    Args:
+        ring: the design.
+        small: the background about those in its model.
+        known: causes that are there anyway.
+        likeliest: small errors by that background.
+        causes: what was found; amounts and launches follow.
+        launches: first guess.
+        dropped: readings that were left out.
+
+    Returns:
+        The small errors, and the fit beside them; those in the model where no step helps.
+    """
+    plain = small.plain.without(dropped)
+    data = plain.data
+
+    def tried(share: float) -> tuple[list[Cause], Fit, float]:
+        errors = [
+            replace(goal, amount=start.amount + share * (goal.amount - start.amount))
+            for start, goal in zip(small.about, likeliest, strict=True)
+        ]
+        model = small.problem.model
+        if share:
+            model = Model(ring, data.settings, data.turns, [*known, *errors], active=data.active)
+        found = fit(replace(plain, model=model), causes, launches)
+        prior = sum((error.amount / small.sizes[error.effect]) ** 2 for error in errors)
+        return errors, found, found.chi2 + prior
+
+    now, fitted, cost = tried(0.0)
+    for share in SHARES:
+        errors, found, better = tried(share)
+        if better < cost:
+            return errors, found
+    return now, fitted
 
 
 def _on_its_way(result: Fit) -> None:

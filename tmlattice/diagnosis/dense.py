@@ -254,8 +254,11 @@ def fit_steps(
 def one_by_one(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
 ) -> Iterator[tuple[Trial, State]]:
-    """The state with one trial's families after another, each fitted beside those before it."""
+    """The state with one trial's families after another, each fitted beside those before it;
+    without those that the ring has no places of."""
     for trial in trials:
+        if not any(family.count(state.data) for family in trial.families):
+            continue
         progress(_title(trial))
         state = bend(state) if trial.own else state
         state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)

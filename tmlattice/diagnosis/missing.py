@@ -93,8 +93,8 @@ def weigh(
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         hypothesis = HYPOTHESES[name](state)
-        # nothing where the ring has no such places, or no reading would move
-        if hypothesis is not None and hypothesis.patterns.any():
+        # nothing where the ring has no such places, or no reading that is fitted would move
+        if hypothesis is not None and fitted.sees(hypothesis):
             found.append(hypothesis)
     alone = [fitted.weigh([hypothesis]) for hypothesis in found]
     progress("hypotheses together")
@@ -224,6 +224,10 @@ class Fitted:
         ring = self.slopes.reshape(len(self.slopes), self.weight.size).T
         own = _dense(weighted @ self.own)
         return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
+
+    def sees(self, hypothesis: Hypothesis) -> bool:
+        """Whether it would move a reading that is fitted."""
+        return bool(hypothesis.patterns.any() and self._part(hypothesis).flat.shape[0])
 
     def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
         """What held-out readings say of these hypotheses together."""

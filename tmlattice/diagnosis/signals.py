@@ -9,6 +9,7 @@ from tmlattice.diagnosis.checkup import Check, fine, note, wrong
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.observe.noise import SAME_PLACE
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -19,8 +20,6 @@ CUT = 3
 """Monitors without a reading, the last ones of a shot, from which the beam is said to be lost."""
 ALIKE = 0.5
 """Share of the signals that never change, from which the data are no readings."""
-SAME_PLACE = 1e-6
-"""m."""
 STRAY = 0.02
 """Share of a turn's readings below which a turn far behind the others is a slip of the pen."""
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.background import SmallErrors, small_errors
+from tmlattice.diagnosis.background import SmallErrors, damped, small_errors
 from tmlattice.diagnosis.prepare import Prepared
 from tmlattice.effects import Cause, background_rms, find
 from tmlattice.errors import BeamLostError
 from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Problem
-from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.inference.search import Explanation, Search, explain, revised
 from tmlattice.lattice import Ring
 from tmlattice.observe.first_turns import turns_of
 from tmlattice.observe.noise import local_misfit
@@ -44,6 +44,15 @@ of machines in good order one in a million has it."""
 AMOUNT = 5.0
 """Log evidence that an amount costs which may be anything: even over four decades, of both signs,
 known to some per cent."""
+
+POOR = 0.01
+"""Chance that noise leaves as much as an explanation, below which its small errors are doubted."""
+
+NEAR = 7.0
+"""Log evidence by which a rival is behind that sizes learnt with the fault among them may hide."""
+
+SETTLED = 3
+"""How often small errors are taken again along what was found, until no rival of it leads."""
 
 CLEAR = 10.0
 """Log evidence above which small errors are there."""
@@ -134,7 +143,12 @@ def _crowded(ready: Prepared) -> bool:
 def explained(found: Explanation) -> bool:
     """Whether few causes leave nothing but noise."""
     more, _ = found.problem.judgement.noise
-    return bool(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)) >= more)
+    return _left(found) >= more
+
+
+def _left(found: Explanation) -> float:
+    """Chance that noise leaves as much."""
+    return float(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)))
 
 
 def _among(
@@ -142,7 +156,7 @@ def _among(
 ) -> tuple[Explanation, SmallErrors]:
     """The background, taken again along the orbit of what is found where that misleads."""
     few = min(2, search.most)  # two findings say already whether it has to be taken again
-    learn = small.evidence is not None
+    learn = stale = small.evidence is not None  # stale: what is found made sizes too large
     search.progress("scan")
     narrow = replace(search, most=few, names_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
@@ -153,13 +167,14 @@ def _among(
         search.progress("background with what was found")
         beside, causes = tried
         weigh = not explanation.count and beside is explanation.fit  # one of the small errors
-        errors = [
-            replace(error, amount=0.0) if error in causes else error
-            for error in small.estimate(beside, turns_of(explanation).whitening)
-        ]
+        likeliest = small.estimate(beside, turns_of(explanation).whitening)
+        errors, there = damped(
+            ring, small, ready.known, likeliest, causes, beside.nuisances, explanation.dropped
+        )
+        causes, errors = _parted(causes, errors, small)
         try:
             again = small_errors(
-                ring, small.plain, ready.known, small.sizes, beside.nuisances, causes, errors,
+                ring, small.plain, ready.known, small.sizes, there.nuisances, causes, errors,
                 learn=learn, noisy=learn and ready.estimated, weigh=weigh,
             )  # fmt: skip
         except BeamLostError:
@@ -169,33 +184,89 @@ def _among(
         other = explain(replace(narrow, problem=again.problem), again.before)
         if not explanation.count and not other.count:
             break  # it was a small error after all
-        small, explanation = again, other
+        small, explanation, stale = again, other, False
     if explanation.full and search.most > few:
         whole = replace(search, problem=small.problem, granted=narrow.granted)
         explanation = explain(whole, small.before)
-    if explanation.fit.causes and not explanation.fit.kicks:
-        return _settled(ring, ready, explanation, small)
+    narrow = replace(narrow, most=max(explanation.count, 1))
+    learn = False
+    for _ in range(SETTLED):
+        if not explanation.fit.causes or explanation.fit.kicks:
+            break
+        names = explanation.names
+        explanation, small = _settled(ring, ready, narrow, explanation, small, learn)
+        learn, stale = stale and _undecided(explanation), False
+        if explanation.names == names and not learn:
+            break
     return explanation, small
 
 
+def _undecided(explanation: Explanation) -> bool:
+    """Whether something at another place does nearly as well as what was found."""
+    for named in explanation.named:
+        best = named.rivals[0]
+        for other in named.rivals[1:]:
+            behind = best.fit.log_evidence - other.fit.log_evidence
+            if behind < NEAR and other.hypothesis[1] != best.hypothesis[1]:
+                return True
+    return False
+
+
 def _settled(
-    ring: Ring, ready: Prepared, explanation: Explanation, small: SmallErrors
+    ring: Ring,
+    ready: Prepared,
+    search: Search,
+    explanation: Explanation,
+    small: SmallErrors,
+    learn: bool,
 ) -> tuple[Explanation, SmallErrors]:
-    """Small errors linear about all that was found, and its amounts among them."""
+    """Small errors linear about all that was found, its amounts among them, and its rivals too.
+
+    What they took up of a fault before it was found spoils the slopes about which its rivals were
+    weighed: by ten in the log evidence, for a fault of 50 times the noise.
+    """
     found = explanation.fit
-    errors = small.estimate(found, turns_of(explanation).whitening)
+    likeliest = small.estimate(found, turns_of(explanation).whitening)
+    errors, there = damped(
+        ring, small, ready.known, likeliest, found.causes, found.nuisances, explanation.dropped
+    )
+    causes, errors = _parted(there.causes, errors, small)
     try:
         about = small_errors(
-            ring, small.plain, ready.known, small.sizes, found.nuisances, found.causes, errors
-        )
+            ring, small.plain, ready.known, small.sizes, there.nuisances, causes, errors,
+            learn=learn, noisy=learn and ready.estimated,
+        )  # fmt: skip
     except BeamLostError:
         return explanation, small
     problem = about.problem.without(explanation.dropped)
-    again = fit(problem, found.causes, found.nuisances)
+    again = fit(problem, causes, there.nuisances)
     if not again.good:
         return explanation, small
     settled = replace(explanation, problem=problem, fit=again, before=about.before)
-    return settled, replace(about, open=small.open, evidence=small.evidence)
+    if _left(settled) < POOR:  # so large that they are linear nowhere: slopes as good as any
+        return settled, replace(about, open=small.open, evidence=small.evidence)
+    settled = revised(replace(search, problem=about.problem, keep=True), settled)
+    known = about.open if learn else small.open
+    return settled, replace(about, open=known, evidence=small.evidence)
+
+
+def _parted(
+    causes: Sequence[Cause], errors: list[Cause], small: SmallErrors
+) -> tuple[tuple[Cause, ...], list[Cause]]:
+    """Causes, and the small errors beside them, without a share in both: all is the cause's.
+
+    Small errors are in a reference too, and causes are not: beside one both have their own.
+    """
+    if not small.plain.data.active.all():
+        return tuple(causes), errors
+    own = {(error.effect, error.element): error.amount for error in errors}
+    whole = {}
+    for cause in causes:
+        where = (cause.effect, cause.element)
+        amount = find(cause.effect).joined(cause.amount, own.get(where, 0.0))
+        whole[where] = replace(cause, amount=amount)
+    kept = [replace(e, amount=0.0) if (e.effect, e.element) in whole else e for e in errors]
+    return tuple(whole.values()), kept
 
 
 def strongest(explanation: Explanation) -> Cause:
@@ -220,16 +291,16 @@ def _beside(
             return None
         estimate = learnt.estimate(explanation.fit, turns_of(explanation).whitening)
         cause = outlier(estimate, learnt.sizes)
-        if cause is not None:
-            return explanation.fit, (cause,)
+        if cause is not None and learnt.plain.data.active.all():  # else it is in the reference too
+            return explanation.fit, (replace(cause, amount=0.0),)  # so far all is a small error's
         cause = _likeliest(explanation)
         if cause is None:
             return None
         tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
         return (tried, tried.causes) if tried.good else None
     found = explanation.fit
-    left = chi2.sf(found.chi2, freedom(explanation.problem, found))
-    if not (explanation.monitors or (found.causes and (explanation.count > 1 or left < 0.01))):
+    doubtful = explanation.count > 1 or _left(explanation) < POOR
+    if not (explanation.monitors or (found.causes and doubtful)):
         return None
     # the others may be the background's
     return found, (strongest(explanation),) if explanation.named else ()

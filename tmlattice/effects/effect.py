@@ -126,6 +126,10 @@ class Effect(ABC):
             return float(self.power * amount ** (self.power - 1))
         return float(1 / (1 + self.some_left(amount)))
 
+    def joined(self, one: float, other: float) -> float:
+        """The amount that does what two of them do."""
+        return (1 + one) * (1 + other) - 1 if self.multiplies else one + other
+
     def some_left(self, amount: float) -> float:
         """The amount; of a strength that would be gone, `LEAST_LEFT` is kept.
 

@@ -47,14 +47,18 @@ def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
         shape: that it must have; None: any.
 
     Raises:
-        MeasurementError: it holds no numbers, or has another shape.
+        MeasurementError: it holds no numbers, complex ones, or has another shape (dimensions of one
+            do not count: files leave them out).
     """
     try:
-        array = np.asarray(value, dtype=float)
+        array = np.asarray(value)
+        if array.dtype.kind == "c":
+            raise MeasurementError(f"{what} holds complex numbers; mend it in the file")
+        array = array.astype(float)
     except (TypeError, ValueError):
         raise MeasurementError(f"{what} holds no numbers; mend it in the file") from None
     if shape is not None:
-        if array.size != int(np.prod(shape)):
+        if [n for n in array.shape if n != 1] != [n for n in shape if n != 1]:
             raise MeasurementError(
                 f"{what} has the shape {list(array.shape)}; it should be {list(shape)}"
             )

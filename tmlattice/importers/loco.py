@@ -31,6 +31,8 @@ Iteration = Literal["first", "last"]
 VARIABLES = (
     "LocoMeasData", "BPMData", "CMData", "RINGData", "FitParameters", "LocoFlags", "LocoModel",
 )  # fmt: skip
+FURTHEST = 1e9
+"""No list of places goes there."""
 SAME = 1e-6
 """Relative difference of the lattice's numbers and the last iteration's: they are the same."""
 COMPUTED = 1e-4
@@ -123,17 +125,25 @@ def _field(structure: Fields, name: str) -> Any:
     return structure[name]
 
 
-def _index(structure: Fields, name: str) -> Indices:
-    """A list of places from 1, counted from 0."""
+def _counted(structure: Fields, name: str) -> Indices:
+    """A list of whole numbers from 1, counted from 0."""
     index = np.atleast_1d(numbers(_field(structure, name), name))
     if index.ndim > 1:
         raise MeasurementError(
             f"{name} has the shape {list(index.shape)}; a magnet of several elements a row is not "
             "taken: name one element of each"
         )
-    if np.any(index != np.round(index)) or len(set(index.tolist())) < len(index):
-        raise MeasurementError(f"{name} is no list of different places; mend it in the file")
+    if not np.all((np.abs(index) < FURTHEST) & (index == np.round(index))):
+        raise MeasurementError(f"{name} is no list of places; mend it in the file")
     return index.astype(np.int64) - 1
+
+
+def _index(structure: Fields, name: str) -> Indices:
+    """Places, each once."""
+    index = _counted(structure, name)
+    if len(set(index.tolist())) < len(index):
+        raise MeasurementError(f"{name} is no list of different places; mend it in the file")
+    return index
 
 
 def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
@@ -194,7 +204,10 @@ def _settings(step: Fields) -> list[Setting]:
         for one in group if isinstance(group, list) else [group]:
             number = np.ravel(np.asarray(one["FieldIndex"], dtype=float))
             at = int(number[-1]) - 1 if len(number) else 0
-            places = np.ravel(np.asarray(one["ElemIndex"], dtype=float)).astype(np.int64) - 1
+            places = np.ravel(np.asarray(one["ElemIndex"], dtype=float))
+            if at < 0 or not (places >= 1).all():
+                raise IndexError("places and fields count from 1")
+            places = places.astype(np.int64) - 1
             settings += [(place, str(one["FieldName"]), at, value) for place in places.tolist()]
     return settings
 
@@ -231,10 +244,14 @@ def _good(
             (plane, monitors, reads[plane], "BPM"), (letter, correctors, kickers[plane], "CM")
         ):  # fmt: skip
             name = f"{letter}{kind}GoodDataIndex"
-            flags = np.ones(len(index), dtype=bool)
+            flags = np.full(len(index), name not in structure)
             if name in structure:
-                there = np.atleast_1d(numbers(structure[name], name)).astype(np.int64) - 1
-                flags[:] = np.isin(np.arange(len(index)), there)
+                there = _counted(structure, name)
+                if len(there) and not 0 <= there.min() <= there.max() < len(index):
+                    raise MeasurementError(
+                        f"{name} counts beyond the {len(index)} of its list; mend it in the file"
+                    )
+                flags[there] = True
             if not flags.all():
                 bad = np.flatnonzero(~flags)
                 names = (

@@ -26,6 +26,7 @@ from tmlattice.importers.imported import is_number
 from tmlattice.lattice import Ring
 from tmlattice.lattice.at_child import shipped_methods
 from tmlattice.lattice.at_file import ring_from_at
+from tmlattice.lattice.expressions import check_order
 
 PLANES = "xy"
 LONGEST = 1e5
@@ -189,6 +190,7 @@ def _element(fields: Mapping[str, Any], place: int, energy: float, said: Counter
         kept["PassMethod"] = "DriftPass" if length else "IdentityPass"
     if str(kept["PassMethod"]) in _APERTURES:
         kept = {"FamName": kept["FamName"], "Class": "Marker", "PassMethod": "IdentityPass"}
+    check_order(kept)
     _one_gradient(kept)
     if "Frequency" in kept:  # a cavity cannot be made without
         kept.setdefault("Energy", energy * 1e9)

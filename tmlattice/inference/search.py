@@ -11,20 +11,20 @@ step every earlier choice is held against its rivals again, with all the others 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.inference import chi2
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.newton import Fit, Outcome, fit
+from tmlattice.inference.options import Option, Reading, spike, unnamed
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.rivals import Detection, Rival, rivals
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,
     Scan,
-    free_threshold,
-    look_elsewhere,
     scan,
     scan_kicks,
     scan_monitors,
@@ -32,12 +32,7 @@ from tmlattice.inference.scan import (
 
 log = logging.getLogger(__name__)
 
-AMONG = 10
-"""Readings for each one that is wrong for once: of a few, such as two tunes, none is."""
-
 Flags = NDArray[np.bool_]
-Reading = tuple[int, ...]
-"""Where it stands among the problem's readings."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +50,7 @@ class Search:
             took what a name nearly explains, and the evidence decides.
         enough: chi-square at which nothing is left to be explained, and no further look is taken.
         granted: hypotheses of which it is decided already that something is there.
+        keep: whether a cause may only give way to a better one, not to none.
         seed: of the threshold's simulation.
         progress: told what was found.
     """
@@ -67,6 +63,7 @@ class Search:
     names_first: bool = False
     enough: float = -np.inf
     granted: frozenset[Hypothesis] = frozenset()
+    keep: bool = False
     seed: int = 0
     progress: Callable[[str], None] = lambda _: None
 
@@ -93,7 +90,6 @@ class State:
         dropped: all readings left out, of the problem's shape.
         effective: number of independent hypotheses that pure noise sees; None: not known yet.
         passed_over: whether a free kick took what a name nearly explains.
-        tried: every explanation that was refitted, with its evidence: what else it could be.
     """
 
     problem: Problem
@@ -117,6 +113,14 @@ class State:
         causes = ((c.effect, c.element) for c in self.fit.causes)
         return frozenset([*causes, *self.fit.kicks])
 
+    @property
+    def choices(self) -> object:
+        """All of them, what was left out too."""
+        return self.names, frozenset(self.monitors), frozenset(self.spikes)
+
+
+AnyState = TypeVar("AnyState", bound=State)
+
 
 @dataclass(frozen=True)
 class Explanation(State):
@@ -137,19 +141,6 @@ class Explanation(State):
     left: FreeScan = NO_SCAN
     full: bool = False
     beyond: tuple[Rival, ...] = ()
-
-
-@dataclass(frozen=True)
-class Option:
-    """What could be done next: by how much the log evidence grows, and how it was seen."""
-
-    kind: str
-    name: str
-    gain: float
-    detection: Detection
-    where: int = -1
-    reading: Reading = ()
-    rivals: tuple[Rival, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -179,6 +170,7 @@ def explain(search: Search, before: Fit) -> Explanation:
 def _run(search: Search, before: Fit) -> Explanation:
     state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
     seen: set[frozenset[object]] = set()
+    been: set[object] = set()
     first: Look | None = None
     spiked = False  # readings were left out since the choices were revised
     while True:
@@ -192,10 +184,11 @@ def _run(search: Search, before: Fit) -> Explanation:
         told = () if seen or search.by_evidence else ("named",)
         options = [option for option in options if option.gain > 0 or option.kind in told]
         seen.add(state.names)
+        been.add(state.choices)
         if not options and not spiked:
             break
         if not options:
-            state, spiked = _revised(search, state), False
+            state, spiked = revised(search, state), False
             continue
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
@@ -206,10 +199,10 @@ def _run(search: Search, before: Fit) -> Explanation:
             break
         spiked = best.kind == "reading" and state.count > 1
         if state.count > 1 and not spiked:
-            state = _revised(search, state)
+            state = revised(search, state)
         if state.fit.chi2 <= search.enough:
             break
-        if best.kind in ("named", "kick") and state.names in seen:
+        if state.choices in been or (best.kind in ("named", "kick") and state.names in seen):
             break  # what was added went again
     return Explanation(
         **vars(state), before=before, first=first.named, first_kicks=first.kicks,
@@ -275,49 +268,20 @@ def _options(search: Search, state: State, look: Look) -> list[Option]:
         ("monitor", look.monitors, problem.monitors, state.monitors),
     ):
         if len(free.places):
-            options += _unnamed(problem, kind, free, names, taken)
-    return [*options, *_spike(search, state)]
+            options += unnamed(problem, kind, free, names, taken)
+    if search.unnamed:
+        options += spike(problem, state.fit.point, len(state.spikes))
+    if state.fit.outcome is Outcome.STUCK:
+        options = [_refitted(search, state, option, look) for option in options]
+    return options
 
 
-def _unnamed(
-    problem: Problem,
-    kind: str,
-    free: FreeScan,
-    names: Sequence[str],
-    taken: Mapping[int, Detection],
-) -> list[Option]:
-    """Something without a name at the place where it explains most."""
-    rate = problem.judgement.rate(kind)
-    place = int(free.gain.argmax())
-    where = int(free.places[place])
-    freedom = max(int(free.freedom[place]), 1)
-    seen = Detection(
-        float(free.statistic[place]),
-        free_threshold(rate, freedom, len(names)),
-        look_elsewhere(float(free.statistic[place]), freedom, len(names)),
-    )
-    if not seen.p_value < rate or where in taken:
-        return []
-    gain = float(free.gain[place]) + problem.unknown_prior(len(names))
-    return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
-
-
-def _spike(search: Search, state: State) -> list[Option]:
-    """The reading that is least explained, left out."""
-    problem, judge = state.problem, state.problem.judgement
-    if not search.unnamed or int(problem.valid.sum()) < AMONG * (len(state.spikes) + 1):
-        return []
-    clean, size = problem.left(state.fit.point)
-    statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
-    worst = tuple(int(i) for i in np.unravel_index(int(statistic.argmax()), statistic.shape))
-    value, count = float(statistic[worst]), float(problem.valid.sum())
-    rate = judge.rate("reading")
-    seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
-    if not seen.p_value < rate:
-        return []
-    # an amount even over its logarithm, as for every other cause
-    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.spike
-    return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]
+def _refitted(search: Search, state: State, option: Option, look: Look) -> Option:
+    """With what it takes of chi-square in fact: about a fit that is stuck a scan says little."""
+    if option.kind == "named":
+        return option
+    fell = state.fit.chi2 - _taken(search, state, option, look).fit.chi2
+    return replace(option, gain=option.gain + 0.5 * (fell - option.detection.statistic))
 
 
 def _choice(search: Search, state: State, options: Sequence[Option]) -> tuple[Option, State]:
@@ -351,7 +315,7 @@ def _taken(search: Search, state: State, option: Option, look: Look) -> State:
     return _again(search, replace(state, monitors=aside), dropped)
 
 
-def _again(search: Search, state: State, dropped: Flags) -> State:
+def _again(search: Search, state: AnyState, dropped: Flags) -> AnyState:
     """The same causes on the readings that are left."""
     problem = search.problem.without(dropped)
     found = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
@@ -359,8 +323,13 @@ def _again(search: Search, state: State, dropped: Flags) -> State:
 
 
 # --- revising ----
-def _revised(search: Search, state: State) -> State:
-    """Every choice held against its rivals, all the others in place, until none changes."""
+def revised(search: Search, state: AnyState) -> AnyState:
+    """Every choice held against its rivals, all the others in place, until none changes.
+
+    Args:
+        search: what is searched; its problem has all readings.
+        state: what is explained so far.
+    """
     for _ in range(3):
         names = state.names
         for monitor in list(state.monitors):
@@ -374,7 +343,7 @@ def _revised(search: Search, state: State) -> State:
     return state
 
 
-def _monitor_revised(search: Search, state: State, monitor: int) -> State:
+def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
     """A monitor that was set aside comes back where a named cause, or none, does as well."""
     own = state.problem.owner() == monitor
     others = {m: seen for m, seen in state.monitors.items() if m != monitor}
@@ -385,6 +354,8 @@ def _monitor_revised(search: Search, state: State, monitor: int) -> State:
     about = back.problem.metric(back.fit.point)
     free = scan_monitors(about, back.fit.residual)
     alone = float(free.gain[monitor]) + back.problem.unknown_prior(len(free.gain))
+    if back.fit.outcome is Outcome.STUCK:  # see `_refitted`
+        alone += 0.5 * (back.fit.chi2 - state.fit.chi2 - float(free.statistic[monitor]))
     if alone <= 0:
         return back
     tried = rivals(back.problem, back.fit, _scan(search, back), search.hypotheses, 8)
@@ -394,7 +365,7 @@ def _monitor_revised(search: Search, state: State, monitor: int) -> State:
     return state
 
 
-def _kick_revised(search: Search, state: State, place: int) -> State:
+def _kick_revised(search: Search, state: AnyState, place: int) -> AnyState:
     """A free kick gives way to a named cause, or to none, where that explains more."""
     now = state.fit
     kicks = {k: v for k, v in now.kicks.items() if k != place}
@@ -412,7 +383,7 @@ def _kick_revised(search: Search, state: State, place: int) -> State:
     return state
 
 
-def _cause_revised(search: Search, state: State, hypothesis: Hypothesis) -> State:
+def _cause_revised(search: Search, state: AnyState, hypothesis: Hypothesis) -> AnyState:
     """A named cause gives way to a better one, or to none; its rivals are weighed anew."""
     now = state.fit
     own = [i for i, c in enumerate(now.causes) if (c.effect, c.element) == hypothesis]
@@ -425,7 +396,7 @@ def _cause_revised(search: Search, state: State, hypothesis: Hypothesis) -> Stat
     without = replace(state, fit=alone, named=named)
     if alone.point.lost:
         return state
-    if alone.log_evidence > now.log_evidence:
+    if not search.keep and alone.log_evidence > now.log_evidence:
         return without
     tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 12)
     if hypothesis not in [rival.hypothesis for rival in tried]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, plain
 
 LONGEST = 10_000_000
 """Characters of one expression; a kick map written out has some million."""
@@ -177,16 +177,43 @@ def _bounded(value: Any) -> Any:
     return value
 
 
+HIGHEST_ORDER = 100
+"""Of a magnet's field; AT lays out as many numbers as `MaxOrder` says."""
+
+
+def check_order(fields: Mapping[str, Any]) -> None:
+    """Raises a LatticeError for an element of a file whose `MaxOrder` no magnet has."""
+    order = np.ravel(fields.get("MaxOrder", 0))
+    if order.dtype.kind in "iufb" and not ((order >= 0) & (order <= HIGHEST_ORDER)).all():
+        raise LatticeError(
+            f"the element '{plain(str(fields.get('FamName')), 40)}' has the MaxOrder "
+            f"{order[0]:g}; it is between 0 and {HIGHEST_ORDER}"
+        )
+
+
+def _checked(make: Callable[..., Any]) -> Callable[..., Any]:
+    """What makes an element of a file, after a look at its size."""
+
+    def made(*arguments: Any, **fields: Any) -> Any:
+        first = arguments[0] if arguments else None  # a name, or all fields
+        check_order(first if isinstance(first, dict) else {"FamName": first, **fields})
+        return make(*arguments, **fields)
+
+    return made
+
+
 @contextmanager
 def nothing_run() -> Iterator[None]:
-    """AT's readers of `.m` and `.repr` calculate where they would evaluate.
+    """AT's readers of `.m` and `.repr` calculate where they would evaluate, and all of them look at
+    sizes first.
 
     They find `eval` among the names of their own module first; one reading at a time has it there.
     """
     import at
-    from at.load import matfile, reprfile
+    from at.load import json, matfile, reprfile
 
-    elements = {cls.__name__: cls for cls in at.Element.subclasses()}
+    elements = {cls.__name__: _checked(cls) for cls in at.Element.subclasses()}
+    make = json.element_from_dict
     numbers = {cls.__name__: cls for cls in (np.float64, np.float32, np.int64, np.int32, np.uint8)}
     functions = {**elements, **numbers, "Particle": at.Particle, "array": np.array}
     names = {**functions, "nan": math.nan, "NaN": math.nan, "inf": math.inf, "Inf": math.inf}
@@ -201,8 +228,10 @@ def nothing_run() -> Iterator[None]:
     with _ONE_AT_A_TIME:
         for module in (matfile, reprfile):
             module.eval = value
+        json.element_from_dict = matfile.element_from_dict = _checked(make)
         try:
             yield
         finally:
+            json.element_from_dict = matfile.element_from_dict = make
             for module in (matfile, reprfile):
                 del module.eval

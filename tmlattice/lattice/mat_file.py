@@ -4,6 +4,7 @@ A damaged file can end the process that reads it (scipy's reader checks little),
 it first: what kills the child becomes a sentence.
 """
 
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,8 +15,10 @@ import numpy as np
 
 from tmlattice.errors import LatticeError, TmlatticeError
 
-SECONDS = 20
-"""Longer than any file of a ring takes to open, on a busy machine too."""
+SECONDS = 4
+"""Of the processor; longer than any file of a ring takes to open."""
+BUSY = 5
+"""Times as long by the clock, on a machine that others use too."""
 RATE = 2e6
 """Bytes that are read in a second at least, beyond that."""
 DEEPEST = 30
@@ -54,14 +57,19 @@ def read_in_a_child(path: Path, what: str, code: str, error: type[TmlatticeError
     Raises:
         error: the child fails, dies, or takes longer than such a file can take.
     """
+    seconds = SECONDS + (int(path.stat().st_size / RATE) if path.is_file() else 0)
+    code = f"import resource as r\nr.setrlimit(r.RLIMIT_CPU, ({seconds}, {seconds + 1}))\n{code}"
     command = [sys.executable, "-P", "-c", code, str(path)]  # nothing of the working directory
-    seconds = SECONDS + (path.stat().st_size / RATE if path.is_file() else 0)
+    late = error(f"'{path}' is not read within {seconds} s; save it again")
     try:
         child = subprocess.run(
-            command, capture_output=True, timeout=seconds, check=False, text=True, errors="replace"
-        )
+            command, capture_output=True, timeout=BUSY * seconds, check=False, text=True,
+            errors="replace",
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise error(f"'{path}' is not read within {seconds:.0f} s; save it again") from None
+        raise late from None
+    if -child.returncode == signal.SIGXCPU:
+        raise late
     if child.returncode:
         said = child.stderr.strip().splitlines()
         why = said[-1][:200] if said and child.returncode > 0 else "its reader crashed"

@@ -32,12 +32,19 @@ class RfStep:
     orbit: Array | None = None
 
 
+HIGHEST_RF = 1e12
+"""Hz, and of its harmonic: no cavity is smaller."""
+LARGEST_KICK = 1e6
+"""rad: what was written down in microradians is told by the data, beyond that it is none."""
+
+
 def check_rf(rf: RfStep) -> None:
     """Raises a MeasurementError for a frequency, a harmonic or a step that cannot be."""
-    if not (0 < rf.frequency < np.inf and rf.harmonic > 0 and abs(rf.step) < np.inf):
+    there_is = 0 < rf.frequency < HIGHEST_RF and 0 < rf.harmonic < HIGHEST_RF
+    if not (there_is and abs(rf.step) < rf.frequency):
         raise MeasurementError(
-            f"an RF of {rf.frequency:g} Hz, harmonic {rf.harmonic}, step {rf.step:g} Hz "
-            "cannot be; frequency and harmonic are above zero, the step is finite"
+            f"an RF of {rf.frequency:g} Hz, harmonic {float(rf.harmonic):g}, step {rf.step:g} Hz "
+            "cannot be; frequency and harmonic are above zero, the step is a small part of it"
         )
 
 
@@ -102,9 +109,10 @@ class OrbitResponse(Shown):
                 raise MeasurementError("no corrector is named 'rf': that name is the RF step's")
             if plane not in ("x", "y"):
                 raise MeasurementError(f"corrector '{name}' kicks in '{plane}'; in x or y it can")
-            if kick == 0 or not np.isfinite(kick):
+            if kick == 0 or not abs(kick) < LARGEST_KICK:
                 raise MeasurementError(
-                    f"corrector '{name}' has a step of {kick:g} rad; it is finite and not zero"
+                    f"corrector '{name}' has a step of {kick:g} rad; it is a small part of one "
+                    "and not zero"
                 )
         if self.rf is not None:
             rf = self.rf

@@ -2,7 +2,8 @@
 
 Between two errors a trajectory is free: the reading of a monitor follows from those of the two
 before it, in each plane. What is left of a reading has the noise of three, with known weights; the
-median over all monitors does not see a few errors.
+median over all monitors does not see a few errors. One signal under two names, of monitors at one
+place, counts once: it has no noise against itself.
 """
 
 import numpy as np
@@ -14,16 +15,19 @@ from tmlattice.observe.sections import Found, Passes
 
 Array = NDArray[np.float64]
 
+SAME_PLACE = 1e-6
+"""m; two monitors nearer to each other stand at one place."""
 _MAD = 1.4826  # of a Gaussian
 
 
 def local_misfit(data: Data, paths: Paths) -> Array:
     """Each reading's difference from the model less what its two predecessors make of it, divided
     by the norm of the weights, [shot, reading, 2]; NaN where it cannot be said."""
-    difference = np.where(data.valid, data.readings - paths.readings, np.nan)
-    result = np.full(difference.shape, np.nan)
+    result = np.full(data.valid.shape, np.nan)
+    own = _signals(data, paths)
+    difference = np.where(data.valid, data.readings - paths.readings, np.nan)[:, own]
     for plane, columns in ((0, (0, 1)), (1, (2, 3))):
-        slope = paths.launch[:, :, plane][:, :, columns]  # [shot, reading, 2]
+        slope = paths.launch[:, own, plane][:, :, columns]  # [shot, reading, 2]
         first, second, third = slope[:, :-2], slope[:, 1:-1], slope[:, 2:]
         determinant = _cross(first, second)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -33,8 +37,16 @@ def local_misfit(data: Data, paths: Paths) -> Array:
             r = difference[:, :, plane]
             left = (r[:, 2:] - a * r[:, :-2] - b * r[:, 1:-1]) / size
         # where the weights are large, small model errors are too
-        result[:, 2:, plane] = np.where(size < 10, left, np.nan)
+        result[:, own[2:], plane] = np.where(size < 10, left, np.nan)
     return result
+
+
+def _signals(data: Data, paths: Paths) -> NDArray[np.intp]:
+    """The readings that are no copies, to the last digit, of the one before at the same place."""
+    moved = np.abs(np.diff(paths.beam_launch[..., :4], axis=1)).max(axis=(0, 2, 3))
+    copied = (np.diff(data.readings, axis=1) == 0) & (data.valid[:, 1:] == data.valid[:, :-1])
+    copied = copied.all(axis=(0, 2)) & data.valid[:, 1:].any(axis=(0, 2))
+    return np.flatnonzero(np.append(True, ~(copied & (moved <= SAME_PLACE))))
 
 
 def _cross(a: Array, b: Array) -> Array:

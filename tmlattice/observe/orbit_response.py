@@ -103,7 +103,7 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
         step, orbit = rf.step / rf.frequency, rf.orbit
     noise = measured.noise
     if noise is None or np.isnan(noise).any():
-        learnt = learnt_noise(measured)
+        learnt = learnt_noise(measured, np.array([ring[name].s for name in measured.monitors]))
         noise = learnt if noise is None else np.where(np.isnan(noise), learnt, noise)
     order = {name: i for i, name in enumerate(names)}
     return ResponseData(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.noise import SAME_PLACE
 
 Array = NDArray[np.float64]
 
@@ -22,8 +23,12 @@ AMONG = 0.2
 _MAD = 1.4826  # of a Gaussian
 
 
-def learnt_noise(measured: OrbitResponse) -> Array:
+def learnt_noise(measured: OrbitResponse, s: Array) -> Array:
     """rms of one orbit change, m, [monitor, 2], the same for all monitors of a plane.
+
+    Args:
+        measured: in beam order.
+        s: where its monitors stand, m; one signal under two names counts once (see `noise`).
 
     Raises:
         MeasurementError: too few monitors or columns.
@@ -33,7 +38,9 @@ def learnt_noise(measured: OrbitResponse) -> Array:
     for p in (0, 1):
         own = measured.response[planes == p, :, p]
         seen = np.isfinite(own).mean(axis=0) > 0.5 if len(own) else np.zeros(0, dtype=bool)
-        read = own[:, seen]
+        read, places = own[:, seen], s[seen]
+        copied = (np.diff(read, axis=1) == 0).all(axis=0) & (np.diff(places) < SAME_PLACE)
+        read = read[:, ~np.append(False, copied)[: len(places)]]
         read = read[np.isfinite(read).all(axis=1)]
         found.append(_left(read))
     sizes = np.array(found)

@@ -1,0 +1,80 @@
+"""A search comes to an end, and one wild reading is what it is."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tmlattice import diagnose, simulate
+from tmlattice.beam.model import Model
+from tmlattice.inference import search as own
+from tmlattice.inference.newton import fit
+from tmlattice.inference.options import Option
+from tmlattice.inference.rivals import Detection
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "fuzz"))
+from inputs import ring as ring_of_ten
+
+MOST = 30
+"""Looks that no search of this ring needs."""
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return ring_of_ten()
+
+
+@pytest.fixture(scope="module")
+def measured(ring):
+    """Of the ring as it is, launches unknown, five of its six monitors."""
+    data = simulate(ring, [], shots=6, amplitude=1e-3, noise=2e-5, engine="ocelot", seed=0)
+    data = data.measurement().select(monitors=[m.name for m in ring.monitors][:5])
+    return replace(data, launches=np.zeros_like(data.launches), launch_sigma=None)
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    """How often a search looks; one without an end ends here."""
+    look, count = own._look, []
+
+    def counted(*arguments):
+        count.append(1)
+        assert len(count) < MOST, "the search goes on and on"
+        return look(*arguments)
+
+    monkeypatch.setattr(own, "_look", counted)
+    return count
+
+
+@pytest.mark.parametrize(("shot", "monitor"), [(1, 1), (0, 2), (2, 0)])
+def test_a_reading_of_a_metre_is_left_out_and_is_no_finding(ring, measured, looks, shot, monitor):
+    """Launches are spoilt by it, so that a scan about their fit takes it for a gain or a magnet; to
+    set the monitor aside and to name its gain took turns for ever."""
+    readings = measured.readings.copy()
+    readings[shot, 0, monitor, 0] = 1.0
+    found = diagnose(ring, replace(measured, readings=readings), holdout=0)
+    assert found.verdict == "nothing"
+    assert found.explanation.spikes == ((shot, monitor, 0),)
+
+
+def test_a_search_ends_where_it_has_been(ring, measured, looks, monkeypatch):
+    """A choice that is taken and given back each time."""
+    data = of_measurement(ring, measured)
+    problem = FirstTurns(model=Model(ring, data.settings), data=data, places={})
+    seen = Detection(50.0, 20.0, 1e-9)
+
+    def options(search, state, look):
+        return [Option("monitor", "another", 10.0, seen, where=len(state.monitors))]
+
+    def revised(search, state):
+        return replace(state, monitors={0: seen})
+
+    monkeypatch.setattr(own, "_options", options)
+    monkeypatch.setattr(own, "revised", revised)
+    found = own.explain(own.Search(problem, []), fit(problem, (), data.launches))
+    assert list(found.monitors) == [0]
+    assert len(looks) == 2

@@ -1,0 +1,39 @@
+"""The noise that nobody states, where the readings could make it nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import diagnose
+from tmlattice.fitting.launches import with_noise
+from tmlattice.machine import simulate
+
+NOISE = 2e-5
+
+
+@pytest.fixture(scope="module")
+def copied(small_ring):
+    """Monitors at one place that are one signal under two names, and no noise stated."""
+    data = simulate(
+        small_ring, [], shots=4, noise=NOISE, amplitude=5e-4, seed=1, engine="ocelot"
+    ).measurement()
+    s = np.array([small_ring[name].s for name in data.monitors])
+    again = np.flatnonzero(np.diff(s) < 1e-6) + 1
+    assert len(again) > len(s) / 3
+    readings = data.readings.copy()
+    readings[:, :, again] = readings[:, :, again - 1]
+    return replace(data, readings=readings, noise=None)
+
+
+def test_one_signal_under_two_names_has_the_noise_of_one(small_ring, copied):
+    found = diagnose(small_ring, copied, holdout=0)
+    assert found.noise_estimated
+    assert found.noise == pytest.approx((NOISE, NOISE), rel=0.25)
+    assert found.verdict == "nothing"
+
+
+def test_a_fit_of_weights_takes_that_noise_too(small_ring, copied):
+    found, estimated = with_noise(small_ring, copied)
+    assert estimated
+    assert found.noise == pytest.approx(np.full_like(found.noise, NOISE), rel=0.25)
