@@ -86,6 +86,18 @@ def test_each_kind_alone_and_all_together_are_scored(several):
     assert told["of_found_alone"]["cases"] + told["of_none_alone"]["cases"] == 2
 
 
+def test_scoring_again_reads_no_turns(several, monkeypatch):
+    """Tables of turns take longer to be read than all else takes where the oracle was asked."""
+    run(several, jobs=1, progress=False, lattice=LATTICE)
+    score(several, jobs=1, progress=False, lattice=LATTICE)
+
+    def read(*args, **options):
+        raise AssertionError("a table was read")
+
+    monkeypatch.setattr("tmlattice.challenge.case.read_measurement", read)
+    assert not score(several, jobs=1, progress=False, lattice=LATTICE)["failed"]
+
+
 def test_the_oracle_weighs_the_truth_by_the_full_model(several):
     case, truth = read_case(several, "0000"), read_truth(several, "0000")
     found = weighed(case, truth)
@@ -119,6 +131,9 @@ def test_all_sextupoles_of_a_family_are_one_change(small_ring, tmp_path):
     row = row_of(result, truth, None, None, Places(small_ring))
     assert row["answers"]["tool"]["first"]
     assert row["answers"]["tool"]["place"]
+    result |= {"verdict": "nothing", "findings": []}
+    row = row_of(result, truth, None, None, Places(small_ring))
+    assert not row["answers"]["tool"]["place"]  # it could not be scored
 
 
 def test_what_many_find_where_one_does_not_by_hand(small_ring):

@@ -1,16 +1,23 @@
 """Orbit, tunes and modes of a stored beam against AT, and their derivatives by differences."""
 
+from functools import partial
+
 import at
 import numpy as np
 import pytest
+from conftest import SMALL
 from numpy.testing import assert_allclose
 
-from tmlattice import Cause
+from tmlattice import Cause, diagnose, load_ring
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.effects import CATALOGUE, RingEffect, apply, find
 from tmlattice.errors import UnstableRingError
+from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
+from tmlattice.machine.at_stored import _orbit, _pass
+from tmlattice.machine.stored_beam import simulate_turns
+from tmlattice.observe.stored import cavities_of
 
 WRONG = [
     Cause("quadrupole_roll", "QF::2", 0.01),
@@ -20,14 +27,25 @@ WRONG = [
 """An orbit through the sextupoles, and coupled planes: nothing is zero by symmetry."""
 
 
+LOSS = Cause("radiation_loss_bends", None, 0.8)
+
+
 @pytest.fixture(scope="module")
 def wrong(small_ring):
     return apply(small_ring, WRONG)
 
 
 @pytest.fixture(scope="module")
-def beam(wrong):
-    return StoredBeam(ResponseModel(wrong))
+def with_cavities(tmp_path_factory):
+    """The small ring with two cavities of its own, where the dispersion is not zero."""
+    text = SMALL.read_text()
+    for behind, name in (("[d, generated_b", "last"), ('    Monitor(eid="bpm_start")', "first")):
+        cavity = f"Cavity(l=0.3, v=2.5e-3, freq=5e8, eid='{name}'), "
+        at = text.index(behind) + behind.index(behind.strip()) + (behind[0] == "[")
+        text = text[:at] + cavity + text[at:]
+    path = tmp_path_factory.mktemp("cavities") / "ring.py"
+    path.write_text(text)
+    return load_ring(path)
 
 
 def _apart(a, b):
@@ -46,16 +64,25 @@ def _hypotheses(ring):
             yield from ((name, place) for place in places[:: max(len(places) // 2, 1)][:2])
 
 
-def test_every_effect_vs_differences(wrong, beam):
+def test_every_effect_vs_differences(wrong):
+    _check_derivatives(wrong, lambda ring: StoredBeam(ResponseModel(ring)))
+
+
+def test_every_effect_vs_differences_where_the_rf_is_felt(with_cavities):
+    ring = apply(with_cavities, [*WRONG, LOSS])
+    felt = cavities_of(with_cavities, ResponseModel(ring))
+    assert len(felt.exits) == 2
+    _check_derivatives(ring, lambda ring: StoredBeam(ResponseModel(ring), felt))
+
+
+def _check_derivatives(wrong, beam_of):
     hypotheses = list(_hypotheses(wrong))
     assert len(hypotheses) > 30
+    beam = beam_of(wrong)
     moved = beam.moved(hypotheses)
     for i, (name, place) in enumerate(hypotheses):
         step = 1e-4 * find(name).largest
-        up, down = (
-            StoredBeam(ResponseModel(apply(wrong, [Cause(name, place, side * step)])))
-            for side in (1, -1)
-        )
+        up, down = (beam_of(apply(wrong, [Cause(name, place, side * step)])) for side in (1, -1))
         orbit = (up.model.readings - down.model.readings) / (2 * step)
         tunes = (up.tunes - down.tunes) / (2 * step)
         modes = (up.modes - down.modes) / (2 * step)
@@ -88,6 +115,49 @@ def test_tunes_and_modes_vs_at(small_ring):
         _apart(modes / np.abs(modes).max(), beam.modes / np.abs(modes).max())
         < 1e-4 * np.abs(beam.modes).max() / np.abs(modes).max()
     )
+
+
+@pytest.mark.parametrize("which", ["small_ring", "with_cavities"])
+def test_tunes_and_modes_with_rf_vs_at(request, which):
+    """A cavity where the dispersion is not zero beats the modes by a hundredth; the model did not
+    know it, and took the loss of energy, with which the RF comes on, for many small errors."""
+    ring = request.getfixturevalue(which)
+    causes = [WRONG[0], LOSS]
+    model = ResponseModel(apply(ring, causes))
+    felt = cavities_of(ring, model)
+    beam, deaf = StoredBeam(model, felt), StoredBeam(model)
+    engine = AtEngine(ring, causes)
+    line, with_rf, late = engine.stored_line({})
+    state = at_orbit.closed(partial(_pass, engine, with_rf), _orbit(engine, line, late), range(6))
+    steps = np.diag(at_orbit.STEPS)
+    moving = np.asfortranarray(np.vstack([state + steps, state - steps]).T)
+    seen = engine.run(with_rf, moving.T, 1, moving)[:, 0]
+    ends = moving.T
+    values, vectors = np.linalg.eig((ends[:6] - ends[6:]).T / (2 * at_orbit.STEPS))
+    own = [int(np.abs(np.angle(values) / (2 * np.pi) % 1 - q).argmin()) for q in beam.tunes]
+    assert_allclose(beam.tunes, np.angle(values[own]) / (2 * np.pi) % 1, atol=1e-5)
+    along = np.moveaxis((seen[:6] - seen[6:]) / (2 * at_orbit.STEPS[:, None, None]), 0, 2)
+    modes = along @ vectors[:, own]
+    modes *= np.abs(beam.modes).max() / np.abs(modes).max()
+    size = np.abs(beam.modes).max()
+    assert _apart(modes, beam.modes) < 1e-4 * size
+    assert _apart(modes, deaf.modes) > 5e-3 * size
+
+
+def test_turns_tell_the_loss_of_energy(small_ring):
+    """It was `distributed`; the RF, which comes on with it, does more than the loss itself."""
+    turns = simulate_turns(small_ring, [LOSS], shots=2, turns=250, seed=3).measured
+    (found,) = diagnose(small_ring, turns).findings
+    assert found.effect == LOSS.effect
+    assert abs(found.amount - LOSS.amount) < 4 * found.amount_sigma
+
+
+def test_no_fault_has_a_sign_that_it_cannot_have(small_ring):
+    """A horizontal kick changes the energy as a loss below nothing would, which has one place."""
+    kick = Cause("quadrupole_offset_x", "QF::7", -6e-5)
+    turns = simulate_turns(small_ring, [kick], shots=4, turns=500, noise=3e-5, seed=8).measured
+    for found in diagnose(small_ring, turns).findings:
+        assert "radiation_loss_bends" not in {one.effect for one in found.credible_set}
 
 
 def test_a_changed_model_is_the_model_of_the_changed_ring(small_ring):

@@ -101,6 +101,17 @@ def test_it_is_named(small_ring, late):
     assert abs(amount - late) < 4 * sigma < 0.02
 
 
+def test_a_monitor_that_counts_late_is_not_dead_as_well(small_ring):
+    """Of one turn it reads nothing."""
+    late = [offset(-2)]
+    turns = simulate_turns(small_ring, late, shots=2, turns=200, seed=3).measured
+    first = simulate(small_ring, late, shots=3, seed=1).measurement()
+    alone = diagnose(small_ring, first).findings
+    assert [(one.effect, one.element) for one in alone] == [("monitor_dead", MONITOR)]
+    (found,) = diagnose(small_ring, {"turns": turns, "first": first}).findings
+    assert (found.effect, found.element) == ("monitor_turn_offset", MONITOR)
+
+
 def test_among_small_errors_a_first_guess_is_the_right_turn(small_ring):
     """A wrong count drags the amplitudes of all monitors along: they have to follow each guess."""
     rms = background_rms({"all": None})

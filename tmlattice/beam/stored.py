@@ -11,6 +11,10 @@ the sum T of the sources before a place
 dU and d Q by perturbation of the eigenvalues. An effect that kicks moves the closed orbit, which
 bends every map behind: with P_j the sum over the curved layers of C^-1 B (C e) C per unit e of the
 launch, its sources are contractions of P. So every effect costs some products of small matrices.
+
+Where the RF is on, a cavity gives an oscillating particle energy by its time of flight: behind it
+all matrices have that in them, and the modes are those of all six coordinates. The closed orbit
+meets the RF's phase and has no part in it.
 """
 
 from collections.abc import Sequence
@@ -21,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.effects.directions import Directions, directions_nearby
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import second_derivatives
@@ -66,6 +71,7 @@ class StoredBeam:
 
     Args:
         model: closed orbit and matrices; monitors without errors.
+        rf: cavities that the oscillation feels, of a model of six coordinates.
 
     Attributes:
         tunes: Q of the modes that are nearer to x and to y, in [0, 1).
@@ -76,14 +82,24 @@ class StoredBeam:
         UnstableRingError: the beam does not oscillate.
     """
 
-    def __init__(self, model: ResponseModel) -> None:
+    def __init__(self, model: ResponseModel, rf: Cavities = NO_RF) -> None:
         self.model = model
-        turn = model.tangents[-1][:TRANSVERSE, :TRANSVERSE]
-        self._values, self._vectors = _modes(turn)
+        # as the oscillation has them: to the exits, into the layers, back from the exits, readings
+        self._C, self._into = model.tangents, model.tangents
+        self._back, self._G = model.inverse, model.reading_slopes
+        self._turn = model.tangents[-1]
+        if len(rf.exits):
+            given, self._turn = _with_rf(model, rf)
+            self._C, self._into = self._C @ given, self._C[:-1] @ given[1:]
+            self._back = np.linalg.inv(given) @ self._back
+            self._G = self._G @ given[model.maps.at]
+        self._values, self._vectors = _modes(self._turn[:TRANSVERSE, :TRANSVERSE])
+        if len(rf.exits):
+            self._values, self._vectors = _nearest(self._turn, self._values, self._vectors)
         self.tunes = np.angle(self._values[:2]) / (2 * np.pi) % 1.0
         self._U = np.zeros((model.dimension, 2), dtype=complex)
-        self._U[:TRANSVERSE] = self._vectors[:, :2]
-        self.modes: ComplexArray = model.reading_slopes @ self._U
+        self._U[: len(self._values)] = self._vectors[:, :2]
+        self.modes: ComplexArray = self._G @ self._U
 
     @property
     def shown(self) -> Moved:
@@ -106,7 +122,7 @@ class StoredBeam:
         if len(d.owner):
             orbit, total, seen = self._sources(d)
             tunes, mixed = self._perturbed(total)
-            G = model.reading_slopes.reshape(-1, model.dimension)
+            G = self._G.reshape(-1, model.dimension)
             there = (G @ mixed.transpose(1, 2, 0).reshape(model.dimension, -1)).T
             seen = seen + there.reshape(2, -1, monitors, 2).transpose(1, 2, 3, 0)
             for out, rows in ((moved.orbit, orbit), (moved.tunes, tunes), (moved.modes, seen)):
@@ -119,7 +135,7 @@ class StoredBeam:
             x = model.path[at]
             bent = second_derivatives(d.E2[row][None])[0] @ x
             moved.orbit[owner, m] += d.E0[row] + (d.E1[row] + bent / 2) @ x
-            moved.modes[owner, m] += (d.E1[row] + bent) @ model.tangents[at] @ self._U
+            moved.modes[owner, m] += (d.E1[row] + bent) @ self._C[at] @ self._U
         return moved
 
     def _sources(self, d: Directions) -> tuple[Array, Array, ComplexArray]:
@@ -127,16 +143,16 @@ class StoredBeam:
         the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2, mode]."""
         model, at, U, n = self.model, self.model.maps.at, self._U, self.model.dimension
         k, rows = d.layer, len(d.layer)
-        x, C, back = model.path[k][..., None], model.tangents[k], model.inverse[k + 1]
+        x = model.path[k][..., None]
         bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
-        S = back @ (d.D1 + bent) @ C
-        w = (back @ (d.D0[..., None] + (d.D1 + bent / 2) @ x))[..., 0]
+        S = self._back[k + 1] @ (d.D1 + bent) @ self._into[k]
+        w = (model.inverse[k + 1] @ (d.D0[..., None] + (d.D1 + bent / 2) @ x))[..., 0]
         z = w @ model.closing.T
         behind = at[None] > k[:, None]  # the monitor reads behind the layer
         G = model.reading_slopes.reshape(-1, n)
         shape = (rows, len(at), 2)
         orbit = (z @ G.T).reshape(shape) + behind[..., None] * (w @ G.T).reshape(shape)
-        bends = self._bends
+        G, bends = self._G.reshape(-1, n), self._bends
         first = (bends[k + 1] @ w[:, None, :, None])[..., 0]
         whole = S - first + ((z + w) @ bends[-1].reshape(-1, n).T).reshape(rows, n, n)
         late = G @ ((S - first) @ U).transpose(1, 2, 0).reshape(n, -1)  # [monitor 2, mode row]
@@ -154,13 +170,13 @@ class StoredBeam:
         """What a launch of the closed orbit adds to the modes at the monitors: through the maps
         before, and where read-outs bend, [n, monitor * 2 * mode * (re, im)]."""
         model, maps = self.model, self.model.maps
-        C = model.tangents[maps.at]
         through = np.einsum(
-            "mja,mabc,bp->cmjp", model.reading_slopes, self._bends[maps.at], self._U, optimize=True
+            "mja,mabc,bp->cmjp", self._G, self._bends[maps.at], self._U, optimize=True
         )
         read = np.einsum(
-            "majk,mkc,mjb,bp->cmap", second_derivatives(maps.R2), C, C, self._U, optimize=True
-        )
+            "majk,mkc,mjb,bp->cmap", second_derivatives(maps.R2), model.tangents[maps.at],
+            self._C[maps.at], self._U, optimize=True,
+        )  # fmt: skip
         whole = np.ascontiguousarray(through + read).reshape(model.dimension, -1)
         return np.asarray(whole.view(float))
 
@@ -171,28 +187,68 @@ class StoredBeam:
         model, maps = self.model, self.model.maps
         W2 = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])
         j = np.flatnonzero(W2.any(axis=(1, 2)))
-        C, back, n = model.tangents[j], model.inverse[j + 1], model.dimension
+        n = model.dimension
         each = np.einsum(
-            "kai,kijl,klc,kjb->kabc", back, second_derivatives(W2[j]), C, C, optimize=True
-        )
+            "kai,kijl,klc,kjb->kabc", self._back[j + 1], second_derivatives(W2[j]),
+            model.tangents[j], self._into[j], optimize=True,
+        )  # fmt: skip
         summed = np.zeros((len(W2) + 1, n, n, n))
         summed[j + 1] = each
         return np.cumsum(summed, axis=0)
 
     def _perturbed(self, whole: Array) -> tuple[Array, ComplexArray]:
         """d tunes and d U at the start, [row, n, mode], for sources of the whole turn."""
-        model, V = self.model, self._vectors
-        turn = (model.tangents[-1] @ whole)[:, :TRANSVERSE, :TRANSVERSE]
+        V, count = self._vectors, len(self._values)
+        turn = (self._turn @ whole)[:, :count, :count]
         D = np.linalg.inv(V) @ turn @ V  # [row, 4, 4]
         values = self._values
-        own = np.einsum("rii->ri", D)[:, :2]
+        own = D[:, [0, 1], [0, 1]]
         tunes = (own / values[:2]).imag / (2 * np.pi)
         apart = values[None, :2] - values[:, None]  # [into, of mode]
         mixes = np.abs(apart) > NEAR
         weights = np.where(mixes, 1 / np.where(mixes, apart, 1.0), 0.0)
-        mixed = np.zeros((len(whole), model.dimension, 2), dtype=complex)
-        mixed[:, :TRANSVERSE] = V @ (D[:, :, :2] * weights)
+        mixed = np.zeros((len(whole), len(self._turn), 2), dtype=complex)
+        mixed[:, :count] = V @ (D[:, :, :2] * weights)
         return tunes, mixed
+
+
+def _with_rf(model: ResponseModel, rf: Cavities) -> tuple[Array, Array]:
+    """What cavities give an oscillating particle, pulled back to the start: the product of those
+    before each exit and the end, [layer + 2, n, n]; and the turn with all of them, [n, n]."""
+    crest, phase, wave, _ = rf.values
+    given = np.tile(np.eye(model.dimension), (len(model.tangents), 1, 1))
+    slope = np.zeros((model.dimension,) * 2)
+    slope[5, 4] = -crest * wave * np.cos(phase)
+    last = len(model.tangents) - 1
+    turn = np.eye(model.dimension)
+    for k in np.sort(rf.exits):
+        gives = np.eye(model.dimension) + model.inverse[k] @ slope @ model.tangents[k]
+        turn = gives @ turn
+        given[k + 1 :] = turn
+    return given, model.tangents[last] @ turn
+
+
+def _nearest(
+    turn: Array, tunes: ComplexArray, modes: ComplexArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Eigenvalues and vectors of a turn with RF: the two that are those of the transverse motion
+    alone, as large and in phase, then the others.
+
+    Raises:
+        UnstableRingError: the RF makes one of them grow.
+    """
+    values, vectors = np.linalg.eig(turn)
+    chosen: list[int] = []
+    for mode in (0, 1):
+        apart = np.abs(values - tunes[mode])
+        apart[chosen] = np.inf
+        chosen.append(int(apart.argmin()))
+        own, alone = vectors[:TRANSVERSE, chosen[-1]], modes[:, mode]
+        vectors[:, chosen[-1]] *= np.vdot(own, alone) / np.vdot(own, own).real
+    if np.abs(np.abs(values[chosen]) - 1).max() > GROWTH:
+        raise UnstableRingError("the beam is not stable: its modes grow")
+    order = [*chosen, *(i for i in range(len(values)) if i not in chosen)]
+    return values[order], vectors[:, order]
 
 
 def _modes(turn: Array) -> tuple[ComplexArray, ComplexArray]:

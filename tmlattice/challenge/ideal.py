@@ -66,7 +66,8 @@ def weighed(case: Case, truth: Truth) -> Weighed:
     hypotheses = _hypotheses(case, problem)
     seen = scan(problem.metric(start.point), hypotheses, start.residual)
     reach = np.array([find(n).largest ** find(n).power for n, _ in hypotheses])
-    amount = np.clip(seen.amount, -reach, reach)
+    one_sign = np.array([find(n).one_sign for n, _ in hypotheses])
+    amount = np.clip(seen.amount, np.where(one_sign, 0.0, -reach), reach)
     discrete = np.array([find(n).discrete for n, _ in hypotheses])
     inner = seen.amount * seen.information
     amount = np.where(discrete & (seen.information > 0), 1.0, amount)
@@ -74,15 +75,19 @@ def weighed(case: Case, truth: Truth) -> Weighed:
     power = np.array([find(n).power for n, _ in hypotheses])
     amount = np.sign(amount) * np.abs(amount) ** (1 / power)
     order = np.argsort(-statistic)[:REFINED]
-    for h in order[statistic[order] > statistic.max() - FAR]:
-        if discrete[h] or not amount[h]:
-            continue
+    order = order[statistic[order] > statistic.max() - FAR]
+    everywhere = [h for h, (n, place) in enumerate(hypotheses) if place is None and find(n).curved]
+    for h in dict.fromkeys((*order.tolist(), *everywhere)):
         name, place = hypotheses[h]
+        whole = find(name).whole or h in everywhere
+        if discrete[h] or not (amount[h] or whole):
+            continue
         guess = Cause(name, place, float(amount[h]))
-        if find(name).whole:
+        if whole:
             guess = best_start(problem, start, hypotheses[h])
         again = fit(problem, [guess], start.nuisances)
-        if again.good and abs(again.causes[0].amount) <= find(name).largest:
+        least = 0.0 if one_sign[h] else -find(name).largest
+        if again.good and least <= again.causes[0].amount <= find(name).largest:
             statistic[h] = start.chi2 - again.chi2
             amount[h] = again.causes[0].amount
     return Weighed(problem, start, seen, statistic, amount)

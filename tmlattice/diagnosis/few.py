@@ -17,10 +17,11 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
-from tmlattice.effects import rare
+from tmlattice.effects import find, rare
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.observe.orbit_response import ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
@@ -40,6 +41,10 @@ PATTERNS, SPARE = 2, 2
 """A thin error at one place changes each plane's response by the product of a column and a row (it
 kicks by what the corrector does there, and the monitors see that kick): two patterns a cause. What
 a magnet's length and sextupoles add has the spare ones."""
+
+KICKS = 50_000
+"""Readings up to which kicks are sought too, which bend the orbit in all sextupoles and so make
+many patterns: of more, a scan of them takes longer than of all others."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +102,17 @@ def few_causes(
     )
     before = fit(problem, (), problem.first)
     count = int(problem.used.sum())
-    if not before.chi2 / count > NOISE and chi2.sf(before.chi2, count) > judgement.false_alarm:
-        return None
+    if count > KICKS:
+        hypotheses = [h for h in hypotheses if find(h[0]).responds]
     number = min(most, MOST)
     gap = max(before.chi2 - count, 1.0)
     enough = float(chi2.isf(judgement.noise[1], count))
     enough = max(enough, min(NOISE * count, count + REST * gap))
     if _beyond(problem, before, PATTERNS * number + SPARE) > enough:
-        return None
+        kicks = [h for h in hypotheses if not find(h[0]).responds]
+        seen = scan(problem.metric(before.point), kicks, before.residual, effective=1.0)
+        if seen.statistic.max(initial=0.0) < gap / 2:
+            return None
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )

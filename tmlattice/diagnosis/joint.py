@@ -26,6 +26,7 @@ from tmlattice.diagnosis.stages import (
     pairs_of,
     seen_by,
     stages_of,
+    too_large,
     views_of,
 )
 from tmlattice.diagnosis.strategy import (
@@ -34,6 +35,7 @@ from tmlattice.diagnosis.strategy import (
     FEW,
     explained,
     freedom,
+    outlier,
     strongest,
 )
 from tmlattice.diagnosis.suspects import suspects
@@ -194,39 +196,74 @@ def _sought(
 
     # two findings say already whether the sizes have to be learnt again beside them
     narrow = replace(search, unnamed=False, most=min(2, search.most))
-    tried: list[tuple[float, Explanation, Learnt]] = []
+    tried: list[tuple[Explanation, Learnt]] = []
     for aside in dict.fromkeys(((), _outstanding(few))):
         try:
             small = learnt(aside, start.nuisances)
         except UnstableRingError:  # a fault among them makes them too large
             continue
         found = explain(replace(narrow, problem=small.problem), small.before)
-        tried.append((small.problem.log_scale + found.fit.log_evidence, found, small))
+        tried.append((found, small))
     if not tried:  # the readings are none of small errors
         return (few if few is not None else explain(search, start)), None
-    _, found, small = max(tried, key=lambda one: one[0])
+    found, small = max(tried, key=lambda one: _density(*one))
     if learn and small.log_evidence < CLEAR:
         assert few is not None
         return (explain(search, start) if few.full else few), None
     for _ in range(problem.judgement.retaken):
-        beside = (*found.fit.causes, *_doubted(found))
-        if not beside:
-            break
+        if not found.named:
+            hidden = _hidden(narrow, found, small, learnt, learn)
+            if hidden is None:
+                break
+            found, small, narrow = hidden
+            continue
         try:
-            about = learnt(beside, found.fit.nuisances)
+            about = learnt((*found.fit.causes, *_doubted(found)), found.fit.nuisances)
         except UnstableRingError:  # a cause that is no cause
             break
         again = explain(replace(narrow, problem=about.problem), about.before)
-        if not found.named and not again.named:
-            break  # it was a small error after all
         same = again.names == found.names
         small, found = about, again
         if same:
             break
     if found.full and search.most > narrow.most:
-        whole = replace(search, unnamed=False, problem=small.problem)
+        whole = replace(narrow, most=search.most, problem=small.problem)
         found = explain(whole, small.before)
     return found, small
+
+
+def _hidden(
+    search: Search,
+    found: Explanation,
+    small: Learnt,
+    learnt: Callable[[Sequence[Cause], Array], Learnt],
+    learn: bool,
+) -> tuple[Explanation, Learnt, Search] | None:
+    """A fault among small errors that hides it: with sizes learnt beside it the readings are
+    likelier than without. One that outweighs its family needs no statistic of its own; it made the
+    family as large as itself."""
+    amounts = small.problem.estimate(found.fit.clean).tolist()
+    errors = zip(small.problem.known.hypotheses, amounts, strict=True)
+    estimate = [Cause(*h, a) for h, a in errors]
+    far = outlier(estimate, small.sizes) if learn else None
+    for beside in dict.fromkeys(((far,) if far is not None else (), _doubted(found))):
+        if not beside:
+            continue
+        try:
+            about = learnt(beside, found.fit.nuisances)
+        except UnstableRingError:  # a cause that is no cause
+            continue
+        granted = frozenset((c.effect, c.element) for c in beside if c is far)
+        own = replace(search, granted=granted)
+        again = explain(replace(own, problem=about.problem), about.before)
+        if again.named and _density(again, about) > _density(found, small):
+            return again, about, own
+    return None
+
+
+def _density(found: Explanation, small: Learnt) -> float:
+    """Log density of the readings by an explanation among small errors."""
+    return small.problem.log_scale + found.fit.log_evidence
 
 
 def _outstanding(few: Explanation | None) -> tuple[Cause, ...]:
@@ -260,8 +297,8 @@ def _doubted(found: Explanation) -> tuple[Cause, ...]:
     name, place = found.scan.hypotheses[top]
     if find(name).discrete:
         return ()
-    amount = found.scan.amount[top]
-    root = abs(amount) ** (1 / find(name).power)
+    amount, effect = found.scan.amount[top], find(name)
+    root = min(abs(amount) ** (1 / effect.power), effect.largest)
     return (Cause(name, place, float(np.copysign(root, amount))),)
 
 
@@ -278,7 +315,11 @@ def _told(
     judgement = how.judgement
     found = _by_ring(ring, problem, found)
     result = found.fit
-    dead = tuple(dict.fromkeys(one for part in parts for one in part.dead))
+    # what counts turns late reads nothing in the first ones
+    late = {c.element for c in result.causes if find(c.effect).of_turns}
+    dead = tuple(
+        dict.fromkeys(d for p in parts for d in p.dead if ring.monitors[d[0]].name not in late)
+    )
     estimated = any(part.estimated for part in parts)
     findings = findings_of(ring, found, dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
@@ -300,7 +341,7 @@ def _told(
         said = (*said, f"held-out readings leave {np.sqrt(left):.1f} times the noise: something is "
                 "there that the fitted ones do not see")  # fmt: skip
     told = (f"{part.label}: {one}" for part in parts for one in part.said)
-    warnings = [*told, *spikes(parts, problem, found), *said]
+    warnings = [*told, *spikes(parts, problem, found), *said, *too_large(stages)]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     learnt = None

@@ -30,11 +30,20 @@ GAP = 0.05
 
 @dataclass(frozen=True)
 class Stage:
-    """One model of the ring: small errors, which a reference has too, causes, what it leaves."""
+    """One model of the ring.
+
+    Attributes:
+        static: small errors, which a reference has too.
+        causes: what was found.
+        point: what they leave.
+        share: of the likeliest small errors that stands in `static`: 1, or less where no beam is
+            stored with all of them.
+    """
 
     static: tuple[Cause, ...]
     causes: tuple[Cause, ...]
     point: Point
+    share: float = 1.0
 
 
 def stages_of(
@@ -61,15 +70,29 @@ HALVES = 4
 
 
 def _settled(problem: Together, static: tuple[Cause, ...], own: tuple[Cause, ...]) -> Stage:
+    share = 1.0
     for _ in range(HALVES):
-        there = replace(problem, fixed=(*problem.fixed, *static))
+        some = tuple(replace(cause, amount=share * cause.amount) for cause in static)
+        there = replace(problem, fixed=(*problem.fixed, *some))
         point = settled(there, own, problem.first)
         if not point.lost or not static:
             break
-        static = tuple(replace(cause, amount=cause.amount / 2) for cause in static)
+        share /= 2
     if point.lost:
         raise MeasurementError(f"{point.lost}, with what was found: too much to be explained")
-    return Stage(static, own, point)
+    return Stage(some, own, point, share)
+
+
+def too_large(stages: Sequence[Stage]) -> list[str]:
+    """A sentence where the last model has not all of the small errors: what it leaves is then no
+    measure of them."""
+    share = stages[-1].share
+    if share == 1:
+        return []
+    return [
+        f"no beam is stored with all of the small errors that were learnt: the figures of what is "
+        f"left are for {share:.4g} of each"
+    ]
 
 
 def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:

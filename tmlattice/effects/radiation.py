@@ -33,6 +33,7 @@ class _Loss(RingEffect):
     group = "beam"
     energy = True
     one_sign = True
+    curved = True  # where a ring without cavities of its own loses energy, its RF is on
     unit = "scale"
     sign = "0: no loss, 1: the expected loss; adds to what the model has"
     largest = 1.2

@@ -85,8 +85,14 @@ def rivals(
         for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
             cause = best_start(problem, others, hypothesis)
             chosen.append(Rival(hypothesis, _with(problem, others, cause, best)))
-    chosen = [rival for rival in chosen if others.chi2 - rival.fit.chi2 > EXPLAINS]
+    chosen = [r for r in chosen if others.chi2 - r.fit.chi2 > EXPLAINS and _possible(r.cause)]
     return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
+
+
+def _possible(cause: Cause) -> bool:
+    """Whether the amount has the sign that a fault of its effect has."""
+    effect = find(cause.effect)
+    return cause.amount >= 0 or not effect.one_sign or effect.power == 2
 
 
 def _linear_evidence(problem: Problem, found: Scan) -> Array:
@@ -110,6 +116,8 @@ def _first_guess(found: Scan, index: int) -> Cause | None:
         if amount <= 0:
             return None
         amount = float(np.sqrt(amount))
+    elif effect.one_sign and amount <= 0:
+        return None
     limit = 1.5 * effect.largest
     return Cause(name, place, float(np.clip(amount, -limit, limit)))
 
@@ -126,6 +134,7 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
     """The amount, out of a few, that leaves least when the nuisances follow."""
     effect = find(hypothesis[0])
     starts = [share * effect.largest for share in problem.judgement.starts]
+    starts = [amount for amount in starts if amount > 0 or not effect.one_sign]
     if effect.whole:
         starts = [float(n * side) for n in range(1, int(effect.largest) + 1) for side in (1, -1)]
     causes = [Cause(*hypothesis, amount) for amount in starts]

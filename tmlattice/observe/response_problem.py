@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects import Cause, LaunchEffect, find, modelled
+from tmlattice.effects import Cause, LaunchEffect, RingEffect, find, modelled
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.observe.orbit_response import Predicted, ResponseData
 from tmlattice.observe.steady import NOTHING, Steady
@@ -23,7 +23,8 @@ Flags = NDArray[np.bool_]
 
 
 def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> list[Hypothesis]:
-    """What may be wrong alone: effects that a response sees, at every place of the ring.
+    """What may be wrong alone: effects that a response sees, at every place of the ring. It sees a
+    kick too, by the orbit that this makes in the sextupoles.
 
     Args:
         data: monitors and correctors that were not measured are no places.
@@ -37,7 +38,7 @@ def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> l
     found: list[Hypothesis] = []
     for name in modelled(effects):
         effect = find(name)
-        if effect.responds:
+        if effect.responds or isinstance(effect, RingEffect):
             found += [
                 (name, place)
                 for place in effect.places(data.ring)

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.rf import NO_RF, Cavities, cavities
+from tmlattice.beam.rf import rf_of as rf_in
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import (
     Cause,
@@ -27,6 +29,7 @@ from tmlattice.effects import (
     find,
     monitors_with,
 )
+from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.steady import Steady
@@ -49,25 +52,40 @@ class Kept:
 
     def __init__(self) -> None:
         self._bases: dict[str, tuple[tuple[Cause, ...], ResponseModel]] = {}
-        self._beams: deque[tuple[str, float, tuple[Cause, ...], StoredBeam]] = deque(maxlen=BEAMS)
+        self._beams: deque[tuple[str, tuple[float, bool], tuple[Cause, ...], StoredBeam]] = deque(
+            maxlen=BEAMS
+        )
 
     def beam(
-        self, ring: Ring, settings: Settings, frequency: float, causes: tuple[Cause, ...]
+        self,
+        ring: Ring,
+        settings: Settings,
+        frequency: float,
+        causes: tuple[Cause, ...],
+        feels_rf: bool = False,
     ) -> StoredBeam:
         """The stored beam of a ring with settings and causes.
+
+        Args:
+            ring: the design.
+            settings, causes: of the state.
+            frequency: of the RF, relative.
+            feels_rf: its oscillation does, turn by turn; where the RF is on, see `Rf.on`.
 
         Raises:
             UnstableRingError: there is none.
         """
-        key, near = repr(settings), None
+        key, near, state = repr(settings), None, (frequency, feels_rf)
         for own, at, known, beam in self._beams:
             if own == key and known == causes:
-                if at == frequency:
+                if at == state:
                     return beam
                 near = beam
         model = self._model(ring, settings, causes) if near is None else near.model
-        made = StoredBeam(model if model.frequency == frequency else model.at_frequency(frequency))
-        self._beams.append((key, frequency, causes, made))
+        if model.frequency != frequency:
+            model = model.at_frequency(frequency)
+        made = StoredBeam(model, cavities_of(ring, model) if feels_rf else NO_RF)
+        self._beams.append((key, state, causes, made))
         return made
 
     def _model(self, ring: Ring, settings: Settings, causes: tuple[Cause, ...]) -> ResponseModel:
@@ -82,6 +100,24 @@ class Kept:
             self._bases[key] = (known, base)
         rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
         return base.changed_to(apply(base.ring, rest)) if rest else base
+
+
+def cavities_of(ring: Ring, model: ResponseModel) -> Cavities:
+    """The RF that turns of a stored beam feel.
+
+    Args:
+        ring: the design.
+        model: of it with what is wrong.
+
+    Raises:
+        UnstableRingError: the RF cannot make good what the beam loses.
+    """
+    rf = ring.memory.setdefault("rf", rf_in(ring))
+    loss = sum(element.errors.loss for element in model.ring.elements)
+    try:
+        return cavities(ring, rf, model.layers.layer_of, loss, model.frequency)
+    except LatticeError as error:
+        raise UnstableRingError(str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -160,7 +196,9 @@ class Stored(Steady):
     def view(self, causes: Sequence[Cause]) -> Beams:
         """A closed orbit for each state."""
         there = tuple(causes)
-        beams = tuple(self.kept.beam(self.ring, *state, there) for state in self.states)
+        beams = tuple(
+            self.kept.beam(self.ring, *state, there, self.counts) for state in self.states
+        )
         return Beams(beams, monitors_with(self.ring, causes))
 
     def read(self, view: Beams, nuisances: Array) -> Array:

@@ -48,8 +48,12 @@ class ManyTurns(Stored):
     said: tuple[str, ...] = ()
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """What is wrong with a monitor may be its count of turns."""
-        return [h for h in among if find(h[0]).of_turns and h[1] == hypothesis[1]]
+        """What is wrong with a monitor may be its count of turns; and all that is seen may be what
+        the RF does, which is on where the beam loses energy."""
+        return [
+            (name, place) for name, place in among
+            if place is None or (find(name).of_turns and place == hypothesis[1])
+        ]  # fmt: skip
 
     @property
     def _turn(self) -> Array:
