@@ -170,7 +170,7 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
             f"{x} in x and {y} in y (a jitter of the beam is not in it)"
         )
     else:
-        said += _understated(measured)
+        said += _understated(measured, data)
     if measured.rf is None or measured.rf.orbit is None:
         said.append(
             "there is no RF step: dispersion is not known, and only what is usual tells the scale "
@@ -179,12 +179,12 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
     return said
 
 
-def _understated(measured: OrbitResponse) -> list[str]:
+def _understated(measured: OrbitResponse, data: ResponseData) -> list[str]:
     """Where the readings scatter by far more than the noise that is stated."""
     if measured.noise is None:
         return []
     try:
-        shown = learnt_noise(measured)
+        shown = learnt_noise(measured, np.array([data.ring[name].s for name in measured.monitors]))
     except MeasurementError:  # too few readings say nothing
         return []
     stated = np.nanmedian(measured.noise, axis=0)
