@@ -4,13 +4,13 @@ Processor time is user + system of the process and its children, s: of the first
 caches (the package's and numba's), and the least of the later calls. The last column names the
 heavy packages that were loaded.
 
-22 November 2026, `python benchmarks/start.py`, two cores, both busy; first / later, s; goal:
+22 November 2026, `python benchmarks/start.py`, two cores, one and a half busy; first / later, s; goal:
 
-    --help              0.09 / 0.09   0.15
-    info petra3         2.37 / 1.08   2.5    none of the heavy packages in the later calls
-    simulate            2.92 / 2.35          ocelot, matplotlib, at
-    diagnose            5.56 / 3.40   2.5    ocelot; 2.87 on 21 November with one core free
-    tune-fit --epochs 1 31.7 / 15.3   3.5    all three methods since; the recipe alone was 4.62
+    --help              0.08 / 0.08   0.15
+    info petra3         2.09 / 0.96   2.5    none of the heavy packages in the later calls
+    simulate            2.69 / 1.98          ocelot, matplotlib, at
+    diagnose            4.21 / 2.60   2.5    ocelot; 2.41 to 2.63 in seven calls by hand
+    tune-fit --epochs 1 16.3 / 5.82   3.5    all three methods; the recipe alone was 4.62
 """
 
 import argparse
