@@ -256,6 +256,14 @@ def test_sextupole_offset_is_that_of_its_centre(tmp_path):
     np.testing.assert_allclose(exit_state(engine, launch)[[1, 3]], expected, rtol=1e-3)
 
 
+def test_gradient_of_a_bend_is_that_of_another_design(tmp_path):
+    bend = "SBend(l=1.0, angle=0.1, k1={k1}, eid='it')"
+    wrong = engine_of(tmp_path, bend.format(k1=0.2), ("bend_gradient", 0.05))
+    found = exit_state(wrong)
+    np.testing.assert_array_equal(found, exit_state(engine_of(tmp_path, bend.format(k1=0.25))))
+    assert np.abs(found - exit_state(engine_of(tmp_path, bend.format(k1=0.2)))).max() > 1e-6
+
+
 def test_no_effect_is_left_untested():
     """Runs last of the effects' tests: each has met a formula above."""
     on_one = {n for n, e in CATALOGUE.items() if isinstance(e, RingEffect) and not e.energy}
