@@ -1,9 +1,12 @@
 """The block solver of the response's fit against dense normal equations, and known errors."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tmlattice.diagnosis.rounds import _good_monitors
 from tmlattice.inference.normal import normal_equations, solve
 from tmlattice.inference.priors import Group
 
@@ -101,3 +104,18 @@ def test_scale_of_the_prior_is_that_of_the_truth(rng, freedom):
     assert_allclose(found.groups[0].rms, rms, rtol=0.35 if heavy else 0.1)
     pull = (found.values[-errors:] - truth) / found.sigma[-errors:]
     assert 0.8 < pull.std() < 1.2
+
+
+@pytest.mark.parametrize("astray", [False, True])
+def test_monitors_are_bad_against_the_others_and_not_all_at_once(rng, astray):
+    """Where most monitors answer nothing of the model it is the fit that is wrong: all had been set
+    aside, and none was left to judge (ALS 2008, a trial without its bends' gradients)."""
+    model, plane = rng.standard_normal((12, 9)), np.arange(12) % 2
+    orbits = model + 1e-3 * rng.standard_normal((12, 9))
+    orbits[:, 4] += rng.standard_normal(12)
+    if astray:
+        orbits = rng.standard_normal((12, 9)) - model
+    data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
+    state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
+    expected = np.full(9, True) if astray else np.arange(9) != 4
+    assert (_good_monitors(state) == expected).all()
