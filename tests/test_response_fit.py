@@ -114,7 +114,7 @@ def test_monitors_are_bad_against_the_others_and_not_all_at_once(rng, astray):
     orbits = model + 1e-3 * rng.standard_normal((12, 9))
     orbits[:, 4] += rng.standard_normal(12)
     if astray:
-        orbits = rng.standard_normal((12, 9)) - model
+        orbits = 0.05 * model
     data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
     state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
     expected = np.full(9, True) if astray else np.arange(9) != 4
