@@ -1,11 +1,14 @@
 """The ring from above, against AT's own geometry."""
 
+from types import SimpleNamespace
+
 import at
 import pytest
 from at_ring import at_lattice
 from numpy.testing import assert_allclose
 
 from tmlattice.lattice.survey import survey
+from tmlattice.plots import plan
 
 
 @pytest.mark.parametrize("name", ["small_ring", "petra3"])
@@ -30,3 +33,12 @@ def test_places_between_elements_lie_on_the_orbit(small_ring):
     plan = survey(small_ring)
     quadrupole = small_ring["QD::5"]
     assert_allclose(plan.along(quadrupole.s, small_ring), plan.at(["QD::5"])[0], atol=1e-9)
+
+
+def test_names_of_findings_that_stand_together_step_aside(small_ring):
+    found = [SimpleNamespace(s=s, where=None) for s in (10.0, 11.0, 12.0, 60.0)]
+    diagnosis = SimpleNamespace(
+        ring=small_ring, findings=(*found, SimpleNamespace(s=None, where=None))
+    )
+    placed = plan.placed(diagnosis, survey(small_ring))
+    assert [(number, off) for number, _, _, off in placed] == [(1, 0), (2, 1), (3, 2), (4, 0)]

@@ -28,6 +28,9 @@ class Small:
 SMALL = {"monitor": Small("o", "tab:cyan", 0.02), "corrector": Small("^", "tab:orange", -0.02)}
 """By kind."""
 
+ROOM = 0.4
+"""Of the ring's size: nearer to each other than that the names of two findings would overlap."""
+
 CULPRIT, SUSPECT = "#d1105a", "#c58a00"
 
 
@@ -66,6 +69,20 @@ def inwards(place: Array, plan: Survey) -> tuple[str, str]:
     return "middle", side
 
 
+def placed(diagnosis: Diagnosis, plan: Survey) -> list[tuple[int, Finding, Array, int]]:
+    """Findings that have a place: number, finding, (x, y), m, and by how many lines its name steps
+    aside for the names of those near it."""
+    room = ROOM * float(np.ptp(plan.ends, axis=0).max())
+    found: list[tuple[int, Finding, Array, int]] = []
+    for number, finding in enumerate(diagnosis.findings, 1):
+        at = place_of(finding, diagnosis, plan)
+        if at is None:
+            continue
+        taken = {off for *_, other, off in found if np.hypot(*(at - other)) < room}
+        found.append((number, finding, at, next(n for n in range(99) if n not in taken)))
+    return found
+
+
 def label(number: int, finding: Finding) -> str:
     """A finding's number and name."""
     return f"{number}. {brief(finding.element or 'unnamed')}"
@@ -90,16 +107,14 @@ def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
         arcs = [(plan.ends[i], plan.middle[i], plan.ends[i + 1]) for i in places]
         lines = LineCollection(arcs, colors=COLOURS[kind], linewidths=3, label=f"{kind}s")
         ax.add_collection(lines)
-    for number, finding in enumerate(diagnosis.findings, 1):
-        place = place_of(finding, diagnosis, plan)
-        if place is None:
-            continue
+    for number, finding, place, lines_off in placed(diagnosis, plan):
         ax.plot(*place, "o", ms=16, mfc="none", mec=CULPRIT, mew=2.2, zorder=5)
         high, side = inwards(place, plan)
         off = {"left": -12, "right": 12, "top": 12, "bottom": -12, "middle": 0}
         ax.annotate(
             label(number, finding), (place[0], place[1]),
-            xytext=(off[side], off[high]), textcoords="offset points",
+            xytext=(off[side], off[high] + 14 * lines_off * (1 if off[high] >= 0 else -1)),
+            textcoords="offset points",
             ha="right" if side == "left" else "left",
             va={"top": "bottom", "bottom": "top"}.get(high, "center"),
             color=CULPRIT, fontweight="bold", zorder=6,

@@ -170,17 +170,18 @@ def plan(diagnosis: Diagnosis) -> Figure:
                        text=[f"{e.name}<br>s = {e.s:.2f} m" for e in own])  # fmt: skip
         trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
         traces.append(trace)
-    for number, finding in enumerate(diagnosis.findings, 1):
-        place = plan_view.place_of(finding, diagnosis, view)
-        if place is None:
-            continue
+    for number, finding, place, lines_off in plan_view.placed(diagnosis, view):
+        high, side = plan_view.inwards(place, view)
+        aside = "<br>\u00a0" * lines_off * (2 if high == "middle" else 1)
         name = finding.element or "unnamed"
         traces.append({
             **_trace(place[:1], place[1:], name, "@culprit", mode="markers", size=20,
                      text=[plan_view.label(number, finding)], showlegend=False,
                      told=f"<br>{name}<br>s = {_s_text(finding.s, finding.where)}"),
-            "mode": "markers+text", "texttemplate": " %{text} ",
-            "textposition": " ".join(plan_view.inwards(place, view)),
+            "mode": "markers+text",
+            "texttemplate": f"{aside[4:]}<br> %{{text}} " if aside and high == "bottom"
+            else f" %{{text}} {aside}",
+            "textposition": f"{high} {side}",
             "textfont": {"color": "@culprit", "size": 15},
             "marker": {"size": 20, "symbol": "circle-open", "color": "@culprit",
                        "line": {"width": 3}},
