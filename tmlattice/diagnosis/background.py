@@ -184,9 +184,8 @@ def small_errors(
         _on_its_way(alone)
         paths = alone.point.view
         hypotheses, scale, spread = background_signatures(model, paths, alone.nuisances, rms)
-        if estimate:
-            spread = chained(estimate)[:, None, None, None] * spread
         estimate = estimate or [Cause(*h, 0.0) for h in hypotheses]
+        spread = chained(estimate)[:, None, None, None] * spread
         amounts = np.array([cause.amount for cause in estimate])
         shifted = _moved(data, amounts / scale, spread)
         if learn:

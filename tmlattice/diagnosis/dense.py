@@ -235,9 +235,7 @@ def fit_steps(
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
         least = min(worth, key=lambda trial: worth[trial])
         state = without[least] if least in without else _without(state, least)
-        gone = steps.pop(least)
-        if gone.parameters:  # else the ring has no places of it
-            refused.append(replace(gone, kept=False))
+        refused.append(replace(steps.pop(least), kept=False))
         doubted = [trial for trial in steps if worth[trial] <= 0]
         del worth[least]
         without = {}
@@ -245,7 +243,7 @@ def fit_steps(
             again, without = _worth(state, doubted, progress)
             worth |= again
     if _lost(_inner(design), _inner(state)) < -SPOILT:  # all together spoil what they should mend
-        refused += [replace(step, kept=False) for step in steps.values() if step.parameters]
+        refused += [replace(step, kept=False) for step in steps.values()]
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
                         (before, before))  # fmt: skip
     progress("result")
