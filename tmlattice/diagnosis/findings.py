@@ -189,10 +189,8 @@ def verdict_of(
     judgement: Judgement,
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
     """The least certain of the findings', the findings that stand, and what is to be said."""
-    found = explanation.scan
-    left = found.p_value(float(found.statistic.max(initial=0.0)))
     more, far_more = judgement.noise
-    if explanation.full and left < judgement.false_alarm:
+    if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
         said = (
             f"{many} not explain the data; a reference from before the fault would cancel what was "

@@ -22,6 +22,7 @@ from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Problem
 from tmlattice.inference.search import Explanation, Search, explain, revised
 from tmlattice.lattice import Ring
+from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import turns_of
 from tmlattice.observe.noise import local_misfit
 
@@ -30,8 +31,19 @@ Array = NDArray[np.float64]
 FEW = 3
 """Causes that are sought alone before anybody asks for small errors."""
 
+SPARSE = 0.05
+"""Excess of the variance between neighbouring monitors, over that of all readings less the orbit
+that a launch makes, below which faults are few: small errors that make up an orbit all along the
+ring have at least 0.08 of it between neighbours, eight faults of the small ring 0.02."""
+
+MEDIAN = 0.674
+"""Of what neighbouring monitors leave of one another, in noise, where there is noise alone."""
+
+ENOUGH = 20
+"""Readings of which a median is taken at least."""
+
 CROWDED = 1.5
-"""Median of what neighbouring monitors leave of one another, in noise (0.67 for noise alone), above
+"""Median of what neighbouring monitors leave of one another, in noise, above
 which few causes are not tried: a few leave most gaps between monitors as the design has them."""
 
 DOUBT = 8.0
@@ -99,7 +111,11 @@ def sought(
     if not _crowded(ready):
         search.progress("scan")
         few = explain(replace(search, most=min(FEW, search.most)), ready.before)
-        if explained(few):
+        alone = explained(few)
+        more = few.scan.chance < few.problem.judgement.false_alarm if alone else _sparse(few)
+        if few.full and search.most > FEW and more:
+            few = explain(search, ready.before, few)
+        if alone:
             return Found(few)
     search.progress("small errors")
     start = ready.before if few is None else few.fit
@@ -119,10 +135,41 @@ def sought(
     if small is None or (small.evidence is not None and small.evidence < CLEAR):
         if few is None:  # errors all along the ring: a few names at most, nothing without one
             few = explain(replace(search, most=min(FEW, search.most), unnamed=False), ready.before)
-        elif few.full and search.most > FEW:
-            few = explain(search, ready.before)
+        elif few.full and few.count < search.most:
+            few = explain(search, ready.before, few)
         return Found(few)
-    return Found(*_among(ring, ready, search, small))
+    among = Found(*_among(ring, ready, search, small))
+    return Found(few) if few is not None and _likelier(few, among.explanation) else among
+
+
+def _sparse(found: Explanation) -> bool:
+    """Whether neighbouring monitors agree although the orbit all along the ring does not."""
+    typical, count = _between(turns_of(found).data, found.fit)
+    if count <= ENOUGH:
+        return False
+    excess = (typical / MEDIAN) ** 2 - 1
+    error = 2.3 / count**0.5  # of the square of a median of noise
+    everywhere = found.fit.chi2 / freedom(found.problem, found.fit) - 1
+    return bool(excess - error < SPARSE * everywhere)
+
+
+def _likelier(few: Explanation, among: Explanation) -> bool:
+    """Whether faults alone explain all, and better than others among small errors do, on the
+    readings that both keep."""
+    dropped = few.dropped | among.dropped
+    return explained(few) and _log_marginal(few, dropped) > _log_marginal(among, dropped)
+
+
+def _log_marginal(found: Explanation, dropped: NDArray[np.bool_]) -> float:
+    """Log evidence, launches and small errors integrated out, up to a constant of the readings."""
+    problem = turns_of(found).without(dropped)
+    again = fit(problem, found.fit.causes, found.fit.nuisances, found.fit.kicks)
+    if not again.good:
+        return -np.inf
+    aside = problem.unknown_prior(len(problem.monitors)) * len(found.monitors)
+    aside += problem.judgement.spike * len(found.spikes)
+    volume = problem.whitening.log_volume + again.projection.log_volume
+    return again.log_evidence + aside + volume
 
 
 def _errors(found: Found, small: SmallErrors) -> list[Cause]:
@@ -135,9 +182,15 @@ def _crowded(ready: Prepared) -> bool:
     data = ready.problem.data
     if ready.estimated:
         return False
-    left = local_misfit(data, ready.before.point.view) / data.sigma
+    typical, count = _between(data, ready.before)
+    return count > ENOUGH and typical > CROWDED
+
+
+def _between(data: Data, found: Fit) -> tuple[float, int]:
+    """Median of what neighbouring monitors leave of one another, in noise, and of how many."""
+    left = local_misfit(data, found.point.view) / data.sigma
     left = np.abs(left[np.isfinite(left)])
-    return len(left) > 20 and float(np.median(left)) > CROWDED
+    return float(np.median(left)) if len(left) else 0.0, len(left)
 
 
 def explained(found: Explanation) -> bool:

@@ -58,7 +58,7 @@ def rivals(
         count: refitted at most; else as the judgement has it.
     """
     judge = problem.judgement
-    linear = _linear_evidence(problem, found)
+    linear = linear_evidence(problem, found)
     have = {(c.effect, c.element) for c in others.causes}
     order = np.argsort(-linear)[: judge.rivals if count is None else count]
     # the linear scan errs by a share of the statistic itself where an effect is strong
@@ -95,8 +95,14 @@ def _possible(cause: Cause) -> bool:
     return cause.amount >= 0 or not effect.one_sign or effect.power == 2
 
 
-def _linear_evidence(problem: Problem, found: Scan) -> Array:
-    """By the scan alone, up to a constant; -inf for what it does not see."""
+def linear_evidence(problem: Problem, found: Scan) -> Array:
+    """Log evidence of each hypothesis by the scan alone, up to a constant; -inf for what it does
+    not see, [hypothesis].
+
+    Args:
+        problem: for the priors.
+        found: the scan.
+    """
     occam = -0.5 * np.log(np.maximum(found.statistic, 1.0))
     prior = np.array([problem.prior(h) for h in found.hypotheses])
     power = np.array([find(h[0]).power for h in found.hypotheses])

@@ -51,6 +51,11 @@ class Scan:
         """Chance that pure noise reaches this anywhere in the scan."""
         return look_elsewhere(statistic, 1, self.effective)
 
+    @property
+    def chance(self) -> float:
+        """That pure noise reaches what is seen most of."""
+        return self.p_value(float(self.statistic.max(initial=0.0)))
+
     def threshold(self, rate: float) -> float:
         """The statistic that pure noise reaches in this share of data sets."""
         return free_threshold(rate, 1, self.effective)

@@ -10,7 +10,7 @@ step every earlier choice is held against its rivals again, with all the others 
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, Outcome, fit
 from tmlattice.inference.options import Option, Reading, spike, unnamed
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.rivals import Detection, Rival, rivals
+from tmlattice.inference.rivals import Detection, Rival, linear_evidence, rivals
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,
@@ -152,14 +152,15 @@ class Look:
     monitors: FreeScan
 
 
-def explain(search: Search, before: Fit) -> Explanation:
+def explain(search: Search, before: Fit, so_far: Explanation | None = None) -> Explanation:
     """Search for the causes of what the nuisances leave unexplained.
 
     Args:
         search: what is searched.
         before: the nuisances alone.
+        so_far: a search for fewer that goes on; None: a new one.
     """
-    found = _run(search, before)
+    found = _run(search, before, so_far)
     if not (found.passed_over and found.kicks):
         return found
     few = min(search.most, found.count + 1)
@@ -167,12 +168,16 @@ def explain(search: Search, before: Fit) -> Explanation:
     return other if _weighed(search, other, found) > _weighed(search, found, other) else found
 
 
-def _run(search: Search, before: Fit) -> Explanation:
-    state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
+def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Explanation:
+    first: Look | None = None
+    if so_far is None:
+        state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
+    else:
+        state = State(**{own.name: getattr(so_far, own.name) for own in fields(State)})
+        first = Look(so_far.first, so_far.first_kicks, NO_SCAN)
     seen: set[frozenset[object]] = set()
     been: set[object] = set()
-    first: Look | None = None
-    spiked = False  # readings were left out since the choices were revised
+    pending = False  # choices were added or readings left out since all were held against rivals
     while True:
         state, look = _look(search, state)
         first = first or look
@@ -185,10 +190,10 @@ def _run(search: Search, before: Fit) -> Explanation:
         options = [option for option in options if option.gain > 0 or option.kind in told]
         seen.add(state.names)
         been.add(state.choices)
-        if not options and not spiked:
+        if not options and not pending:
             break
         if not options:
-            state, spiked = revised(search, state), False
+            state, pending = revised(search, state), False
             continue
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
@@ -197,13 +202,15 @@ def _run(search: Search, before: Fit) -> Explanation:
         if state.fit.point.lost:  # the model has no answer there
             state = there
             break
-        spiked = best.kind == "reading" and state.count > 1
-        if state.count > 1 and not spiked:
-            state = revised(search, state)
+        pending = pending or state.count > 1
+        if state.count > 1 and best.kind != "reading":
+            state = revised(search, state, doubted=True)
         if state.fit.chi2 <= search.enough:
             break
         if state.choices in been or (best.kind in ("named", "kick") and state.names in seen):
             break  # what was added went again
+    if pending:
+        state = revised(search, state)
     return Explanation(
         **vars(state), before=before, first=first.named, first_kicks=first.kicks,
         scan=look.named, left=look.kicks, full=full, beyond=beyond,
@@ -323,21 +330,23 @@ def _again(search: Search, state: AnyState, dropped: Flags) -> AnyState:
 
 
 # --- revising ----
-def revised(search: Search, state: AnyState) -> AnyState:
+def revised(search: Search, state: AnyState, doubted: bool = False) -> AnyState:
     """Every choice held against its rivals, all the others in place, until none changes.
 
     Args:
         search: what is searched; its problem has all readings.
         state: what is explained so far.
+        doubted: once, only causes that a scan puts behind others, and kicks against few rivals:
+            all of eight after each choice would take most of the time.
     """
-    for _ in range(3):
+    for _ in range(1 if doubted else 3):
         names = state.names
         for monitor in list(state.monitors):
             state = _monitor_revised(search, state, monitor)
         for place in list(state.fit.kicks):
-            state = _kick_revised(search, state, place)
+            state = _kick_revised(search, state, place, 3 if doubted else 8)
         for cause in state.fit.causes:
-            state = _cause_revised(search, state, (cause.effect, cause.element))
+            state = _cause_revised(search, state, (cause.effect, cause.element), doubted)
         if names == state.names:
             break
     return state
@@ -365,7 +374,7 @@ def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
     return state
 
 
-def _kick_revised(search: Search, state: AnyState, place: int) -> AnyState:
+def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> AnyState:
     """A free kick gives way to a named cause, or to none, where that explains more."""
     now = state.fit
     kicks = {k: v for k, v in now.kicks.items() if k != place}
@@ -376,14 +385,16 @@ def _kick_revised(search: Search, state: AnyState, place: int) -> AnyState:
         return state
     if alone.log_evidence > now.log_evidence:
         return without
-    tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 8)
+    tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, count)
     if tried and tried[0].fit.log_evidence > now.log_evidence:
         named = (*state.named, Named(state.kicks[place], tried))
         return replace(without, fit=tried[0].fit, named=named)
     return state
 
 
-def _cause_revised(search: Search, state: AnyState, hypothesis: Hypothesis) -> AnyState:
+def _cause_revised(
+    search: Search, state: AnyState, hypothesis: Hypothesis, doubted: bool
+) -> AnyState:
     """A named cause gives way to a better one, or to none; its rivals are weighed anew."""
     now = state.fit
     own = [i for i, c in enumerate(now.causes) if (c.effect, c.element) == hypothesis]
@@ -398,7 +409,12 @@ def _cause_revised(search: Search, state: AnyState, hypothesis: Hypothesis) -> A
         return state
     if not search.keep and alone.log_evidence > now.log_evidence:
         return without
-    tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, 12)
+    about = _scan(search, without)
+    if doubted:
+        leader = about.hypotheses[int(linear_evidence(state.problem, about).argmax())]
+        if leader == hypothesis:
+            return state
+    tried = rivals(state.problem, alone, about, search.hypotheses, 12)
     if hypothesis not in [rival.hypothesis for rival in tried]:
         order = (*rest, now.causes[k])
         kept = fit(state.problem, order, now.nuisances, now.kicks, slopes=now.slopes)

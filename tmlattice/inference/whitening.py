@@ -72,6 +72,12 @@ class Whitening:
             assert failed == 0
 
     @property
+    def log_volume(self) -> float:
+        """Log density at their peak of readings in units of their own noise, over that of noise
+        alone: what it costs the likelihood that small errors might be anywhere."""
+        return 0.0 if self._inverse is None else float(np.log(np.diag(self._inverse)).sum())
+
+    @property
     def dense(self) -> bool:
         """Whether readings of different shots are correlated."""
         return self._inverse is not None
@@ -153,6 +159,12 @@ class Projection:
 
     def __init__(self, directions: Array) -> None:
         self.Q, self._R = np.linalg.qr(directions)
+
+    @property
+    def log_volume(self) -> float:
+        """Of the launches' covariance: log of the square root of its determinant."""
+        seen = np.abs(np.diagonal(self._R, axis1=1, axis2=2))
+        return -float(np.log(np.maximum(seen, 1e-300)).sum())
 
     def out(self, rows: Array) -> Array:
         """Rows [..., row] less what launches explain, the same shape."""
