@@ -112,11 +112,12 @@ def sought(
         search.progress("scan")
         few = explain(replace(search, most=min(FEW, search.most)), ready.before)
         alone = explained(few)
-        more = few.scan.chance < few.problem.judgement.false_alarm if alone else _sparse(few)
-        if few.full and search.most > FEW and more:
-            few = explain(search, ready.before, few)
-        if alone:
+        more = few.full and few.count < search.most
+        more = more and few.scan.chance < few.problem.judgement.false_alarm
+        if alone and not more:
             return Found(few)
+        if more and (alone or _sparse(few)):
+            few = explain(search, ready.before, few)
     search.progress("small errors")
     start = ready.before if few is None else few.fit
     about = [] if few is None or not few.named else [strongest(few)]
@@ -154,10 +155,10 @@ def _sparse(found: Explanation) -> bool:
 
 
 def _likelier(few: Explanation, among: Explanation) -> bool:
-    """Whether faults alone explain all, and better than others among small errors do, on the
-    readings that both keep."""
+    """Whether faults alone explain all, and clearly better than fewer among small errors do, on
+    the readings that both keep."""
     dropped = few.dropped | among.dropped
-    return explained(few) and _log_marginal(few, dropped) > _log_marginal(among, dropped)
+    return explained(few) and _log_marginal(few, dropped) > CLEAR + _log_marginal(among, dropped)
 
 
 def _log_marginal(found: Explanation, dropped: NDArray[np.bool_]) -> float:
