@@ -121,9 +121,7 @@ class ResponseSlopes:
         """
         for name, _ in hypotheses:
             if not isinstance(find(name), RingEffect):
-                raise EffectError(
-                    f"'{name}' does not act on the ring; its derivative is not here"
-                )
+                raise EffectError(f"'{name}' does not act on the ring; its derivative is not here")
         return self._factors(hypotheses)
 
     def _factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
@@ -154,9 +152,7 @@ class ResponseSlopes:
         kicks = (back @ kick[:, :, None])[..., 0]
         return kicks, back @ (d.D1 + bent) @ model.tangents[d.layer]
 
-    def _stepped(
-        self, layers: NDArray[np.int64], sources: Array
-    ) -> tuple[Array, Array, Array]:
+    def _stepped(self, layers: NDArray[np.int64], sources: Array) -> tuple[Array, Array, Array]:
         """Of new kicks S u [row, n, n] in layers: what the monitors see of the launch; what of the
         columns' own kicks comes too late for them, [column, n]; and their sum, [n, n]."""
         seen, missed = np.zeros_like(self.readings), np.zeros_like(self.pulled)
