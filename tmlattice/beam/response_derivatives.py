@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import KICK, ResponseModel
+from tmlattice.beam.feed_down import feed_down
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions
 from tmlattice.errors import EffectError
@@ -190,15 +191,12 @@ class ResponseSlopes:
         """
         model, maps, n = self.model, self.model.maps, self.model.dimension
         C, back, columns = model.tangents, model.inverse, self.columns
-        bends = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])  # the closing way too
-        j = np.flatnonzero(bends.any(axis=(1, 2)))
-        sources = np.zeros((len(C), n, n, n))
-        sources[j + 1] = _between(back[j + 1], second_derivatives(bends[j]), C[j])
-        fed = np.cumsum(sources, axis=0)
+        fed = feed_down(model, back, C)
         G, at = self.readings, maps.at
         seen = np.einsum("mpa,mabi->mpbi", G, fed[at])
         if maps.R2.any():
-            seen += _between(np.eye(2), second_derivatives(maps.R2), C[at])
+            bends = second_derivatives(maps.R2)
+            seen += np.einsum("mpxy,mxb,myi->mpbi", bends, C[at], C[at], optimize=True)
         missed = np.einsum("cabi,cb->cai", fed[self._exits], self.pulled)
         own = np.zeros((len(self.pulled), n, n))
         own[:-1] = back[columns.layer + 1] @ columns.slope @ C[columns.layer]
@@ -225,20 +223,14 @@ class ResponseSlopes:
         element, h = layers.ring.elements[place], STEP * effect.largest
         key = (effect.name, layers.physics(element))
         if key not in self._mixes:
-            B, R, T = 0.0, 0.0, 0.0
+            n = layers.dimension
+            B, R, T = np.zeros(n), np.zeros((n, n)), np.zeros((n, n, n))
             for kick, amount in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 set_to = element.changed(angle=element.angle + kick * KICK)
                 there = layers.map(effect.changed(set_to, amount * h, layers.ring.energy))
                 share = kick * amount / (4 * KICK * h)
-                B, R = B + share * there.B, R + share * there.R
-                T = T + share * (0.0 if there.T is None else there.T)
-            n = layers.dimension
-            self._mixes[key] = Quadratic(B, R, T if np.ndim(T) else np.zeros((n, n, n)))
+                B += share * there.B
+                R += share * there.R
+                T += share * (0.0 if there.T is None else there.T)
+            self._mixes[key] = Quadratic(B, R, T)
         return self._mixes[key]
-
-
-def _between(left: Array, bends: Array, right: Array) -> Array:
-    """left T''(right ., right .) [..., a, b, i] of second derivatives T'' [..., n, n, n]."""
-    once = bends @ right[:, None]  # [..., out, x, i]
-    twice = np.swapaxes(once, 2, 3) @ right[:, None]  # [..., out, i, b]
-    return np.asarray(np.einsum("...ao,...oib->...abi", left, twice, optimize=True))

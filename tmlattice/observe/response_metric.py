@@ -114,7 +114,7 @@ class _Here:
         return (1 + self.view.errors.calibration) * self.view.data.kicks
 
     @cached_property
-    def first(self) -> Array:
+    def first(self) -> NDArray[np.intp]:
         """The first of the measured monitors behind each column's kick, [column]."""
         return np.searchsorted(self.view.data.at, self.slopes.first)
 
