@@ -25,7 +25,7 @@ from tmlattice.beam.feed_down import feed_down
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions
 from tmlattice.errors import EffectError
-from tmlattice.maps.quadratic import Quadratic
+from tmlattice.maps.quadratic import Quadratic, difference
 from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
@@ -223,14 +223,10 @@ class ResponseSlopes:
         element, h = layers.ring.elements[place], STEP * effect.largest
         key = (effect.name, layers.physics(element))
         if key not in self._mixes:
-            n = layers.dimension
-            B, R, T = np.zeros(n), np.zeros((n, n)), np.zeros((n, n, n))
+            ends = []
             for kick, amount in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 set_to = element.changed(angle=element.angle + kick * KICK)
-                there = layers.map(effect.changed(set_to, amount * h, layers.ring.energy))
-                share = kick * amount / (4 * KICK * h)
-                B += share * there.B
-                R += share * there.R
-                T += share * (0.0 if there.T is None else there.T)
-            self._mixes[key] = Quadratic(B, R, T)
+                there = effect.changed(set_to, amount * h, layers.ring.energy)
+                ends.append((kick * amount, layers.map(there)))
+            self._mixes[key] = difference(ends, 4 * KICK * h)
         return self._mixes[key]
