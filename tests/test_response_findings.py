@@ -83,6 +83,15 @@ def test_a_faint_cause_is_named_where_all_readings_together_are_noise(small_ring
     assert 30 < found.detection.statistic < 80
 
 
+def test_a_strong_cause_is_one_beside_columns_that_are_fitted_by_half(small_ring):
+    """What was not fitted counted as nothing, which no few patterns explain."""
+    cause = Cause("quadrupole_gradient", "QF::2", -0.05)
+    data = response_data(small_ring, measured(small_ring, [cause], noise=5e-8, engine="ocelot"))
+    split = split_columns(data, 0.2, np.random.default_rng(0))
+    (found,) = few_causes(data, split, None, 1, DEFAULT).findings
+    assert (found.effect, found.element) == (cause.effect, cause.element)
+
+
 def test_two_causes_are_two_findings(small_ring):
     causes = [Cause("quadrupole_roll", "QF::2", 0.02), Cause("corrector_calibration", "v7", 0.2)]
     result = diagnose(small_ring, measured(small_ring, causes))

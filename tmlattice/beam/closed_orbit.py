@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from tmlattice.beam.chain import NO_ORBIT, Chain, closing
 from tmlattice.beam.settle import settle
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.lattice import Ring
+from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
+from tmlattice.maps.quadratic import Quadratic, difference
 from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
@@ -286,12 +287,21 @@ class ResponseModel:
 
     def _kick(self, place: int, layer: int) -> tuple[Array, Array]:
         """The corrector's kick at its layer's exit, and how it depends on the state there."""
-        element = self.ring.elements[place]
-        up, down = (
-            self.layers.layer(layer, {place: element.changed(angle=element.angle + h)})[0]
-            for h in (KICK, -KICK)
-        )
-        w0, w1, w2 = ((p - m) / (2 * KICK) for p, m in zip(up, down, strict=True))
+        slope = self._map_slope(self.ring.elements[place])
+        w0, w1, w2 = slope.after(self.layers.way(layer)).reduced()
         x = self.path[layer]
         bent = second_derivatives(w2[None])[0] @ x
         return w0 + (w1 + bent / 2) @ x, w1 + bent
+
+    def _map_slope(self, corrector: Element) -> Quadratic:
+        """d map / d kick; equal correctors share it."""
+        layers = self.layers
+        key = ("kick", layers.physics(corrector))
+        if key not in layers.memory:
+            ends = [
+                (side, layers.map(corrector.changed(angle=corrector.angle + side * KICK)))
+                for side in (1, -1)
+            ]
+            layers.memory[key] = difference(ends, 2 * KICK)
+        known: Quadratic = layers.memory[key]
+        return known

@@ -1,4 +1,4 @@
-"""How errors change the orbit response: each effect of the ring in closed form, in one pass.
+"""How errors change the orbit response: each effect of the ring in closed form, in factors.
 
 To second order a corrector's kick and an error meet in four places. With the orbit's changes dc of
 a column (a corrector, or the RF) and da of the error, a new kick arises at the exit of
@@ -9,21 +9,27 @@ a column (a corrector, or the RF) and da of the error, a new kick arises at the 
 
 and the read-outs gain the like. Every source is linear in dc = C u, u the column's change of the
 launch: dz before the corrector and dz + w behind it. So with P_j the sum of C^-1 (...) C over the
-layers before j, all columns cost two small matrix products per error.
+layers before j, an error's change of the whole response is a few numbers for each monitor (what it
+reads of a launch is another) and for each column (its launch is another): see `Factors`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import KICK, Columns, ResponseModel
+from tmlattice.beam.closed_orbit import KICK, ResponseModel
+from tmlattice.beam.feed_down import feed_down
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions
 from tmlattice.errors import EffectError
+from tmlattice.maps.quadratic import Quadratic, difference
 from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
+Hypothesis = tuple[str, str | None]
 
 STILL = 1e-12
 """m and rad per unit: an error whose own kick is smaller leaves the closed orbit where it is."""
@@ -31,7 +37,7 @@ STILL = 1e-12
 
 def derivatives(
     model: ResponseModel,
-    hypotheses: Sequence[tuple[str, str | None]],
+    hypotheses: Sequence[Hypothesis],
     correctors: Sequence[str] | None = None,
 ) -> Iterator[Array]:
     """d (orbit response) / d amount of effects, one after another.
@@ -49,106 +55,178 @@ def derivatives(
         EffectError: an effect that does not act on the ring.
         UnknownNameError, MeasurementError: see `ResponseModel.columns`.
     """
-    for name, _ in hypotheses:
-        if not isinstance(find(name), RingEffect):
-            raise EffectError(f"'{name}' does not act on the ring; its derivative is not here")
-    return _Pass(model, model.columns(correctors), hypotheses).run()
+    slopes = ResponseSlopes(model, correctors)
+    return map(slopes.whole, slopes.factors(hypotheses))
 
 
-class _Pass:
-    def __init__(
-        self,
-        model: ResponseModel,
-        columns: Columns,
-        hypotheses: Sequence[tuple[str, str | None]],
-    ) -> None:
-        self.model, self.columns, self.hypotheses = model, columns, hypotheses
-        n, maps = model.dimension, model.maps
+@dataclass(frozen=True)
+class Factors:
+    """d (orbit response) / d amount of one error.
+
+    With the slopes' `start`, `pulled` and `readings` (u, p and G) a monitor before a column's
+    corrector changes by seen u + G before, one behind it by seen (u + p) + G (before + behind).
+
+    Attributes:
+        seen: change of what each monitor reads of the launch, [monitor, 2, n].
+        before, behind: change of each column's launch, and of what its kick adds to that, per unit
+            of the column's kick, [column, n].
+    """
+
+    seen: Array
+    before: Array
+    behind: Array
+
+
+class ResponseSlopes:
+    """The derivatives of one response.
+
+    Args:
+        model, correctors: see `derivatives`.
+
+    Attributes:
+        start, pulled: each column's change of the launch per unit, and what its kick adds to that
+            behind it; the RF's last, [column, n].
+        readings: what the monitors read of the launch, [monitor, 2, n].
+        first: the first monitor behind each column's kick; there is none behind the RF's, [column].
+
+    Raises:
+        UnknownNameError, MeasurementError: see `ResponseModel.columns`.
+    """
+
+    def __init__(self, model: ResponseModel, correctors: Sequence[str] | None = None) -> None:
+        self.model = model
+        self.columns = columns = model.columns(correctors)
+        n, at = model.dimension, model.maps.at
         rf = model.rf_start if n == 6 else np.zeros(n)
         self.start = np.vstack([columns.start, rf])
         self.pulled = np.vstack([columns.pulled, np.zeros(n)])
-        after = model.downstream(columns)
-        self.after = np.vstack([after, np.zeros((1, after.shape[1]), dtype=bool)])[:, :, None]
-        self.exits = np.append(columns.layer + 1, 0)
-        # the closing way of the ring is its last layer
-        bends = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])
-        self.bends = second_derivatives(bends)
-        self.curved = np.flatnonzero(bends.any(axis=(1, 2)))
-        self.read_bends = second_derivatives(maps.R2)
-        self.reads_bend = bool(maps.R2.any())
-        self.directions: Directions = directions(model.layers, hypotheses)
+        self.readings = model.reading_slopes
+        self.first = np.append(np.searchsorted(at, columns.layer, side="right"), len(at))
+        self._exits = np.append(columns.layer + 1, 0)
+        self._mixes: dict[Hashable, Quadratic] = {}
 
-    def run(self) -> Iterator[Array]:
-        """The derivative by each hypothesis."""
-        d = self.directions
-        for h, hypothesis in enumerate(self.hypotheses):
-            yield self._one(
-                hypothesis, np.flatnonzero(d.owner == h), np.flatnonzero(d.read_owner == h)
-            )
+    def whole(self, change: Factors) -> Array:
+        """The derivative itself, [column, monitor, 2]: see `derivatives`."""
+        n, shape = self.model.dimension, (len(self.start), *self.readings.shape[:2])
+        seen = np.concatenate([change.seen, self.readings], axis=2).reshape(-1, 2 * n).T
+        out = np.hstack([self.start, change.before]) @ seen
+        behind = np.hstack([self.pulled, change.behind]) @ seen
+        there = np.arange(shape[1]) >= self.first[:, None]
+        return np.asarray(out.reshape(shape) + there[:, :, None] * behind.reshape(shape))
 
-    def _one(
-        self, hypothesis: tuple[str, str | None], rows: NDArray[np.intp], reads: NDArray[np.intp]
-    ) -> Array:
-        model, d, n = self.model, self.directions, self.model.dimension
-        path, C, back, at = model.path, model.tangents, model.inverse, model.maps.at
-        G = model.reading_slopes
-        sources = np.zeros((len(C) - 1, n, n))  # C^-1 (...) C of each layer
-        moved = np.zeros((len(C) - 1, n))  # w of the error's own kicks
-        for r in rows:
-            k = d.layer[r]
-            bent = second_derivatives(d.D2[r][None])[0] @ path[k]
-            sources[k] += back[k + 1] @ (d.D1[r] + bent) @ C[k]
-            moved[k] += back[k + 1] @ (d.D0[r] + (d.D1[r] + bent / 2) @ path[k])
-        own = np.zeros_like(self.pulled)
-        reading = np.zeros_like(G)
-        if np.abs(moved).max() > STILL:
-            launch = np.concatenate([np.zeros((1, n)), np.cumsum(moved, axis=0)])
-            launch += model.closing @ launch[-1]
-            orbit = np.einsum("kij,kj->ki", C, launch)
-            j = self.curved
-            sources[j] += back[j + 1] @ np.einsum("kaij,kj->kai", self.bends[j], orbit[j]) @ C[j]
-            at_corrector = np.einsum("cij,cj->ci", self.columns.slope, orbit[self.columns.layer])
-            own[:-1] += self._pull(at_corrector)
-            if self.reads_bend:
-                reading += np.einsum("maij,mj->mai", self.read_bends, orbit[at]) @ C[at]
-        for r in reads:
-            m = d.monitor[r]
-            bent = second_derivatives(d.E2[r][None])[0] @ path[at[m]]
-            reading[m] += (d.E1[r] + bent) @ C[at[m]]
-        own[:-1] += self._mixed(hypothesis)
+    def factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
+        """The derivative by each hypothesis.
 
-        total = np.concatenate([np.zeros((1, n, n)), np.cumsum(sources, axis=0)])
-        missed = np.einsum("cij,cj->ci", total[self.exits], self.pulled)
-        end = self.start @ total[-1].T + self.pulled @ total[-1].T - missed + own
-        everywhere = end @ model.closing.T
-        carried = G @ total[at] + reading
-        before = np.einsum("mai,ci->cma", carried, self.start, optimize=True)
-        before += np.einsum("mai,ci->cma", G, everywhere, optimize=True)
-        behind = np.einsum("mai,ci->cma", carried, self.pulled, optimize=True)
-        behind += np.einsum("mai,ci->cma", G, own - missed, optimize=True)
-        return np.asarray(before + self.after * behind)
+        Raises:
+            EffectError: an effect that does not act on the ring.
+        """
+        for name, _ in hypotheses:
+            if not isinstance(find(name), RingEffect):
+                raise EffectError(f"'{name}' does not act on the ring; its derivative is not here")
+        return self._factors(hypotheses)
 
-    def _pull(self, kicks: Array) -> Array:
-        """Kicks at the exits of the correctors' layers as changes of the launch."""
-        return np.asarray(
-            np.einsum("cij,cj->ci", self.model.inverse[self.columns.layer + 1], kicks)
-        )
+    def _factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
+        model, d = self.model, directions(self.model.layers, hypotheses)
+        kicks, sources = self._own(d)
+        rows = np.searchsorted(d.owner, np.arange(len(hypotheses) + 1))
+        for h, hypothesis in enumerate(hypotheses):
+            own = slice(*rows[h : h + 2])
+            seen, missed, end = self._stepped(d.layer[own], sources[own])
+            for r in np.flatnonzero(d.read_owner == h):
+                m = d.monitor[r]
+                bent = second_derivatives(d.E2[r][None])[0] @ model.path[model.maps.at[m]]
+                seen[m] += (d.E1[r] + bent) @ model.tangents[model.maps.at[m]]
+            behind = self._mixed(hypothesis) - missed
+            if np.abs(kicks[own]).max(initial=0.0) > STILL:
+                moved = self._moved(d.layer[own], kicks[own])
+                seen, behind, end = seen + moved[0], behind + moved[1], end + moved[2]
+            before = (self.start + self.pulled) @ end.T + behind
+            yield Factors(seen, before @ model.closing.T, behind)
 
-    def _mixed(self, hypothesis: tuple[str, str | None]) -> Array:
+    def _own(self, d: Directions) -> tuple[Array, Array]:
+        """What each row of directions kicks the closed orbit by, [row, n], and by what more it
+        kicks a launch, [row, n, n]; both as changes of the launch."""
+        model = self.model
+        x, back = model.path[d.layer], model.inverse[d.layer + 1]
+        bent = (second_derivatives(d.D2) @ x[:, None, :, None])[..., 0]
+        kick = d.D0 + ((d.D1 + bent / 2) @ x[:, :, None])[..., 0]
+        kicks = (back @ kick[:, :, None])[..., 0]
+        return kicks, back @ (d.D1 + bent) @ model.tangents[d.layer]
+
+    def _stepped(self, layers: NDArray[np.int64], sources: Array) -> tuple[Array, Array, Array]:
+        """Of new kicks S u [row, n, n] in layers: what the monitors see of the launch; what of the
+        columns' own kicks comes too late for them, [column, n]; and their sum, [n, n]."""
+        seen, missed = np.zeros_like(self.readings), np.zeros_like(self.pulled)
+        for k, source in zip(layers, sources, strict=True):
+            behind = np.searchsorted(self.model.maps.at, k, side="right")
+            seen[behind:] += self.readings[behind:] @ source
+            missed += (self._exits > k)[:, None] * (self.pulled @ source.T)
+        return seen, missed, sources.sum(axis=0)
+
+    def _moved(self, layers: NDArray[np.int64], kicks: Array) -> tuple[Array, Array, Array]:
+        """Of an orbit that kicks [row, n] in layers move: what the monitors see of the launch, what
+        that adds to the columns' kicks, [column, n], and the sum of the layers' sources, [n, n]."""
+        fed, seen_by, missed_by, own_by = self._fed
+        everywhere = self.model.closing @ kicks.sum(axis=0)
+        seen, added = seen_by @ everywhere, (own_by - missed_by) @ everywhere
+        end = fed[-1] @ (everywhere + kicks.sum(axis=0))
+        for k, kick in zip(layers, kicks, strict=True):
+            earlier = fed[k + 1] @ kick  # the kick is not there yet
+            behind = np.searchsorted(self.model.maps.at, k, side="right")
+            seen[behind:] += seen_by[behind:] @ kick - self.readings[behind:] @ earlier
+            missed = missed_by @ kick - self.pulled @ earlier.T
+            added -= (self._exits > k)[:, None] * missed
+            added += (self._exits > k + 1)[:, None] * (own_by @ kick)
+            end -= earlier
+        return seen, added, end
+
+    @cached_property
+    def _fed(self) -> tuple[Array, Array, Array, Array]:
+        """What a change of the orbit, as one of the launch (the last axis), makes by feed-down.
+
+        Returns:
+            The sum of C^-1 T''(., C da) C over the layers before each, [layer + 2, n, n, n]; what a
+            monitor sees of a column's launch by it, [monitor, 2, n, n]; what of a column's own kick
+            comes too late for the sum; and what becomes of that kick itself, [column, n, n].
+        """
+        model, maps, n = self.model, self.model.maps, self.model.dimension
+        C, back, columns = model.tangents, model.inverse, self.columns
+        fed = feed_down(model, back, C)
+        G, at = self.readings, maps.at
+        seen = np.einsum("mpa,mabi->mpbi", G, fed[at])
+        if maps.R2.any():
+            bends = second_derivatives(maps.R2)
+            seen += np.einsum("mpxy,mxb,myi->mpbi", bends, C[at], C[at], optimize=True)
+        missed = np.einsum("cabi,cb->cai", fed[self._exits], self.pulled)
+        own = np.zeros((len(self.pulled), n, n))
+        own[:-1] = back[columns.layer + 1] @ columns.slope @ C[columns.layer]
+        return fed, seen, missed, own
+
+    def _mixed(self, hypothesis: Hypothesis) -> Array:
         """What an error in a corrector makes of its own kick, as a change of the launch."""
         model, columns = self.model, self.columns
-        mixed = np.zeros((len(columns.names), model.dimension))
+        mixed = np.zeros_like(self.pulled)
         effect, place = find(hypothesis[0]), hypothesis[1]
         assert isinstance(effect, RingEffect)
         members = effect.members(model.ring, place)
         for c in np.flatnonzero(np.isin(columns.place, members)):
             i, k = int(columns.place[c]), int(columns.layer[c])
-            element, h = model.layers.ring.elements[i], STEP * effect.largest
+            w0, w1, w2 = self._mix(effect, i).after(model.layers.way(k)).reduced()
             x = model.path[k]
+            image = w0 + (w1 + second_derivatives(w2[None])[0] @ x / 2) @ x
+            mixed[c] = model.inverse[k + 1] @ image
+        return mixed
+
+    def _mix(self, effect: RingEffect, place: int) -> Quadratic:
+        """d2 (map of a corrector) / d kick d amount; equal correctors share it."""
+        layers = self.model.layers
+        element, h = layers.ring.elements[place], STEP * effect.largest
+        key = (effect.name, layers.physics(element))
+        if key not in self._mixes:
+            ends = []
             for kick, amount in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 set_to = element.changed(angle=element.angle + kick * KICK)
-                there = effect.changed(set_to, amount * h, model.ring.energy)
-                w0, w1, w2 = model.layers.layer(k, {i: there})[0]
-                image = w0 + (w1 + second_derivatives(w2[None])[0] @ x / 2) @ x
-                mixed[c] += kick * amount * image / (4 * KICK * h)
-        return self._pull(mixed)
+                there = effect.changed(set_to, amount * h, layers.ring.energy)
+                ends.append((kick * amount, layers.map(there)))
+            self._mixes[key] = difference(ends, 4 * KICK * h)
+        return self._mixes[key]

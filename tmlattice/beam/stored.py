@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.feed_down import feed_down
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.effects.directions import Directions, directions_nearby
 from tmlattice.errors import UnstableRingError
@@ -182,19 +183,8 @@ class StoredBeam:
 
     @cached_property
     def _bends(self) -> Array:
-        """P: sources that a change of the closed orbit's launch makes before each exit, summed,
-        [layer + 2, n, n, n]."""
-        model, maps = self.model, self.model.maps
-        W2 = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])
-        j = np.flatnonzero(W2.any(axis=(1, 2)))
-        n = model.dimension
-        each = np.einsum(
-            "kai,kijl,klc,kjb->kabc", self._back[j + 1], second_derivatives(W2[j]),
-            model.tangents[j], self._into[j], optimize=True,
-        )  # fmt: skip
-        summed = np.zeros((len(W2) + 1, n, n, n))
-        summed[j + 1] = each
-        return np.cumsum(summed, axis=0)
+        """P: see `feed_down`."""
+        return feed_down(self.model, self._back, self._into)
 
     def _perturbed(self, whole: Array) -> tuple[Array, ComplexArray]:
         """d tunes and d U at the start, [row, n, mode], for sources of the whole turn."""

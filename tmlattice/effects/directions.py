@@ -22,6 +22,7 @@ from tmlattice.lattice import Element
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
 from tmlattice.maps.magnets import Quadratic, Weights
+from tmlattice.maps.quadratic import difference
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -183,10 +184,7 @@ def _derivative(
     plus, minus = (effect.changed(element, a, energy) for a in (h, -h))
     if plus is minus:  # a corrector's calibration without a kick
         return None
-    up, down = layers.map(plus), layers.map(minus)
-    zero = np.zeros((layers.dimension,) * 3)
-    bends = [zero if m.T is None else m.T for m in (up, down)]
-    return Quadratic(*_slope((up.B, up.R, bends[0]), (down.B, down.R, bends[1]), h))
+    return difference([(1, layers.map(plus)), (-1, layers.map(minus))], 2 * h)
 
 
 def _slope(up: Weights, down: Weights, h: float) -> Weights:

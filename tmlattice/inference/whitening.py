@@ -168,6 +168,8 @@ class Projection:
 
     def out(self, rows: Array) -> Array:
         """Rows [..., row] less what launches explain, the same shape."""
+        if not self.Q.shape[2]:
+            return rows.copy()
         blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
         kept = np.empty_like(blocks)
         for b, Q in enumerate(self.Q):
@@ -186,6 +188,8 @@ class Projection:
 
     def inside(self, rows: Array) -> Array:
         """The square of what launches explain of rows [..., row], [...]."""
+        if not self.Q.shape[2]:
+            return np.zeros(rows.shape[:-1])
         blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
         total = np.zeros(len(blocks))
         for b, Q in enumerate(self.Q):

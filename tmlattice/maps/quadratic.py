@@ -55,6 +55,21 @@ class Quadratic:
         return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
 
 
+def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
+    """The sum of maps with signs, over a step: a derivative by differences.
+
+    Args:
+        ends: signs and maps, one at least.
+        step: of the whole.
+    """
+    signs, maps = zip(*ends, strict=True)
+    B, R = (
+        np.tensordot(signs, np.stack([getattr(m, name) for m in maps]), 1) / step for name in "BR"
+    )
+    bent = [sign * m.T for sign, m in zip(signs, maps, strict=True) if m.T is not None]
+    return Quadratic(B, R, sum(bent) / step if bent else None)
+
+
 FAINT = 3e-4
 """rad; below, OCELOT's map of a bend with k2 has lost a hundredth of its second order to rounding
 (k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large).

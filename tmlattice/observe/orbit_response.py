@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.response_derivatives import derivatives
+from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.lattice import Ring
@@ -331,8 +331,13 @@ class Predicted:
         """d beam's orbit changes / d amount of effects on the ring, m, [column, monitor, 2]."""
         data = self.data
         scale = ((1 + self.errors.calibration) * data.kicks)[:, None, None]
-        for slope in derivatives(self.model, pairs, data.measured.correctors):
-            yield slope[:, data.at] * scale
+        for change in self.response_slopes.factors(pairs):
+            yield self.response_slopes.whole(change)[:, data.at] * scale
+
+    @cached_property
+    def response_slopes(self) -> ResponseSlopes:
+        """Of the linear response, at all of the ring's monitors."""
+        return ResponseSlopes(self.model, self.data.measured.correctors)
 
     def rows(self, effect: str, places: Sequence[str], block: int) -> Array:
         """What the readings of a block do for each error, gains alone, [error, column, monitor]."""
@@ -369,24 +374,34 @@ class Predicted:
             if isinstance(kind, RingEffect):
                 yield self.seen(next(slopes))
             elif isinstance(kind, ReadingEffect):
-                yield self._monitor_slope(kind, self.data.ring[place or ""].name)
+                yield self._read_otherwise(effect, place)
             elif effect == "energy_spread":  # by the square of the amount
                 scale = (1 + self.errors.calibration)[:, None, None] / DELTA**2
                 yield self.seen(scale * self.curved)
             else:
                 raise EffectError(f"'{effect}' does not act on a closed orbit")
 
-    def _monitor_slope(self, effect: ReadingEffect, place: str) -> Array:
-        out = np.zeros_like(self.read)
-        (at,) = [i for i, n in enumerate(self.data.measured.monitors)
-                 if self.data.ring[n].name == place] or (None,)  # fmt: skip
-        if at is None:
-            return out
-        read, nothing = self.read[:, at], np.zeros((1, 2))
+    def _read_otherwise(self, effect: str, place: str | None) -> Array:
+        out, at = np.zeros_like(self.read), self.monitor(place)
+        if at >= 0:
+            out[:, at] = self.monitor_slope(effect, at)
+        return out
+
+    def monitor(self, name: str | None) -> int:
+        """Which of the measured monitors it is; -1 for none of them."""
+        return self._monitors.get(self.data.ring[name or ""].name, -1)
+
+    @cached_property
+    def _monitors(self) -> dict[str, int]:
+        return {self.data.ring[name].name: i for i, name in enumerate(self.data.measured.monitors)}
+
+    def monitor_slope(self, name: str, at: int) -> Array:
+        """d reading / d amount of an effect on one of the measured monitors, m, [column, 2]."""
+        effect, read, nothing = find(name), self.read[:, at], np.zeros((1, 2))
+        assert isinstance(effect, ReadingEffect)
         steps = (1.0, 0.0) if effect.discrete else (SMALL * effect.largest, -SMALL * effect.largest)
         up, down = (effect.change(read, h) - effect.change(nothing, h) for h in steps)
-        out[:, at] = (up - down) / (steps[0] - steps[1])
-        return out
+        return np.asarray((up - down) / (steps[0] - steps[1]))
 
     def with_causes(self, causes: Sequence[Cause]) -> "Predicted":
         """The same with more causes, not linearised."""

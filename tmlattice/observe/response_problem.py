@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, find, modelled
-from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.metric import Hypothesis, Metric
+from tmlattice.inference.problem import Point
 from tmlattice.observe.orbit_response import Predicted, ResponseData
+from tmlattice.observe.response_metric import ResponseMetric
 from tmlattice.observe.steady import NOTHING, Steady
 
 Array = NDArray[np.float64]
@@ -93,6 +95,10 @@ class Response(Steady):
         for row, slope in zip(out, view.signatures(hypotheses), strict=True):
             row[:] = slope
         return out
+
+    def metric(self, point: Point) -> Metric:
+        """Through factors."""
+        return ResponseMetric(self, point)
 
     @property
     def monitors(self) -> Sequence[str]:

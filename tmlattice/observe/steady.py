@@ -112,7 +112,7 @@ class Steady(Problem):
 
     def metric(self, point: Point) -> Metric:
         """Every signature in closed form."""
-        return _SteadyMetric(self, point)
+        return SteadyMetric(self, point)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """A stored beam is linear enough in all of them."""
@@ -143,7 +143,9 @@ class Steady(Problem):
         return replace(self, used=self.used & ~dropped)
 
 
-class _SteadyMetric(Metric):
+class SteadyMetric(Metric):
+    """Products about one point, signatures as the kind gives them."""
+
     def __init__(self, problem: Steady, point: Point) -> None:
         assert point.projection is not None
         super().__init__(point.projection)
@@ -151,6 +153,7 @@ class _SteadyMetric(Metric):
         self.chunk = int(np.clip(ROOM // max(problem.used.size, 1), 1, 512))
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
+        """See `Metric.rows`."""
         point = self.point
         return self.problem.as_rows(
             self.problem.signatures(point.view, point.nuisances, hypotheses)

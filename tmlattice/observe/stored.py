@@ -205,7 +205,7 @@ class Stored(Steady):
         """Monitors' errors and all."""
         matrix, constant = view.monitors.matrix(), view.monitors.constant()
         shown = self.counted([b.shown for b in view.beams], view.monitors.late)
-        return self.told([_seen(one, matrix, constant) for one in shown], nuisances)
+        return self.told([seen_by(one, matrix, constant) for one in shown], nuisances)
 
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
         """Effects on the ring in closed form, those of monitors by differences."""
@@ -218,7 +218,7 @@ class Stored(Steady):
             known: dict[int, Moved] = {}
             for beam in view.beams:
                 if id(beam) not in known:
-                    known[id(beam)] = _seen(beam.moved(some), matrix)
+                    known[id(beam)] = seen_by(beam.moved(some), matrix)
             moved = self.counted([known[id(beam)] for beam in view.beams], view.monitors.late)
             out[on_ring] = self.told(moved, nuisances)
         place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
@@ -226,18 +226,18 @@ class Stored(Steady):
             effect = find(name)
             if isinstance(effect, ReadingEffect):
                 own = [i for i, h in enumerate(hypotheses) if h[0] == name]
-                changed = self._of_monitors(view, nuisances, effect)
+                changed = self.of_monitors(view, nuisances, effect)
                 for i in own:
                     mine = self.read_by == place[hypotheses[i][1] or ""]
                     out[i][mine] = changed[mine]
         return out
 
-    def _of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
+    def of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
         """d readings / d amount of an effect on top, every monitor's own."""
         own = self.counted([b.shown for b in view.beams], view.monitors.late)
         if effect.of_turns:
             matrix = view.monitors.matrix()
-            return self.told([_seen(one, matrix) for one in self.a_turn_on(own)], nuisances)
+            return self.told([seen_by(one, matrix) for one in self.a_turn_on(own)], nuisances)
         high = 1.0 if effect.discrete else SMALL * effect.largest
         low = 0.0 if effect.discrete else -high
         ends = []
@@ -248,10 +248,12 @@ class Stored(Steady):
             ends.append((monitors.matrix(), monitors.constant()))
         (upper, up), (lower, down) = ends
         slope, constant = ((a - b) / (high - low) for a, b in ((upper, lower), (up, down)))
-        return self.told([_seen(one, slope, constant, tunes=0.0) for one in own], nuisances)
+        return self.told([seen_by(one, slope, constant, tunes=0.0) for one in own], nuisances)
 
 
-def _seen(shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0) -> Moved:
+def seen_by(
+    shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0
+) -> Moved:
     """What monitors make of it."""
     orbit, modes = shown.orbit + constant, shown.modes
     wrong = np.flatnonzero((matrix != np.eye(2)).any(axis=(1, 2)))

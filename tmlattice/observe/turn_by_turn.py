@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from tmlattice.beam.stored import Moved
 from tmlattice.effects import Settings, find
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.metric import Metric
 from tmlattice.inference.problem import Hypothesis, Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
 from tmlattice.observe.stored import Beams, Stored, rf_of, stacked
+from tmlattice.observe.stored_metric import TurnsMetric
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -86,6 +88,10 @@ class ManyTurns(Stored):
         left = self.as_rows(self.data - self.read(view, nothing))
         solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
         return np.asarray(solved.reshape(nothing.shape))
+
+    def metric(self, point: Point) -> Metric:
+        """By changes of the modes."""
+        return TurnsMetric(self, point)
 
     def left(self, point: Point) -> tuple[Array, Array]:
         """A line is no single reading: none is left out alone."""

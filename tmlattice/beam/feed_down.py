@@ -1,0 +1,33 @@
+"""What a moved closed orbit makes of the matrices behind it."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.maps.taylor import second_derivatives
+
+Array = NDArray[np.float64]
+
+
+def feed_down(
+    model: ResponseModel, back: NDArray[np.floating[Any]], into: NDArray[np.floating[Any]]
+) -> Array:
+    """Sources C^-1 T''(., C da) C that a change da of the closed orbit's launch makes before each
+    exit, summed, [layer + 2, n, n, n], da the last axis.
+
+    Args:
+        model: closed orbit, maps and matrices.
+        back, into: matrices from the layers' exits to the start and from there into the layers, of
+            whatever moves about the closed orbit, [layer + 2, n, n].
+    """
+    maps, n = model.maps, model.dimension
+    W2 = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])  # the closing way too
+    j = np.flatnonzero(W2.any(axis=(1, 2)))
+    summed = np.zeros((len(W2) + 1, n, n, n))
+    summed[j + 1] = np.einsum(
+        "kai,kijl,klc,kjb->kabc", back[j + 1], second_derivatives(W2[j]), model.tangents[j],
+        into[j], optimize=True,
+    )  # fmt: skip
+    return np.cumsum(summed, axis=0)

@@ -1,0 +1,168 @@
+"""Products of an orbit response's signatures, which are never written out.
+
+What an error of the ring does to a response is a few numbers a column and a few a monitor
+(`beam.response_derivatives.Factors`). So its product with data is that of these numbers with sums
+over the data that are taken once; its square is summed up reading by reading, each with its own
+weight. An error of a monitor is in that monitor's readings alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
+from tmlattice.beam.response_squares import squares
+from tmlattice.effects import ReadingEffect, RingEffect, find
+from tmlattice.inference.metric import Hypothesis, Indices, Products
+from tmlattice.observe.orbit_response import Predicted
+from tmlattice.observe.steady import SteadyMetric
+
+Array = NDArray[np.float64]
+
+AT_ONCE = 128
+"""Errors whose factors are held at a time: 17 MB for 330 correctors and 246 monitors."""
+
+
+class ResponseMetric(SteadyMetric):
+    """About one point of a `Response`, which has no nuisances."""
+
+    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
+        """Errors of the ring and of monitors."""
+        kinds = [find(name) for name, _ in hypotheses]
+        on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
+        if len(on_ring):
+            self._on_ring(hypotheses, on_ring, data, found)
+        of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
+        if len(of_monitors):
+            self._of_monitors(hypotheses, of_monitors, data, found)
+        return np.concatenate([on_ring, of_monitors])
+
+    def _on_ring(
+        self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
+    ) -> None:
+        """Through their factors."""
+        here = _Here(self.point.view, self.problem.used, self.problem.sigma)
+        sums = here.sums(data)
+        factors = here.slopes.factors([hypotheses[i] for i in which])
+        for start in range(0, len(which), AT_ONCE):
+            part = which[start : start + AT_ONCE]
+            some = here.read([next(factors) for _ in part])
+            found.put(part, here.squares(some), 0.0, some.products(sums))
+
+    def _of_monitors(
+        self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
+    ) -> None:
+        """Monitor by monitor: of each the errors have its rows in common."""
+        used, row = self.problem.used, np.zeros(self.problem.used.shape, dtype=np.intp)
+        row[used] = np.arange(np.count_nonzero(used))
+        places = np.array([self.point.view.monitor(hypotheses[i][1]) for i in which])
+        for at in np.unique(places[places >= 0]):
+            own = which[places == at]
+            there = used[:, at]
+            slopes = [self.point.view.monitor_slope(hypotheses[i][0], at) for i in own]
+            rows = (np.stack(slopes) / self.problem.sigma[at])[:, there]
+            inner = rows @ data[:, row[:, at][there]].T
+            found.put(own, np.einsum("hr,hr->h", rows, rows), 0.0, inner)
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """Factors of many, stacked, with `seen` as measured monitors tell it in units of the noise; or
+    sums over data, of which products with those are products of signatures with the data.
+
+    Attributes:
+        seen, before, behind: see `Factors`, [many, ...].
+    """
+
+    seen: Array
+    before: Array
+    behind: Array
+
+    def products(self, sums: "_Stack") -> Array:
+        """[error, data]."""
+        pairs = (
+            (self.seen, sums.seen), (self.before, sums.before), (self.behind, sums.behind),
+        )  # fmt: skip
+        return np.asarray(sum(a.reshape(len(a), -1) @ b.reshape(len(b), -1).T for a, b in pairs))
+
+
+@dataclass(frozen=True)
+class _Here:
+    """A response with its monitors' errors and its columns' steps, in units of the noise.
+
+    Attributes:
+        view: the response.
+        used: readings that are fitted, [column, monitor, 2].
+        sigma: noise, m, [monitor, 2].
+    """
+
+    view: Predicted
+    used: NDArray[np.bool_]
+    sigma: Array
+
+    @property
+    def slopes(self) -> ResponseSlopes:
+        """Of the beam's orbit by a unit of each column."""
+        return self.view.response_slopes
+
+    @cached_property
+    def scale(self) -> Array:
+        """Of the columns, [column]."""
+        return (1 + self.view.errors.calibration) * self.view.data.kicks
+
+    @cached_property
+    def first(self) -> NDArray[np.intp]:
+        """The first of the measured monitors behind each column's kick, [column]."""
+        return np.searchsorted(self.view.data.at, self.slopes.first)
+
+    def seen(self, slopes: Array) -> Array:
+        """What the measured monitors tell, in noise, of orbits at all [..., monitor, 2, n]."""
+        own = self.view.errors.monitors / self.sigma[:, :, None]
+        return np.asarray(own @ slopes[..., self.view.data.at, :, :])
+
+    @cached_property
+    def readings(self) -> Array:
+        """What they tell of the launch, [monitor, 2, n]."""
+        return self.seen(self.slopes.readings)
+
+    def read(self, changes: Sequence[Factors]) -> _Stack:
+        """As the measured monitors tell them."""
+        seen = self.seen(np.stack([change.seen for change in changes]))
+        before, behind = (
+            np.stack([getattr(change, name) for change in changes]) for name in ("before", "behind")
+        )
+        return _Stack(seen, before, behind)
+
+    def sums(self, data: Array) -> _Stack:
+        """Of data [data, row]."""
+        n, columns = self.readings.shape[2], len(self.scale)
+        G = self.readings.reshape(-1, n)
+        behind = np.repeat(np.arange(len(self.readings)) >= self.first[:, None], 2, axis=1)
+        seen = np.empty((len(data), len(G), n))
+        before, added = np.empty((2, len(data), columns, n))
+        whole = np.zeros(self.used.shape)
+        for d, row in enumerate(data):
+            whole[self.used] = row
+            D = whole.reshape(columns, -1) * self.scale[:, None]
+            late = np.where(behind, D, 0.0)
+            seen[d] = D.T @ self.slopes.start + late.T @ self.slopes.pulled
+            before[d], added[d] = D @ G, late @ G
+        return _Stack(seen, before, added)
+
+    def squares(self, some: _Stack) -> Array:
+        """Of signatures, [error]."""
+        slopes, n = self.slopes, self.readings.shape[2]
+        seen = some.seen.reshape(len(some.seen), -1, n)
+        return np.asarray(
+            squares(
+                np.ascontiguousarray(np.moveaxis(seen, 2, 1)),
+                np.ascontiguousarray(self.readings.reshape(-1, n).T),
+                np.stack([slopes.start, slopes.start + slopes.pulled]),
+                np.stack([some.before, some.before + some.behind]),
+                2 * self.first,
+                self.used.reshape(len(self.scale), -1) * self.scale[:, None] ** 2,
+            )
+        )
