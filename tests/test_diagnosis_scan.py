@@ -12,7 +12,7 @@ from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.inference import scan as scanning
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import fit
-from tmlattice.inference.rivals import _linear_evidence
+from tmlattice.inference.rivals import linear_evidence
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import simulate
 from tmlattice.observe.data import of_measurement
@@ -155,7 +155,7 @@ def test_evidence_by_the_scan_differs_between_places_as_that_of_the_refits(small
     base = Base(small_ring, [fault], settings=[{}] * 3, amplitude=1e-4, noise=2e-6)
     problem = replace(base.problem, places={"quadrupole_gradient": 16})
     found = base.scan([("quadrupole_gradient", f"QD::{k}") for k in range(16)], effective=16.0)
-    linear = _linear_evidence(problem, found)
+    linear = linear_evidence(problem, found)
     seen = np.flatnonzero(found.statistic > 1.5)  # of what is not seen the scan knows no amount
     assert found.statistic[seen].max() > 10 * found.statistic[seen].min()
     refitted = [
