@@ -176,6 +176,12 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
             "there is no RF step: dispersion is not known, and only what is usual tells the scale "
             "of all correctors from that of all monitors"
         )
+    for plane in (p for p in "xy" if p not in measured.planes):
+        said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")
+    if not np.isfinite(data.pick(data.orbits, 1)[:-1]).any():
+        said.append(
+            "no corrector is read in the other plane: rolls and skew gradients are not known"
+        )
     return said
 
 

@@ -291,7 +291,7 @@ def log_evidence(state: State, good: Flags) -> float:
     """Of what is fitted, of the readings of some monitors, both blocks, what the model lacks and
     the priors at their likeliest; up to a constant of the data."""
     total = 0.0
-    for block in (0, 1):
+    for block in (block for block in (0, 1) if state.reads(block)):
         state = replace(look(state, block), good=good)
         weights = weight(state, block)
         use = weights > 0

@@ -69,6 +69,11 @@ class State:
         """Families of a block."""
         return tuple(family for family in self.families if family.block == block)
 
+    def reads(self, block: int) -> bool:
+        """Whether correctors that are fitted have readings of a block."""
+        orbits = self.data.pick(self.data.orbits, block)
+        return bool(np.isfinite(orbits[self.fitted][:, self.good]).any())
+
     def allows(self, name: str) -> bool:
         """Whether a family is in the fit."""
         return any(family.name == name for family in self.families)

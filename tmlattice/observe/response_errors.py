@@ -27,6 +27,10 @@ USUAL = 0.01
 """Mean square of what the usual errors leave of a column, in units of the column's own: a tenth."""
 GAIN = 2.5
 """Log of the misfit that each of the changed columns has to lose in the mean."""
+OF_RF = 1.4
+"""The same of the RF's one orbit, whose size the ring's length gives whatever its errors."""
+STRANGERS, RESEMBLING = 1.5, 0.5
+"""Or: typical misfits before and after, of columns that were strangers and resemble the design."""
 COLUMNS = 2
 """At least, that an assumption about correctors or monitors changes: one may be a bad corrector."""
 SHARE = 0.8
@@ -119,8 +123,10 @@ class ResponseJudge:
             few = moved.sum() < COLUMNS and not names[0].startswith("rf")
             if moved.any() and not few and (change[moved] < 0).mean() >= SHARE:
                 gain = -float(change[moved].sum())
-                if gain > GAIN * moved.sum():
-                    before, after = (float(np.median(own[moved])) for own in (stated, other))
+                before, after = (float(np.median(own[moved])) for own in (stated, other))
+                mended = before > STRANGERS and after < RESEMBLING
+                least = OF_RF if names[0].startswith("rf") else GAIN
+                if mended or gain > least * moved.sum():
                     found.append(ResponseVerdict(names, gain, before, after))
         if not found:
             return None

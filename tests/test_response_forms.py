@@ -1,0 +1,61 @@
+"""Orbit responses that lack what others have: a plane, the other plane's readings, the RF's step."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import diagnose
+from tmlattice.effects import Cause
+from tmlattice.machine.response import simulate_response
+
+GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
+
+
+@pytest.fixture(scope="module")
+def whole(small_ring):
+    causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
+    causes.append(Cause("corrector_calibration", "v2", 0.1))
+    return simulate_response(
+        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
+        progress=False, seed=3,
+    ).measured  # fmt: skip
+
+
+def in_plane_alone(data):
+    response = data.response.copy()
+    for c, plane in enumerate(data.planes):
+        response[c, :, "yx".index(plane)] = np.nan
+    return replace(data, response=response)
+
+
+def of_plane(plane):
+    def only(data):
+        names = [n for n, p in zip(data.correctors, data.planes, strict=True) if p == plane]
+        return in_plane_alone(data.select(correctors=names))
+
+    return only
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (in_plane_alone, "no corrector is read in the other plane"),
+        (of_plane("y"), "no corrector kicks in x"),
+    ],
+    ids=["in-plane readings alone", "y alone"],
+)
+def test_a_response_of_less_is_fitted_and_says_what_is_not_known(
+    small_ring, whole, tmp_path, made, said
+):
+    effects = ["corrector_calibration", "quadrupole_gradient", "monitor_roll", "skew_gradient"]
+    found = diagnose(small_ring, made(whole), effects=effects, seed=1)
+    assert any(said in sentence for sentence in found.warnings), found.warnings
+    last = found.steps[-1]
+    assert last.heldout_rms_in_plane < 3e-8
+    assert np.isnan(last.heldout_rms_coupling)
+    found.save(tmp_path / "found")
+    text = (tmp_path / "found" / "report.txt").read_text()
+    assert "nan" not in text, text
+    json.loads((tmp_path / "found" / "diagnosis.json").read_text())
