@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
+from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.response import assumed_of
+from tmlattice.diagnosis.strangers import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import response_data, split_columns
 
 GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
 
@@ -59,3 +64,27 @@ def test_a_response_of_less_is_fitted_and_says_what_is_not_known(
     text = (tmp_path / "found" / "report.txt").read_text()
     assert "nan" not in text, text
     json.loads((tmp_path / "found" / "diagnosis.json").read_text())
+
+
+def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole):
+    """Of a real ring with two of its 24 monitors reversed 93 µm were left instead of 0.7."""
+    response, orbit = whole.response.copy(), whole.rf.orbit.copy()
+    for readings in (response, orbit):
+        readings[..., 7, :] *= -1
+        readings[..., 20, 1] *= -1
+    response[3] *= -1
+    data = replace(whole, response=response, rf=replace(whole.rf, orbit=orbit))
+    split = split_columns(response_data(small_ring, data), 0.2, np.random.default_rng(1))
+    fit = fit_steps(response_data(small_ring, data), split, STEPS[:3])
+    assert fit.steps[-1].heldout_rms_in_plane < 3e-8
+    assert reversed_ones(fit.state) == [
+        "monitors that read with the wrong sign: "
+        f"{data.monitors[7]} in x, {data.monitors[7]} in y, {data.monitors[20]} in y",
+        f"correctors that kick with the wrong sign: {data.correctors[3]}",
+    ]
+
+
+def test_monitors_in_any_order_have_the_noise_that_they_have(small_ring, whole):
+    order = np.random.default_rng(2).permutation(len(whole.monitors))
+    data = whole.select(monitors=[whole.monitors[i] for i in order])
+    assert assumed_of(data, response_data(small_ring, data)) == []

@@ -35,7 +35,7 @@ from tmlattice.diagnosis.odd_readings import odd_readings
 from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.diagnosis.state import begin
-from tmlattice.diagnosis.strangers import strangers
+from tmlattice.diagnosis.strangers import reversed_ones, strangers
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -170,7 +170,7 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
             f"{x} in x and {y} in y (a jitter of the beam is not in it)"
         )
     else:
-        said += _understated(measured, data)
+        said += _understated(data)
     if measured.rf is None or measured.rf.orbit is None:
         said.append(
             "there is no RF step: dispersion is not known, and only what is usual tells the scale "
@@ -185,8 +185,9 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
     return said
 
 
-def _understated(measured: OrbitResponse, data: ResponseData) -> list[str]:
+def _understated(data: ResponseData) -> list[str]:
     """Where the readings scatter by far more than the noise that is stated."""
+    measured = data.measured  # in beam order
     if measured.noise is None:
         return []
     try:
@@ -317,7 +318,7 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    return (*said, *odd_readings(fit.state))
+    return (*reversed_ones(fit.state), *said, *odd_readings(fit.state))
 
 
 def _misfit(fit: DenseFit, read: Array) -> Misfit:
