@@ -2,10 +2,10 @@
 
 A measured ring is changed in a way whose outcome is known: fewer correctors, a monitor dead, the
 lattice without names, a unit wrong. Each variant is diagnosed with default options as any other
-ring; where the diagnosis stops and names what to assume, it goes on with that. Told are what stopped
-it, the seconds, the held-out rms in plane, in the other and of the RF's orbit, micrometres, over the
-untouched ring's in brackets, and what it said that it did not say of the untouched ring. A
-traceback is an error of the program, and ends in the table as one.
+ring; where the diagnosis stops and names what to assume, it goes on with that. Told are what
+stopped it, the seconds, the held-out rms in plane, in the other and of the RF's orbit, micrometres,
+over the untouched ring's in brackets, and what it said that it did not say of the untouched ring.
+A traceback is an error of the program, and ends in the table as one.
 
 `--variant NAME` (any number of them) takes some of them; `--seed N` another draw and split; a ring
 may be a folder that `tmlattice import` wrote.
@@ -443,9 +443,7 @@ VARIANTS: dict[str, Callable[[Case, Rng], Case]] = {
 
 
 # --- the trial ------------------------------------------------------------------------------------
-def tried(
-    make: Callable[[], Case], seed: int, assumed: tuple[str, ...] = ()
-) -> dict[str, Any]:
+def tried(make: Callable[[], Case], seed: int, assumed: tuple[str, ...] = ()) -> dict[str, Any]:
     """What comes of a case; a second time with what the first asks to assume."""
     begun = time.process_time()
     try:

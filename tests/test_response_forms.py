@@ -1,4 +1,4 @@
-"""Orbit responses that lack what others have: a plane, the other plane's readings, the RF's step."""
+"""Orbit responses that lack what others have, a plane or its readings, or have wrong signs."""
 
 import json
 from dataclasses import replace

@@ -261,8 +261,9 @@ def one_by_one(
 ) -> Iterator[tuple[Trial, State]]:
     """The state with one trial's families after another, each fitted beside those before it;
     without those that the ring has no places of, or the measurement no readings."""
-    for trial in trials:
-        trial = replace(trial, families=tuple(f for f in trial.families if state.reads(f.block)))
+    for given in trials:
+        told = tuple(family for family in given.families if state.reads(family.block))
+        trial = replace(given, families=told)
         if not any(family.count(state.data) for family in trial.families):
             continue
         progress(_title(trial))

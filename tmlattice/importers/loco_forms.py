@@ -40,9 +40,9 @@ def usual_form(content: Fields, energy: float | None = None) -> tuple[dict[str, 
     for name in ("LocoMeasData", "BPMData", "CMData", "LocoFlags", "RINGData"):
         if isinstance(new.get(name), Mapping | list):
             new[name] = dict(_first(new[name])) or new[name]
-    data, monitors, correctors = (new.get(n) for n in ("LocoMeasData", "BPMData", "CMData"))
-    whole = all(isinstance(one, dict) for one in (data, monitors, correctors, new.get("RINGData")))
-    if not whole:
+    needed = [new.get(n) for n in ("LocoMeasData", "BPMData", "CMData", "RINGData")]
+    data, monitors, correctors, _ = (own if isinstance(own, dict) else {} for own in needed)
+    if not all(isinstance(own, dict) for own in needed):
         return new, said
     if isinstance(new.get("LocoFlags"), dict):
         new["LocoFlags"] = {k: v for k, v in new["LocoFlags"].items() if np.size(v)}
@@ -90,7 +90,11 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         return
     turn = LIGHT / sum(lengths)
     cavities = [e for e in elements if _is_cavity(e)]
-    frequencies = [data.get("RF"), ring.get("CavityFrequency"), *(e.get("Frequency") for e in cavities)]
+    frequencies = [
+        data.get("RF"),
+        ring.get("CavityFrequency"),
+        *(e.get("Frequency") for e in cavities),
+    ]
     frequencies = [own for own in frequencies if is_number(own) and own > 0]
     harmonics = [ring.get("CavityHarmNumber"), *(e.get("HarmNumber") for e in cavities)]
     harmonics = [own for own in harmonics if is_number(own) and own > 0]
@@ -101,7 +105,7 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         frequencies = [harmonics[0] * turn]
         said.append(f"no frequency is given: {frequencies[0]:.9g} Hz, by harmonic and length")
     if harmonics and frequencies:
-        _frequency(data, ring, frequencies, harmonics[0] * turn, said)
+        _frequency(data, frequencies, harmonics[0] * turn, said)
         ring.setdefault("CavityHarmNumber", harmonics[0])
     for cavity in cavities:
         if harmonics and frequencies:
@@ -122,14 +126,12 @@ def _is_cavity(element: Fields) -> bool:
 
 
 def _frequency(
-    data: dict[str, Any], ring: Fields, given: Sequence[float], expected: float, said: list[str]
+    data: dict[str, Any], given: Sequence[float], expected: float, said: list[str]
 ) -> None:
-    """`RF` in Hz: one that the ring can have, where there is one."""
-    if is_number(ring.get("CavityHarmNumber")) or len(given) > 1:
-        fits = [f for own in given for f in (own, 1e6 * own) if abs(f / expected - 1) < SAME_RF]
-        if fits and fits[0] != given[0]:
-            said.append(f"an RF of {given[0]:g} Hz is not this ring's: {fits[0]:.9g} Hz is taken")
-            data["RF"] = fits[0]
+    """`RF` in Hz."""
+    if abs(1e6 * given[0] / expected - 1) < SAME_RF:
+        said.append(f"an RF of {given[0]:g} Hz would be that of another ring: it is taken in MHz")
+        data["RF"] = 1e6 * given[0]
     data.setdefault("RF", given[0])
 
 
@@ -189,9 +191,7 @@ def _count(structure: Fields, letter: str, kind: str) -> int:
 
 
 # --- shapes ---------------------------------------------------------------------------------------
-def _shapes(
-    data: dict[str, Any], monitors: Fields, correctors: Fields, said: list[str]
-) -> None:
+def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: list[str]) -> None:
     """`M`, `Eta` and `BPMSTD` of all monitors, x then y, in one row."""
     x, y = (_count(monitors, letter, "BPM") for letter in "HV")
     shape = x + y, sum(_count(correctors, letter, "CM") for letter in "HV")
@@ -209,7 +209,7 @@ def _shapes(
         given = _array(data.get(name))
         if given is None or given.size in (0, 1):
             continue
-        if name == "BPMSTD" and given.ndim == 2 and given.shape == np.shape(data.get("M")):
+        if name == "BPMSTD" and given.ndim == 2 and given.shape == np.shape(data.get("M", ())):
             given = np.sqrt(np.nanmean(given**2, axis=1))
             said.append("BPMSTD is of every entry of M: the rms of each monitor is taken")
         given = given.ravel(order="F" if given.shape != (2, x) else "C")  # x, then y
@@ -245,6 +245,8 @@ def _array(value: Any) -> Array | None:
     """As numbers, if it is some."""
     try:
         array = np.atleast_1d(np.asarray(value))
-        return array.astype(float) if array.dtype.kind in "fiub" or isinstance(value, list) else None
+        return (
+            array.astype(float) if array.dtype.kind in "fiub" or isinstance(value, list) else None
+        )
     except (TypeError, ValueError):
         return None
