@@ -38,7 +38,8 @@ HEAD = ("step", "parameters", "in-plane", "with jump", "coupling", "with roll", 
 
 
 HYPOTHESIS = (
-    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "so",
+    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "random",
+    "so",
 )  # fmt: skip
 
 
@@ -54,6 +55,7 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
             f"{1e6 * row.heldout_rms_in_plane:.3g}",
             f"{1e6 * row.heldout_rms_position:.3g}",
             f"{1e6 * row.on_top_in_plane:.3g}",
+            "" if row.control_in_plane is None else micrometres(row.control_in_plane),
             row.judgement,
         )
         for row in result.hypotheses or ()
