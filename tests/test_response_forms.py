@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tmlattice import diagnose
+from tmlattice.diagnosis import few
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.hypotheses import HYPOTHESES
@@ -14,6 +16,7 @@ from tmlattice.diagnosis.missing import control, weigh
 from tmlattice.diagnosis.response import assumed_of
 from tmlattice.diagnosis.strangers import reversed_ones
 from tmlattice.effects import Cause
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data, split_columns
 
@@ -109,3 +112,17 @@ def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, mo
     none, own = weigh(fitted, ["orbit_drift"])
     assert own.judgement == "excluded"
     assert own.evidence < 0
+
+
+def test_no_causes_are_sought_of_kicks_beyond_all_measure(small_ring, whole, monkeypatch):
+    """A ring with all gradients 1 % off had its tunes mended by kicks of centimetres' orbit, for
+    100 s, before anything was fitted."""
+    data = response_data(small_ring, whole)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    seen = SimpleNamespace(
+        statistic=np.array([1e12]), amount=np.array([1e-2]), hypotheses=[("corrector_kick_x", "h1")]
+    )
+    monkeypatch.setattr(few, "scan", lambda *_, **__: seen)
+    monkeypatch.setattr(few, "_beyond", lambda *_: 1e12)
+    monkeypatch.setattr(few, "explain", lambda *_: pytest.fail("a search was begun"))
+    assert few.few_causes(data, split, None, 10, DEFAULT) is None

@@ -124,8 +124,8 @@ def weigh(
                 left.remove(best)
 
     told = [
-        i for i, answer in enumerate(alone)
-        if random[i] is None or answer.in_plane < HELPS * random[i]
+        i for i, (answer, rms) in enumerate(zip(alone, random, strict=True))
+        if rms is None or answer.in_plane < HELPS * rms
     ]  # fmt: skip
     helpers = [i for i in told if _helps(found[i], alone[i], base)]
     take(helpers)
@@ -137,8 +137,8 @@ def weigh(
     }
     before = together
     take([i for i, answer in on_top.items() if i in told and _helps(found[i], answer, before)])
-    rms = base.in_plane, base.position, together.in_plane, together.position
-    out = [Weighed("none", "", "", 0, 0.0, 0.0, *rms, 0.0, None, "")]
+    four = base.in_plane, base.position, together.in_plane, together.position
+    out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
     for i, hypothesis in enumerate(found):
         beside = together if i in chosen else on_top[i]
         if i in chosen:
