@@ -13,6 +13,7 @@ from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.missing import control, weigh
+from tmlattice.diagnosis.odd_readings import without_gross
 from tmlattice.diagnosis.response import assumed_of
 from tmlattice.diagnosis.strangers import reversed_ones
 from tmlattice.effects import Cause
@@ -126,3 +127,20 @@ def test_no_causes_are_sought_of_kicks_beyond_all_measure(small_ring, whole, mon
     monkeypatch.setattr(few, "_beyond", lambda *_: 1e12)
     monkeypatch.setattr(few, "explain", lambda *_: pytest.fail("a search was begun"))
     assert few.few_causes(data, split, None, 10, DEFAULT) is None
+
+
+def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_ring, whole, rng):
+    """Of SPEAR3 with 0.3 % of its readings gone wrong 880 µm were left in the other plane."""
+    response = whole.response.copy()
+    response[..., 7, :] *= -1
+    response[3] *= -1
+    there = response_data(small_ring, replace(whole, response=response))
+    assert without_gross(there.measured, there) == (there.measured, [])
+    places = [(2, 5, 0), (2, 9, 1), (11, 20, 1), (14, 30, 0)]
+    for place in places:
+        response[place] += 20 * np.nanstd(response)
+    data = replace(whole, response=response)
+    measured, (said,) = without_gross(data, response_data(small_ring, data))
+    assert said.endswith(f"left out: 4; most at {whole.correctors[2]} (2)")
+    gone = np.isnan(measured.response) & np.isfinite(response)
+    assert [tuple(place) for place in np.argwhere(gone)] == places

@@ -31,7 +31,7 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
-from tmlattice.diagnosis.odd_readings import odd_readings
+from tmlattice.diagnosis.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.diagnosis.state import begin
@@ -95,6 +95,9 @@ def diagnose_response(
     measured = mended(ring, measured, assume)
     trials, data = trials_of(effects), response_data(ring, measured)
     said = [*consulted(ring, measured), *assumed_of(measured, data)]
+    measured, gross = without_gross(measured, data)
+    if gross:
+        said, data = said + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
