@@ -212,6 +212,7 @@ RESPONSE = {
     "kicks-reversed": "kicks-reversed",
     "kicks-in-mrad": None,
     "kicks-doubled": "kicks-halved",
+    "kicks-in-krad": "kicks-in-mrad",
     "correctors-shifted=1": "correctors-shifted=-1",
     "monitors-shifted=1": "monitors-shifted=-1",
     "rf-reversed": "rf-reversed",
@@ -229,6 +230,27 @@ def test_what_is_wrong_everywhere_in_an_orbit_response_is_named(small_ring, step
     (check,) = told(check_data(small_ring, data))
     assert name in check.assume or f"--assume {name}" in check.sentence
     assert check_data(small_ring, data, assumed=check.assume).told == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("kicks-halved", lambda d: replace(d, kicks=2 * d.kicks)),
+        ("kicks-doubled", lambda d: replace(d, kicks=d.kicks / 2)),
+        ("kicks-in-krad", lambda d: replace(d, kicks=1e-3 * d.kicks)),
+        ("readings-in-mm", lambda d: replace(d, response=1e3 * d.response, noise=None)),
+    ],
+    ids=lambda own: own if isinstance(own, str) else "",
+)
+def test_a_scale_is_named_of_a_ring_far_from_its_design(small_ring, steps, name, change):
+    """Columns of the Siam ring are 44 % off its design."""
+    rng = np.random.default_rng(5)
+    size = np.sqrt(np.nanmean(steps.response**2, axis=(1, 2)))[:, None, None]
+    far = steps.response + 0.45 * size * rng.standard_normal(steps.response.shape)
+    far = replace(steps, response=far, rf=None)
+    assert told(check_data(small_ring, far)) == []
+    checks = told(check_data(small_ring, change(far)))
+    assert any(name in check.sentence for check in checks), checks
 
 
 def test_a_bad_corrector_or_monitor_is_no_global_error(small_ring, steps):

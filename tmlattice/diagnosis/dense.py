@@ -260,8 +260,10 @@ def one_by_one(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
 ) -> Iterator[tuple[Trial, State]]:
     """The state with one trial's families after another, each fitted beside those before it;
-    without those that the ring has no places of."""
-    for trial in trials:
+    without those that the ring has no places of, or the measurement no readings."""
+    for given in trials:
+        told = tuple(family for family in given.families if state.reads(family.block))
+        trial = replace(given, families=told)
         if not any(family.count(state.data) for family in trial.families):
             continue
         progress(_title(trial))

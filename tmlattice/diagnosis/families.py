@@ -48,7 +48,7 @@ class MonitorGain(_Monitors):
     """Gains, x and y of each monitor: free but for a mean of each plane."""
 
     name, effects = "monitor_gain", ("monitor_gain_x", "monitor_gain_y")
-    block, variable, trust = 0, "gain", 0.01
+    block, variable, trust, gross = 0, "gain", 0.01, 0.5
 
     def groups(self, data: ResponseData) -> list[Group]:
         """Each its own, and those of a plane alike."""

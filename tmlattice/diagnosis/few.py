@@ -23,7 +23,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Search, explain
-from tmlattice.observe.orbit_response import ResponseData, Split
+from tmlattice.observe.orbit_response import Hypothesis, ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
 
 Flags = NDArray[np.bool_]
@@ -45,6 +45,10 @@ a magnet's length and sextupoles add has the spare ones."""
 ROUNDS, SETTLED = 30, 0.99
 """Of filling in what was not read, at most, and the share of chi-square that another one leaves
 where it is worth no more: of a column that is read by half, a round finds half of the rest."""
+
+LARGER = 2.0
+"""Times the largest fault: a kick of more is none, and stands for what it does to the tunes by all
+sextupoles."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,8 @@ def few_causes(
     gap = max(before.chi2 - count, 1.0)
     enough = float(chi2.isf(judgement.noise[1], count))
     enough = max(enough, min(NOISE * count, count + REST * gap))
-    if _beyond(problem, before, PATTERNS * number + SPARE, enough) > enough:
-        kicks = [h for h in hypotheses if not find(h[0]).responds]
-        seen = scan(problem.metric(before.point), kicks, before.residual, effective=1.0)
-        if seen.statistic.max(initial=0.0) < gap / 2:
-            return None
+    if _hopeless(problem, hypotheses, before, number, enough):
+        return None
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
@@ -118,10 +119,25 @@ def few_causes(
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
         return None  # the strongest of a few would explain its share
     if found.fit.chi2 > search.enough and number > 1:
-        found = explain(replace(search, most=number), before)
+        if _hopeless(problem, hypotheses, found.fit, number - 1, enough):
+            return None
+        found = explain(replace(search, most=number), before, found)
     if found.fit.chi2 > search.enough:
         return None
     return _told(data, split, found, count, judgement)
+
+
+def _hopeless(
+    problem: Response, hypotheses: Sequence[Hypothesis], left: Fit, number: int, enough: float
+) -> bool:
+    """Whether so few causes more, none beyond all measure, cannot explain what is left to less than
+    enough: quick, where the search for each is not."""
+    if _beyond(problem, left, PATTERNS * number + SPARE, enough) <= enough:
+        return False
+    kicks = [h for h in hypotheses if not find(h[0]).responds]
+    seen = scan(problem.metric(left.point), kicks, left.residual, effective=1.0)
+    fault = np.abs(seen.amount) < LARGER * np.array([find(h[0]).largest for h in seen.hypotheses])
+    return bool(seen.statistic[fault].max(initial=0.0) < (left.chi2 - problem.used.sum()) / 2)
 
 
 def _beyond(problem: Response, before: Fit, patterns: int, enough: float) -> float:

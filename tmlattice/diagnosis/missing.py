@@ -11,7 +11,7 @@ kick is.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -31,6 +31,8 @@ FREE = 30.0
 """Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
 FEW = 6
 """So many amounts stand alone."""
+CONTROL = 17
+"""Seed of the random parameters that patterns of single columns are held against."""
 SPARSE = 0.1
 """Patterns are kept sparse where fewer of their readings are not zero."""
 
@@ -46,9 +48,13 @@ class Weighed:
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
         on_top_in_plane, on_top_position: with it and all others that are wanted together, m.
+        evidence: by which the log evidence of the fitted readings grows with it alone: the misfit
+            that it explains, less what its parameters cost.
+        control_in_plane: with as many random parameters in its stead, m; None where columns have no
+            amounts of their own. See `control`.
         judgement: "helps", on top of all that help more; "helps, not on top", where those leave it
-            nothing; "unphysical" (it would help, by more than physics allows); "excluded"
-            (held-out readings do not want it).
+            nothing; "as random ones do" (no more than its control); "unphysical" (it would help, by
+            more than physics allows); "excluded" (held-out readings do not want it).
     """
 
     effect: str
@@ -61,6 +67,8 @@ class Weighed:
     heldout_rms_position: float
     on_top_in_plane: float
     on_top_position: float
+    evidence: float
+    control_in_plane: float | None
     judgement: str
 
     def as_json(self) -> dict[str, Any]:
@@ -97,6 +105,7 @@ def weigh(
         if hypothesis is not None and fitted.sees(hypothesis):
             found.append(hypothesis)
     alone = [fitted.weigh([hypothesis]) for hypothesis in found]
+    random = [fitted.weigh([control(own)]).in_plane if own.own else None for own in found]
     progress("hypotheses together")
     together, chosen = base, list[int]()
 
@@ -114,7 +123,11 @@ def weigh(
                 chosen.append(best)
                 left.remove(best)
 
-    helpers = [i for i, answer in enumerate(alone) if _helps(found[i], answer, base)]
+    told = [
+        i for i, (answer, rms) in enumerate(zip(alone, random, strict=True))
+        if rms is None or answer.in_plane < HELPS * rms
+    ]  # fmt: skip
+    helpers = [i for i in told if _helps(found[i], alone[i], base)]
     take(helpers)
     first = [found[k] for k in chosen]
     on_top = {
@@ -123,22 +136,25 @@ def weigh(
         if i not in chosen
     }
     before = together
-    take([i for i, answer in on_top.items() if _helps(found[i], answer, before)])
-    out = [Weighed("none", "", "", 0, 0.0, 0.0, *base[2:], *together[2:], "")]
+    take([i for i, answer in on_top.items() if i in told and _helps(found[i], answer, before)])
+    four = base.in_plane, base.position, together.in_plane, together.position
+    out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
     for i, hypothesis in enumerate(found):
         beside = together if i in chosen else on_top[i]
         if i in chosen:
             judgement = "helps"
         elif i in helpers:
             judgement = "helps, not on top"
+        elif i not in told and _helps(hypothesis, alone[i], base):
+            judgement = "as random ones do"
         else:
             judgement = _refusal(hypothesis, alone[i], beside, base, before)
-        amounts, sigma, in_plane, position = alone[i]
+        amounts, sigma, in_plane, position, evidence = alone[i]
         out.append(
             Weighed(
                 hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
                 _size(amounts), float(np.median(sigma)), in_plane, position, beside.in_plane,
-                beside.position, judgement,
+                beside.position, evidence, random[i], judgement,
             )
         )  # fmt: skip
     return out
@@ -153,7 +169,24 @@ def _refusal(
 
 
 def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
-    return answer.in_plane < HELPS * before.in_plane and _sensible(hypothesis, answer)
+    gains = answer.in_plane < HELPS * before.in_plane and answer.evidence > before.evidence
+    return gains and _sensible(hypothesis, answer)
+
+
+def control(hypothesis: Hypothesis) -> Hypothesis:
+    """As many parameters of the same size and as smooth along the ring, that have nothing to do
+    with their columns: each column's patterns, carried on by a random number of monitors.
+
+    What columns have of their own is taken from half of a held-out one's monitors: a few smooth
+    orbits, whatever they are, describe the other half better than none.
+    """
+    rng = np.random.default_rng(CONTROL)
+    patterns = hypothesis.patterns.copy()
+    monitors = patterns.shape[2]
+    for c in range(patterns.shape[1]):
+        by = int(rng.integers(monitors // 4, monitors - monitors // 4))
+        patterns[:, c] = np.roll(patterns[:, c], by, axis=1)
+    return replace(hypothesis, patterns=patterns)
 
 
 def _size(amounts: Array) -> float:
@@ -165,12 +198,14 @@ def _sensible(hypothesis: Hypothesis, answer: "Answer") -> bool:
 
 
 class Answer(NamedTuple):
-    """Amounts of the last hypothesis, their errors, held-out rms without and with a jump, m."""
+    """Amounts of the last hypothesis, their errors, held-out rms without and with a jump, m, and
+    the log evidence of all of them."""
 
     amounts: Array
     sigma: Array
     in_plane: float
     position: float
+    evidence: float
 
 
 class Fitted:
@@ -234,7 +269,7 @@ class Fitted:
         if not hypotheses:  # the same linear step as with one: the fit itself may still move
             moved = cho_solve(self.factor, self.vector)
             in_plane, position = self._score(self.change(self.spread @ moved - self.start), None)
-            return Answer(np.zeros(0), np.zeros(0), in_plane, position)
+            return Answer(np.zeros(0), np.zeros(0), in_plane, position, 0.0)
         parts = [self._part(hypothesis) for hypothesis in hypotheses]
         edge = np.cumsum([0, *(part.across.shape[1] for part in parts)])
         B = np.concatenate([part.across for part in parts], axis=1)
@@ -272,7 +307,8 @@ class Fitted:
         own = [hypothesis.patterns for hypothesis in hypotheses if hypothesis.own]
         last = owner == len(parts) - 1
         rms, jumped = self._score(change, np.concatenate(own) if own else None)
-        return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped)
+        evidence = 0.5 * float(r @ amounts) - float(np.log(np.diag(root[0])).sum())
+        return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped, evidence)
 
     def _part(self, hypothesis: Hypothesis) -> "_Part":
         """Its patterns that fitted readings see."""

@@ -13,9 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.state import State
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
 
 Array = NDArray[np.float64]
 
+GROSS = 20.0
+"""So many times what the design leaves of the typical reading, both of its corrector and of its
+monitor, no error of a ring makes of one reading alone: it went wrong."""
 OUT = 5.0
 """A reading sticks out from so many times what is left of its column's typical one."""
 NAMED = 3
@@ -23,6 +28,50 @@ NAMED = 3
 OFTEN = 2
 """Readings of one monitor, or corrector, from which it is named."""
 _MAD = 1.4826  # of a Gaussian
+
+
+def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitResponse, list[str]]:
+    """The measurement without single readings that went wrong, and a sentence of them.
+
+    Held-out correctors have such readings too, and a few of them make up all that the judges see.
+
+    Args:
+        measured: the response.
+        data: the same, as the ring has it.
+    """
+    gap = np.abs(data.orbits - Predicted(data, Errors.none(data)).read)[:-1]
+    plane = data.plane[:-1]
+    wrong = np.zeros(gap.shape, dtype=bool)
+    for kicked, read in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        left = gap[plane == kicked, :, read]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # what was not read at all
+            column, monitor = (np.nanmedian(left, axis=own, keepdims=True) for own in (1, 0))
+        usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
+        wrong[plane == kicked, :, read] = np.nan_to_num(left) > GROSS * _MAD * usual
+    if not wrong.any():
+        return measured, []
+    response = data.measured.response.copy()
+    response[wrong] = np.nan
+    columns, monitors, _ = np.nonzero(wrong)
+    names = data.measured
+    most = _most(Counter(names.monitors[i] for i in monitors.tolist()),
+                 Counter(names.correctors[i] for i in columns.tolist()))  # fmt: skip
+    return replace(names, response=response), [
+        f"single readings that differ from the design by {GROSS:g} times what is usual of their "
+        f"corrector and of their monitor, left out: {len(columns)}{most}"
+    ]
+
+
+def _most(*tables: Counter[str]) -> str:
+    """Who has most of them."""
+    most = [
+        f"{name} ({own})"
+        for table in tables
+        for name, own in table.most_common(NAMED)
+        if own >= OFTEN
+    ]
+    return f"; most at {', '.join(most)}" if most else ""
 
 
 def robust(state: State) -> State:
@@ -68,14 +117,7 @@ def odd_readings(state: State) -> list[str]:
         correctors.update(measured.correctors[i] for i in np.nonzero(out)[0])
     if not count:
         return []
-    most = [
-        f"{name} ({own})"
-        for table in (monitors, correctors)
-        for name, own in table.most_common(NAMED)
-        if own >= OFTEN
-    ]
-    named = f"; most at {', '.join(most)}" if most else ""
     return [
         f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
-        f"corrector's typical one, and count little{named}."
+        f"corrector's typical one, and count little{_most(monitors, correctors)}."
     ]

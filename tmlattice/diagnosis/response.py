@@ -31,11 +31,11 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
-from tmlattice.diagnosis.odd_readings import odd_readings
+from tmlattice.diagnosis.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.diagnosis.state import begin
-from tmlattice.diagnosis.strangers import strangers
+from tmlattice.diagnosis.strangers import reversed_ones, strangers
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -95,6 +95,9 @@ def diagnose_response(
     measured = mended(ring, measured, assume)
     trials, data = trials_of(effects), response_data(ring, measured)
     said = [*consulted(ring, measured), *assumed_of(measured, data)]
+    measured, gross = without_gross(measured, data)
+    if gross:
+        said, data = said + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
@@ -170,17 +173,24 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
             f"{x} in x and {y} in y (a jitter of the beam is not in it)"
         )
     else:
-        said += _understated(measured, data)
+        said += _understated(data)
     if measured.rf is None or measured.rf.orbit is None:
         said.append(
             "there is no RF step: dispersion is not known, and only what is usual tells the scale "
             "of all correctors from that of all monitors"
         )
+    for plane in (p for p in "xy" if p not in measured.planes):
+        said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")
+    if not np.isfinite(data.pick(data.orbits, 1)[:-1]).any():
+        said.append(
+            "no corrector is read in the other plane: rolls and skew gradients are not known"
+        )
     return said
 
 
-def _understated(measured: OrbitResponse, data: ResponseData) -> list[str]:
+def _understated(data: ResponseData) -> list[str]:
     """Where the readings scatter by far more than the noise that is stated."""
+    measured = data.measured  # in beam order
     if measured.noise is None:
         return []
     try:
@@ -311,7 +321,7 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    return (*said, *odd_readings(fit.state))
+    return (*reversed_ones(fit.state), *said, *odd_readings(fit.state))
 
 
 def _misfit(fit: DenseFit, read: Array) -> Misfit:

@@ -291,7 +291,7 @@ def log_evidence(state: State, good: Flags) -> float:
     """Of what is fitted, of the readings of some monitors, both blocks, what the model lacks and
     the priors at their likeliest; up to a constant of the data."""
     total = 0.0
-    for block in (0, 1):
+    for block in (block for block in (0, 1) if state.reads(block)):
         state = replace(look(state, block), good=good)
         weights = weight(state, block)
         use = weights > 0
@@ -337,7 +337,7 @@ def _good_monitors(state: State) -> Flags:
         gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
         count = np.maximum(seen.sum(axis=0), 1)
         rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
-        rms[(seen.sum(axis=0) == 0) | (abs(gain) < 0.2)] = np.inf
+        rms[(seen.sum(axis=0) == 0) | (gain < 0.2)] = np.inf  # reversed, until gains come in
         if np.isfinite(
             typical := np.median(rms)
         ):  # else the fit is astray, not half of the monitors

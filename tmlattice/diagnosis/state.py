@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 ALONE = 0.3
 """A column whose misfit falls to this share by its own number has no other error to speak of."""
+FEW = 3
+"""Readings that it takes to judge the gain of a monitor."""
 
 
 class Kept(NamedTuple):
@@ -68,6 +70,11 @@ class State:
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""
         return tuple(family for family in self.families if family.block == block)
+
+    def reads(self, block: int) -> bool:
+        """Whether correctors that are fitted have readings of a block."""
+        orbits = self.data.pick(self.data.orbits, block)
+        return bool(np.isfinite(orbits[self.fitted][:, self.good]).any())
 
     def allows(self, name: str) -> bool:
         """Whether a family is in the fit."""
@@ -142,6 +149,26 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     return amounts, without, told
 
 
+def by_monitors(state: State) -> Array:
+    """What each monitor alone says of its gains, over those that it has, x and y of each, [2 x
+    monitor]: from half of the columns that are fitted, where the other half agrees; else 1."""
+    model, orbits = (state.data.pick(own) for own in (state.at.read, state.data.orbits))
+    gains = np.ones((len(state.data.at), 2))
+    for p in (0, 1):
+        rows = np.flatnonzero(state.fitted & (state.data.plane == p))
+        for m in range(len(gains)):
+            seen = rows[np.isfinite(orbits[rows, m])]
+            near, far = seen[::2], seen[1::2]
+            size = float(model[near, m] @ model[near, m])
+            if len(far) < FEW or not size > 0:
+                continue
+            gain = float(model[near, m] @ orbits[near, m]) / size
+            without = np.sum((orbits[far, m] - model[far, m]) ** 2)
+            if np.sum((orbits[far, m] - gain * model[far, m]) ** 2) < ALONE**2 * without:
+                gains[m, p] = gain
+    return gains.ravel()
+
+
 def jump(state: State, beyond: float | None = None) -> State:
     """Start large numbers of single columns at what the column alone says.
 
@@ -151,6 +178,11 @@ def jump(state: State, beyond: float | None = None) -> State:
     """
     values = dict(state.values)
     for family in state.families:
+        if family.per == "monitor" and not np.isinf(family.gross):
+            gains = by_monitors(state)
+            far = np.abs(gains - 1) > family.gross  # of a gain of zero nothing can be made
+            moved = np.where(far, (1 + values[family.variable]) * (gains - 1), 0.0)
+            values[family.variable] = values[family.variable] + moved
         limit = family.gross if beyond is None else beyond * family.trust
         if family.per != "column" or np.isinf(limit):
             continue

@@ -70,6 +70,25 @@ class Strangers:
         return replace(kept, response=response, rf=None if rf is None else replace(rf, orbit=orbit))
 
 
+def reversed_ones(state: State) -> list[str]:
+    """A sentence of monitors and correctors that the fit says have the wrong sign."""
+    errors, measured = state.at.errors, state.data.measured
+    gains = np.diagonal(errors.monitors, axis1=1, axis2=2)
+    said = []
+    for what, names in (
+        ("monitors that read", [
+            f"{measured.monitors[m]} in {'xy'[p]}"
+            for m, p in np.argwhere((gains < 0) & state.good[:, None])
+        ]),
+        ("correctors that kick", [
+            measured.correctors[c] for c in np.flatnonzero(errors.calibration[:-1] < -1)
+        ]),
+    ):  # fmt: skip
+        if names:
+            said.append(f"{what} with the wrong sign: {', '.join(names)}")
+    return said
+
+
 def strangers(state: State) -> Strangers:
     """Those among the readings in each column's own plane."""
     data = state.data

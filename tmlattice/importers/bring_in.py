@@ -146,7 +146,7 @@ def _bring(
     if len(loco) == 1 and len(loco) + len(rest) == len(files):
         ((path, content),) = loco
         if not rest:
-            return bring_loco(content, path, options.iteration, options.keep_bad)
+            return bring_loco(content, path, options.iteration, options.keep_bad, options.energy)
         if len(responses) == 1:
             beside = [content for _, content in rest if is_beside(content)]
             return bring_middle_layer(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, counted, is_number, numbers
+from tmlattice.importers.loco_forms import usual_form
 from tmlattice.importers.matlab_ring import Placed, Roles, ring_of_elements
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
@@ -46,7 +47,11 @@ def is_loco(content: Fields) -> bool:
 
 
 def bring_loco(
-    content: Fields, path: Path, iteration: Iteration = "last", keep_bad: bool = False
+    content: Fields,
+    path: Path,
+    iteration: Iteration = "last",
+    keep_bad: bool = False,
+    energy: float | None = None,
 ) -> Imported:
     """The measurement and the model of a LOCO file.
 
@@ -56,21 +61,19 @@ def bring_loco(
         iteration: "last": the lattice as the file has it, which is as the fit left it; "first":
             with the parameters with which the fit began, the model as it was before.
         keep_bad: take monitors and correctors too that the good lists leave out.
+        energy: GeV; None: what the file states.
 
     Raises:
         MeasurementError: a variable or field is missing, or shapes do not fit.
         LatticeError: the lattice cannot be made.
     """
-    data, monitors, correctors = (
-        _first(content.get(name), f"{name} of '{path}'")
-        for name in ("LocoMeasData", "BPMData", "CMData")
+    content, of_form = usual_form(content, energy)
+    data, monitors, correctors, lattice = (
+        _structure(content.get(name), f"{name} of '{path}'")
+        for name in ("LocoMeasData", "BPMData", "CMData", "RINGData")
     )
-    lattice = content.get("RINGData")
-    if isinstance(lattice, list):  # the ring itself
-        lattice = {"Lattice": lattice}
-    lattice = _first(lattice, f"RINGData of '{path}'")
-    stated = isinstance(content.get("LocoFlags"), Mapping | list)
-    flags = _first(content["LocoFlags"], "LocoFlags") if stated else {}
+    flags = content.get("LocoFlags")
+    flags = flags if isinstance(flags, Mapping) else {}
     at_monitor = _index(monitors, "BPMIndex")
     every = {
         "HBPMIndex": np.arange(len(at_monitor)) + 1,
@@ -105,15 +108,12 @@ def bring_loco(
     return Imported(
         measured,
         placed.ring,
-        assumed=(*conventions(flags, measured), *of_lists, of_lattice, *placed.said),
+        assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.said),
         doubts=(*_computed(data, content.get("LocoModel"), good), *_unkicked(correctors, kickers)),
     )
 
 
-def _first(value: Any, what: str) -> Fields:
-    """A structure, or the first of a list by iteration."""
-    if isinstance(value, list) and value:
-        value = value[0]
+def _structure(value: Any, what: str) -> Fields:
     if not isinstance(value, Mapping):
         raise MeasurementError(f"no structure {what}; give the whole LOCO file")
     return value
@@ -150,7 +150,9 @@ def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
     """GeV; LOCO has it in GeV, AT's elements in eV."""
     stated = [s["Energy"] for s in (lattice, *elements) if is_number(s.get("Energy"))]
     if not stated or not stated[0] > 0:
-        raise MeasurementError("neither RINGData nor its elements state an energy; add Energy")
+        raise MeasurementError(
+            "neither RINGData nor its elements state an energy: name it (--energy, GeV)"
+        )
     return float(stated[0]) * (1e-9 if stated[0] > 1e5 else 1.0)
 
 
@@ -375,10 +377,11 @@ def _computed(data: Fields, models: Any, good: Mapping[str, NDArray[np.bool_]]) 
 
 def conventions(flags: Fields, measured: OrbitResponse) -> list[str]:
     """How the numbers of a LOCO file are taken; a sentence each."""
-    two = str(flags.get("ResponseMatrixMeasurement", "BiDirectional")).lower() == "bidirectional"
+    two = "one" not in str(flags.get("ResponseMatrixMeasurement", "")).lower()
     said = [
         "M and Eta are in mm, HCMKicks and VCMKicks in mrad from one side of the step to the other",
-        "steps are two-sided" + ("" if flags else " (no LocoFlags say so)") if two
+        "steps are two-sided"
+        + ("" if "ResponseMatrixMeasurement" in flags else " (no LocoFlags say so)") if two
         else "steps are one-sided, as LocoFlags says; the diagnosis takes them as two-sided",
         "the RF frequency stood still while correctors were stepped",
     ]  # fmt: skip

@@ -384,6 +384,9 @@ ASSUMPTIONS: dict[str, Assumption] = {
                               _kicks, 1e-3, 1e-3),
     "kicks-in-urad": _columns("the kicks are in µrad", UNIT.format("them", "rad"),
                               _kicks, 1e-6, 1e-6),
+    "kicks-in-krad": _columns(
+        "the kicks are a thousand times too small", UNIT.format("them", "rad"), _kicks, 1e3, 1e3
+    ),
     "kicks-doubled": _columns(
         "the kicks are half of those that were made", "give the whole step, from one side to the "
         "other", _kicks, 2, 2,

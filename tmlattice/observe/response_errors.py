@@ -27,6 +27,13 @@ USUAL = 0.01
 """Mean square of what the usual errors leave of a column, in units of the column's own: a tenth."""
 GAIN = 2.5
 """Log of the misfit that each of the changed columns has to lose in the mean."""
+OF_RF = 1.4
+"""The same of the RF's one orbit, whose size the ring's length gives whatever its errors."""
+STRANGERS, RESEMBLING = 1.5, 0.5
+"""Or: typical misfits before and after, of columns that were strangers and resemble the design."""
+SCALES, NEAR, SIMILAR = {"kicks-doubled": 2.0, "kicks-halved": 0.5}, 0.15, 0.8
+"""Or: that the typical column's size is so many times the design's, and how near the logarithm is;
+and its correlation with the design's, at least."""
 COLUMNS = 2
 """At least, that an assumption about correctors or monitors changes: one may be a bad corrector."""
 SHARE = 0.8
@@ -101,6 +108,21 @@ class ResponseJudge:
         seen = there.any(axis=(1, 2)) & (size > 0)
         return np.where(seen, left / np.where(seen, size, 1.0), np.nan)
 
+    def scale(self) -> float:
+        """Of what the typical column reads over the design's, for correctors; NaN where the typical
+        column resembles the design too little to say so."""
+        read, made = self.measured, self.design
+        data = in_beam_order(read, self.monitors)
+        there = np.isfinite(data.response)
+        a = np.where(there, data.response, 0.0)
+        b = np.where(there, data.kicks[:, None, None] * made.response, 0.0)
+        both, own, design = ((u * v).sum(axis=(1, 2)) for u, v in ((a, b), (a, a), (b, b)))
+        seen = (own > 0) & (design > 0)
+        if not seen.any():
+            return float("nan")
+        alike = float(np.median(both[seen] / np.sqrt(own[seen] * design[seen])))
+        return float(np.median(both[seen] / design[seen])) if alike > SIMILAR else float("nan")
+
     def candidates(self) -> list[Names]:
         """What may be assumed of these data."""
         found: list[Names] = [(n,) for n, a in ASSUMPTIONS.items() if a.response]
@@ -119,8 +141,12 @@ class ResponseJudge:
             few = moved.sum() < COLUMNS and not names[0].startswith("rf")
             if moved.any() and not few and (change[moved] < 0).mean() >= SHARE:
                 gain = -float(change[moved].sum())
-                if gain > GAIN * moved.sum():
-                    before, after = (float(np.median(own[moved])) for own in (stated, other))
+                before, after = (float(np.median(own[moved])) for own in (stated, other))
+                mended = before > STRANGERS and after < RESEMBLING
+                if names[0] in SCALES:  # whatever else is wrong, all correctors say the same
+                    mended |= abs(np.log(self.scale() / SCALES[names[0]])) < NEAR
+                least = OF_RF if names[0].startswith("rf") else GAIN
+                if mended or gain > least * moved.sum():
                     found.append(ResponseVerdict(names, gain, before, after))
         if not found:
             return None

@@ -18,22 +18,28 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
         (
             step.effect,
             str(step.parameters),
-            f"{1e6 * step.heldout_rms_in_plane:.3g}",
-            f"{1e6 * step.heldout_rms_position:.3g}",
-            f"{1e6 * step.heldout_rms_coupling:.3g}",
-            f"{1e6 * step.heldout_rms_roll:.3g}" if np.isfinite(step.heldout_rms_roll) else "",
-            f"{1e6 * step.dispersion_rms:.3g}" if np.isfinite(step.dispersion_rms) else "",
+            micrometres(step.heldout_rms_in_plane),
+            micrometres(step.heldout_rms_position),
+            micrometres(step.heldout_rms_coupling),
+            micrometres(step.heldout_rms_roll),
+            micrometres(step.dispersion_rms),
             f"{step.heldout_chi2_per_dof:.3g}",
         )
         for step in steps
     ]
 
 
+def micrometres(metres: float) -> str:
+    """Three digits; nothing where nothing was read."""
+    return f"{1e6 * metres:.3g}" if np.isfinite(metres) else ""
+
+
 HEAD = ("step", "parameters", "in-plane", "with jump", "coupling", "with roll", "RF", "chi2")
 
 
 HYPOTHESIS = (
-    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "so",
+    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "random",
+    "so",
 )  # fmt: skip
 
 
@@ -49,6 +55,7 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
             f"{1e6 * row.heldout_rms_in_plane:.3g}",
             f"{1e6 * row.heldout_rms_position:.3g}",
             f"{1e6 * row.on_top_in_plane:.3g}",
+            "" if row.control_in_plane is None else micrometres(row.control_in_plane),
             row.judgement,
         )
         for row in result.hypotheses or ()

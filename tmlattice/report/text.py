@@ -146,9 +146,13 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
         "Small errors all along the ring, or of correctors: with them the gap of fitted correctors "
         f"falls from {1e6 * diagnosis.fit_before.rms:.1f} to {1e6 * diagnosis.fit_after.rms:.1f} "
         "µm, that of held-out ones from "
-        f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm, in "
-        f"the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
-        f"{1e6 * last.heldout_rms_coupling:.1f} µm"
+        f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm"
+        + (
+            f", in the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
+            f"{1e6 * last.heldout_rms_coupling:.1f} µm"
+            if np.isfinite(last.heldout_rms_coupling)
+            else ""
+        )
         + (
             ", and that of the RF's response from "
             f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."

@@ -1,0 +1,157 @@
+"""LOCO files as other versions and hands save them: read as the usual one is, and said."""
+
+import copy
+
+import numpy as np
+import pytest
+import scipy.io
+from test_import import simulated  # noqa: F401  (a fixture)
+
+from tmlattice.errors import MeasurementError
+from tmlattice.importers import Options, bring_in
+from tmlattice.lattice import mat_file
+
+
+@pytest.fixture(autouse=True)
+def no_child(monkeypatch):
+    monkeypatch.setattr(mat_file, "check_mat", lambda path: None)
+
+
+@pytest.fixture
+def bring(tmp_path):
+    def bring(variables, **options):
+        scipy.io.savemat(tmp_path / "simulated.loco.mat", variables)
+        return bring_in([tmp_path / "simulated.loco.mat"], Options(**options))
+
+    return bring
+
+
+def struct_array(elements):
+    names = list(dict.fromkeys(name for e in elements for name in e))
+    array = np.empty(len(elements), dtype=[(name, object) for name in names])
+    for i, element in enumerate(elements):
+        for name in names:
+            array[i][name] = element.get(name, np.zeros((0, 0)))
+    return array
+
+
+def put(variable, **fields):
+    """Fields as functions of what they were; None: gone."""
+
+    def change(v):
+        for name, new in fields.items():
+            old = v[variable].pop(name, None)
+            if new is not None:
+                v[variable][name] = new(old)
+
+    return change
+
+
+def together(*changes):
+    return lambda v: [change(v) for change in changes] and None
+
+
+def thering(v):
+    v["THERING"] = v.pop("RINGData")["Lattice"]
+
+
+def cavity_without(*names):
+    def change(v):
+        for element in v["RINGData"]["Lattice"]:
+            for name in names if element["FamName"] == "CAV" else ():
+                element.pop(name)
+
+    return change
+
+
+def energy_of_globval(v):
+    put("RINGData", Energy=None)(v)
+    cavity_without("Energy")(v)
+    v["GLOBVAL"] = {"E0": 1.5e9}
+
+
+def several_elements(v):
+    index = v["CMData"]["HCMIndex"]
+    v["CMData"]["HCMIndex"] = np.stack([index, index, np.full(len(index), np.nan)], axis=1)
+
+
+def of_good_ones(v):
+    v["BPMData"]["VBPMGoodDataIndex"] = np.arange(16) + 1.0
+    v["CMData"]["VCMGoodDataIndex"] = np.delete(np.arange(16) + 1.0, 5)
+    data = v["LocoMeasData"]
+    data["M"] = np.delete(data["M"], 16 + 5, axis=1)
+
+
+FORMS = {
+    "a structure array": (lambda v: v["RINGData"].update(
+        Lattice=struct_array(v["RINGData"]["Lattice"])), ""),
+    "THERING": (thering, "the lattice is THERING"),
+    "energy of GLOBVAL": (energy_of_globval, "the energy is E0"),
+    "no harmonic": (together(put("RINGData", CavityHarmNumber=None), cavity_without("HarmNumber")),
+                    "no harmonic is given: 88"),
+    "no frequency": (together(put("RINGData", CavityFrequency=None), cavity_without("Frequency"),
+                              put("LocoMeasData", RF=None)), "no frequency is given"),
+    "RF in MHz": (put("LocoMeasData", RF=lambda f: 1e-6 * f, DeltaRF=lambda f: 1e-6 * f),
+                  "it is taken in MHz"),
+    "Eta in two columns": (put("LocoMeasData", Eta=lambda e: e.reshape(2, -1).T), ""),
+    "BPMSTD of each entry": (put("LocoMeasData", BPMSTD=lambda s: np.tile(s[:, None], 32)),
+                             "the rms of each monitor"),
+    "flags of good ones": (put("BPMData", HBPMGoodDataIndex=lambda g: np.ones(16, dtype=bool)), ""),
+    "an empty good list": (put("CMData", HCMGoodDataIndex=lambda g: np.zeros((0, 0))),
+                           "HCMGoodDataIndex is empty"),
+    "M turned": (together(put("LocoMeasData", M=lambda m: m[:, :30].T), put(
+        "CMData", VCMIndex=lambda i: i[:14], VCMKicks=lambda k: k[:14], VCMGoodDataIndex=None)),
+        "M stands as [correctors, monitors]"),
+    "several elements a corrector": (several_elements, "the middle is taken"),
+    "flags that say nothing": (put("LocoFlags", ResponseMatrixMeasurement=lambda f: np.zeros(0)),
+                               "no LocoFlags say so"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_other_forms_are_the_usual_one(simulated, bring, form):  # noqa: F811
+    usual = bring(simulated)
+    change, said = FORMS[form]
+    variables = copy.deepcopy(simulated)
+    change(variables)
+    found = bring(variables)
+    assert any(said in sentence for sentence in found.assumed), found.assumed
+    if form != "M turned":  # of fewer correctors
+        assert [e.name for e in found.ring.elements] == [e.name for e in usual.ring.elements]
+    data, same = found.measurement, usual.measurement
+    kept = [same.correctors.index(name) for name in data.correctors]
+    assert len(kept) == (30 if form == "M turned" else 32)
+    assert np.array_equal(data.response, same.response[kept])
+    assert np.allclose(data.noise, same.noise, rtol=1e-12)
+    assert np.array_equal(data.rf.orbit, same.rf.orbit)
+    assert data.rf.step == pytest.approx(same.rf.step)
+    assert data.rf.frequency == pytest.approx(same.rf.frequency)
+    assert data.rf.harmonic == same.rf.harmonic
+    assert found.ring.energy == pytest.approx(usual.ring.energy)
+
+
+def test_what_is_not_measured_is_left_out_and_said(simulated, bring):  # noqa: F811
+    variables = copy.deepcopy(simulated)
+    data = variables["LocoMeasData"]
+    data["Eta"], data["BPMSTD"] = 0 * data["Eta"], data["BPMSTD"][:7]
+    variables["CMData"]["HCMKicks"][3] = np.nan
+    of_good_ones(variables)
+    found = bring(variables)
+    assert found.measurement.rf is None
+    assert found.measurement.noise is None
+    assert len(found.measurement.correctors) == 30
+    for said in (
+        "Eta is zero everywhere",
+        "BPMSTD has 7 numbers, not 32",
+        "of the good lists alone",
+    ):
+        assert any(said in sentence for sentence in found.assumed), found.assumed
+
+
+def test_an_energy_that_no_file_states_can_be_named(simulated, bring):  # noqa: F811
+    variables = copy.deepcopy(simulated)
+    energy_of_globval(variables)
+    del variables["GLOBVAL"]
+    with pytest.raises(MeasurementError, match="--energy"):
+        bring(variables)
+    assert bring(variables, energy=1.5).ring.energy == pytest.approx(1.5)

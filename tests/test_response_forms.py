@@ -1,0 +1,146 @@
+"""Orbit responses that lack what others have, a plane or its readings, or have wrong signs."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tmlattice import diagnose
+from tmlattice.diagnosis import few
+from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.hypotheses import HYPOTHESES
+from tmlattice.diagnosis.missing import control, weigh
+from tmlattice.diagnosis.odd_readings import without_gross
+from tmlattice.diagnosis.response import assumed_of
+from tmlattice.diagnosis.strangers import reversed_ones
+from tmlattice.effects import Cause
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import response_data, split_columns
+
+GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
+
+
+@pytest.fixture(scope="module")
+def whole(small_ring):
+    causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
+    causes.append(Cause("corrector_calibration", "v2", 0.1))
+    return simulate_response(
+        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
+        progress=False, seed=3,
+    ).measured  # fmt: skip
+
+
+def in_plane_alone(data):
+    response = data.response.copy()
+    for c, plane in enumerate(data.planes):
+        response[c, :, "yx".index(plane)] = np.nan
+    return replace(data, response=response)
+
+
+def of_plane(plane):
+    def only(data):
+        names = [n for n, p in zip(data.correctors, data.planes, strict=True) if p == plane]
+        return in_plane_alone(data.select(correctors=names))
+
+    return only
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (in_plane_alone, "no corrector is read in the other plane"),
+        (of_plane("y"), "no corrector kicks in x"),
+    ],
+    ids=["in-plane readings alone", "y alone"],
+)
+def test_a_response_of_less_is_fitted_and_says_what_is_not_known(
+    small_ring, whole, tmp_path, made, said
+):
+    effects = ["corrector_calibration", "quadrupole_gradient", "monitor_roll", "skew_gradient"]
+    found = diagnose(small_ring, made(whole), effects=effects, seed=1)
+    assert any(said in sentence for sentence in found.warnings), found.warnings
+    last = found.steps[-1]
+    assert last.heldout_rms_in_plane < 3e-8
+    assert np.isnan(last.heldout_rms_coupling)
+    found.save(tmp_path / "found")
+    text = (tmp_path / "found" / "report.txt").read_text()
+    assert "nan" not in text, text
+    json.loads((tmp_path / "found" / "diagnosis.json").read_text())
+
+
+def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole):
+    """Of a real ring with two of its 24 monitors reversed 93 µm were left instead of 0.7."""
+    response, orbit = whole.response.copy(), whole.rf.orbit.copy()
+    for readings in (response, orbit):
+        readings[..., 7, :] *= -1
+        readings[..., 20, 1] *= -1
+    response[3] *= -1
+    data = replace(whole, response=response, rf=replace(whole.rf, orbit=orbit))
+    split = split_columns(response_data(small_ring, data), 0.2, np.random.default_rng(1))
+    fit = fit_steps(response_data(small_ring, data), split, STEPS[:3])
+    assert fit.steps[-1].heldout_rms_in_plane < 3e-8
+    assert reversed_ones(fit.state) == [
+        "monitors that read with the wrong sign: "
+        f"{data.monitors[7]} in x, {data.monitors[7]} in y, {data.monitors[20]} in y",
+        f"correctors that kick with the wrong sign: {data.correctors[3]}",
+    ]
+
+
+def test_monitors_in_any_order_have_the_noise_that_they_have(small_ring, whole):
+    order = np.random.default_rng(2).permutation(len(whole.monitors))
+    data = whole.select(monitors=[whole.monitors[i] for i in order])
+    assert assumed_of(data, response_data(small_ring, data)) == []
+
+
+def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, monkeypatch):
+    """Gradients are not fitted: 53 smooth orbits that have nothing to do with their columns take
+    0.17 to 0.13 µm; and have nothing to say where nothing is missing."""
+    data = response_data(small_ring, whole)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    calibrations = replace(STEPS[0], families=STEPS[0].families[:1])
+    waves = HYPOTHESES["orbit_drift"]
+    monkeypatch.setitem(HYPOTHESES, "random", lambda state: control(waves(state)))
+    lacking = fit_steps(data, split, [calibrations]).state
+    none, own, random = weigh(lacking, ["orbit_drift", "random"])
+    assert random.heldout_rms_in_plane < 0.9 * none.heldout_rms_in_plane
+    assert random.judgement == "as random ones do"
+    assert own.judgement == "helps"
+    fitted = fit_steps(data, split, [calibrations, *STEPS[1:3]]).state
+    none, own = weigh(fitted, ["orbit_drift"])
+    assert own.judgement == "excluded"
+    assert own.evidence < 0
+
+
+def test_no_causes_are_sought_of_kicks_beyond_all_measure(small_ring, whole, monkeypatch):
+    """A ring with all gradients 1 % off had its tunes mended by kicks of centimetres' orbit, for
+    100 s, before anything was fitted."""
+    data = response_data(small_ring, whole)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    seen = SimpleNamespace(
+        statistic=np.array([1e12]), amount=np.array([1e-2]), hypotheses=[("corrector_kick_x", "h1")]
+    )
+    monkeypatch.setattr(few, "scan", lambda *_, **__: seen)
+    monkeypatch.setattr(few, "_beyond", lambda *_: 1e12)
+    monkeypatch.setattr(few, "explain", lambda *_: pytest.fail("a search was begun"))
+    assert few.few_causes(data, split, None, 10, DEFAULT) is None
+
+
+def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_ring, whole, rng):
+    """Of SPEAR3 with 0.3 % of its readings gone wrong 880 µm were left in the other plane."""
+    response = whole.response.copy()
+    response[..., 7, :] *= -1
+    response[3] *= -1
+    there = response_data(small_ring, replace(whole, response=response))
+    assert without_gross(there.measured, there) == (there.measured, [])
+    places = [(2, 5, 0), (2, 9, 1), (11, 20, 1), (14, 30, 0)]
+    for place in places:
+        response[place] += 20 * np.nanstd(response)
+    data = replace(whole, response=response)
+    measured, (said,) = without_gross(data, response_data(small_ring, data))
+    assert said.endswith(f"left out: 4; most at {whole.correctors[2]} (2)")
+    gone = np.isnan(measured.response) & np.isfinite(response)
+    assert [tuple(place) for place in np.argwhere(gone)] == places
