@@ -121,6 +121,14 @@ class Gap:
     interval: tuple[float, float] | None
     since: int = 0
 
+    @property
+    def lost(self) -> bool:
+        """Whether one of the models loses readings that the other one has: nobody judges it."""
+        if not len(self.residuals):  # of a response, whose models lose none
+            return False
+        one, other = (np.isfinite(self.residuals[i]).sum() for i in (self.since, -1))
+        return bool(one != other)
+
 
 def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
     """The gap of a series of models on readings that no fit saw.

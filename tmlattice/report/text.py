@@ -56,8 +56,7 @@ def closed_text(diagnosis: Diagnosis) -> str:
             "What has no name cannot be put into the lattice, so the gap of the held-out shots "
             "stays"
         )
-    there = np.isfinite(gap.residuals).reshape(len(gap.residuals), -1).sum(axis=1)
-    if gap.closed is None and there[gap.since] != there[-1]:
+    if gap.closed is None and gap.lost:
         return (
             "The beam of held-out shots is lost in one of the models, so they do not judge the gap"
         )
