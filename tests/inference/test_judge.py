@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.judge import Half, Judged, held_out_gap, other_half
+from tmlattice.inference.judge import Half, Judged, Left, held_out_gap, other_half
 
 READINGS, LAUNCHES, ERRORS = 40, 4, 30
 SIGMA = 20e-6
@@ -79,3 +79,14 @@ def test_the_interval_of_what_is_closed_holds_in_95_per_cent(halves, rng):
 def test_no_share_is_told_of_a_gap_within_the_noise(halves, rng):
     both = [of(judged(halves, 0.0, rng, False)) for _ in range(2)]
     assert held_out_gap(both).closed is None
+
+
+def test_a_gap_of_which_a_model_loses_the_beam_is_judged_by_nobody(halves, rng):
+    whole = judged(halves, 1e-4, rng, False)
+    seen = whole.residual.copy()
+    seen[0] = np.nan
+    fewer = Left(whole.residual[1:], whole.noise[1:, 1:])
+    found = held_out_gap([of(whole), Judged(seen.reshape(1, -1, 1), (fewer,))])
+    assert found.closed is None
+    assert found.lost
+    assert not held_out_gap([of(whole)] * 2).lost
