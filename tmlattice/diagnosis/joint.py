@@ -129,7 +129,7 @@ def diagnose_together(
         (name, place) for name in (rms or background_rms({"all": None}))
         for place in find(name).places(ring)
     ]  # fmt: skip
-    found, small = _sought(search, everywhere, rms, known)
+    found, small = sought(search, everywhere, rms, known)
     progress("report")
     return _told(
         ring, parts, problem, found, small, how,
@@ -163,13 +163,20 @@ def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]
 
 
 # --- the search ----
-def _sought(
+def sought(
     search: Search,
     everywhere: Sequence[Hypothesis],
     told: Mapping[str, float] | None,
     known: Known | None,
 ) -> tuple[Explanation, Learnt | None]:
-    """Few causes alone, or a few among small errors everywhere: what the data speak for."""
+    """Few causes alone, or a few among small errors everywhere: what the data speak for.
+
+    Args:
+        search: what is searched.
+        everywhere: every small error.
+        told: their rms by effect; None: the data say.
+        known: of them beforehand.
+    """
     problem = search.problem
     search.progress("scan")
     start = fit(problem, (), problem.first)
