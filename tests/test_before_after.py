@@ -94,7 +94,7 @@ def test_a_measurement_against_itself_is_nothing(small_ring, before):
 def among_errors(ring, changes=(), seed=1):
     """Measured by AT in a machine with all usual small errors, which nobody states."""
     return simulate_response(
-        ring, changes, background={"all": None}, noise=(2e-6, 1.2e-6), seed=seed, machine_seed=11,
+        ring, changes, background={"all": None}, noise=(5e-7, 3e-7), seed=seed, machine_seed=11,
         progress=False,
     ).measured  # fmt: skip
 
@@ -106,7 +106,7 @@ def usual(small_ring):
 
 @pytest.mark.parametrize(
     "cause",
-    [Cause("family_gradient", "QF", 2.5e-4), Cause("family_sextupole", "sf", 0.04)],
+    [Cause("family_gradient", "QF", 1e-4), Cause("family_sextupole", "sf", 0.01)],
     ids=lambda cause: cause.effect,
 )
 def test_a_supply_is_told_among_small_errors_that_both_have(small_ring, usual, cause):

@@ -28,9 +28,9 @@ from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, trials_of
+from tmlattice.diagnosis.response_causes import change_among_errors
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.diagnosis.rounds import linear, marginal, settle
-from tmlattice.diagnosis.shared_errors import change_among_errors
 from tmlattice.diagnosis.state import State, begin, bend, jump
 from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.errors import TmlatticeError
