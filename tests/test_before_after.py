@@ -106,7 +106,10 @@ def usual(small_ring):
 
 @pytest.mark.parametrize(
     "cause",
-    [Cause("family_gradient", "QF", 1e-4), Cause("family_sextupole", "sf", 0.01)],
+    [
+        Cause("family_gradient", "QF", 1e-4),
+        pytest.param(Cause("family_sextupole", "sf", 0.01), marks=pytest.mark.slow),
+    ],
     ids=lambda cause: cause.effect,
 )
 def test_a_supply_is_told_among_small_errors_that_both_have(small_ring, usual, cause):
@@ -119,6 +122,7 @@ def test_a_supply_is_told_among_small_errors_that_both_have(small_ring, usual, c
     assert found.amount_sigma < 0.2 * abs(cause.amount)
 
 
+@pytest.mark.slow
 def test_nothing_changed_among_small_errors(small_ring, usual):
     same = diagnose(small_ring, among_errors(small_ring, (), 3), reference=usual)
     assert (same.verdict, same.findings) == ("nothing", ())

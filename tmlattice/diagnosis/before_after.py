@@ -23,7 +23,7 @@ from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one, score
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.family import Told
-from tmlattice.diagnosis.few import few_causes
+from tmlattice.diagnosis.few import Few, few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
@@ -42,6 +42,7 @@ from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import (
+    Errors,
     Predicted,
     ResponseData,
     Split,
@@ -135,15 +136,9 @@ def diagnose_change(
     }  # fmt: skip
     judgement = Judgement(false_alarm=false_alarm)
     split = split_columns(first, holdout, rng)
-    shared = trials and change_among_errors(
-        first, second, fitted, split, effects, max_effects, judgement, seed, progress
-    )
-    if shared:
-        there, few = shared.there, shared.few
-    else:
-        there, change = response_change(first, errors, second)
-        data = response_data(there, change)
-        few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    asked = (effects, max_effects, judgement, seed, progress)
+    shared = change_among_errors(first, second, fitted, split, *asked) if trials else None
+    there, few, data = shared or _few_in_difference(first, second, errors, split, *asked)
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
         return as_diagnosis(
@@ -172,6 +167,15 @@ def diagnose_change(
         noise_estimated=True,
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
+
+
+def _few_in_difference(
+    first: ResponseData, second: ResponseData, errors: Errors, split: Split, *asked: Any
+) -> tuple[Ring, Few | None, ResponseData]:
+    """The ring of the first measurement, few causes of the difference, and that itself."""
+    there, change = response_change(first, errors, second)
+    data = response_data(there, change)
+    return there, few_causes(data, split, *asked), data
 
 
 def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:

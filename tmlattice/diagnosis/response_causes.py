@@ -11,7 +11,7 @@ both say nothing: the model lacks something, or monitors and correctors drift be
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,19 +46,6 @@ SURE = 1 - 1e-8
 the likeliest errors is in both measurements alike, and takes nothing from their difference."""
 
 
-@dataclass(frozen=True)
-class Shared:
-    """What changed, and from what.
-
-    Attributes:
-        there: the ring with the small errors of the first measurement.
-        few: what is told of the second one.
-    """
-
-    there: Ring
-    few: Few
-
-
 def change_among_errors(
     before: ResponseData,
     after: ResponseData,
@@ -69,7 +56,7 @@ def change_among_errors(
     judgement: Judgement,
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
-) -> Shared | None:
+) -> tuple[Ring, Few, ResponseData] | None:
     """The few changes from one response to the other, or None where they do not explain it.
 
     Args:
@@ -81,6 +68,10 @@ def change_among_errors(
         judgement: thresholds.
         seed: of the threshold's simulation.
         progress: told what is being done.
+
+    Returns:
+        The ring with the small errors of the first measurement, what is told of the second one, and
+        the difference on top of the first.
     """
     if before.orbits.size > ROWS or _typical(fitted) > NEARLY:
         return None
@@ -109,13 +100,14 @@ def change_among_errors(
     there, change = response_change(before, _errors(before, known), after)
     data = response_data(there, change)
     base = begin(data, split).at.bend()
-    return Shared(there, few_told(data, split, found, base, count, judgement))
+    return there, few_told(data, split, found, base, count, judgement), data
 
 
 def changes(data: ResponseData, effects: Sequence[str] | None) -> list[tuple[str, str | None]]:
     """What may have changed: single causes, and the supplies of families."""
     families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
-    return single_causes(data, effects or list(dict.fromkeys([*modelled(), *families])))
+    usual = list(dict.fromkeys([*modelled(), *families]))
+    return single_causes(data, usual if effects is None else effects)
 
 
 def _problem(data: ResponseData, judgement: Judgement) -> Response:
