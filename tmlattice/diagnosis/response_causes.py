@@ -28,6 +28,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import Known, Learnt, small_errors_of
 from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.search import Search
 from tmlattice.lattice import Ring
@@ -41,6 +42,8 @@ cube, and is half a minute here."""
 NEARLY = 3.0
 """Times the noise that the families' fit to the first measurement typically leaves, above which it
 is not asked whether small errors explain that: they are the families' and some more."""
+OWN = 0.8
+"""Share of a column's, or a monitor's, change that its own scale makes where that drifts."""
 SURE = 1 - 1e-8
 """Share of a direction of small errors that the first measurement may know: what is linear about
 the likeliest errors is in both measurements alike, and takes nothing from their difference."""
@@ -73,7 +76,7 @@ def change_among_errors(
         The ring with the small errors of the first measurement, what is told of the second one, and
         the difference on top of the first.
     """
-    if before.orbits.size > ROWS or _typical(fitted) > NEARLY:
+    if before.orbits.size > ROWS or _typical(fitted) > NEARLY or _drift(before, after):
         return None
     progress("small errors of the reference")
     learnt = _learnt(before, judgement)
@@ -176,6 +179,20 @@ def _learnt(data: ResponseData, judgement: Judgement) -> Learnt | None:
     except (UnstableRingError, np.linalg.LinAlgError):  # too large to be small errors
         return None
     return learnt if _noise(learnt.before, len(learnt.before.residual)) else None
+
+
+def _drift(before: ResponseData, after: ResponseData) -> bool:
+    """Whether more correctors, or monitors, changed their scale than there are few causes."""
+    scale = (before.kicks / after.kicks)[:, None, None]
+    change = np.nan_to_num((after.orbits * scale - before.orbits) / before.noise)
+    own = np.nan_to_num(before.orbits / before.noise)
+    for axes in ((1, 2), (0, 2)):
+        whole = (change**2).sum(axis=axes) / 2
+        size = np.maximum((own**2).sum(axis=axes), 1e-300)
+        taken = (change * own).sum(axis=axes) ** 2 / size / 2
+        if ((taken > CLEAR) & (taken > OWN * whole)).sum() > MOST:
+            return True
+    return False
 
 
 def _typical(fitted: State) -> float:
