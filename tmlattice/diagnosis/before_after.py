@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.change_among_errors import change_among_errors
 from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one, score
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families import CHANGES, STEPS, Trial
@@ -28,7 +29,6 @@ from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, trials_of
-from tmlattice.diagnosis.response_causes import change_among_errors
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.diagnosis.rounds import linear, marginal, settle
 from tmlattice.diagnosis.state import State, begin, bend, jump

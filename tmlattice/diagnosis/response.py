@@ -33,8 +33,7 @@ from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.odd_readings import odd_readings
 from tmlattice.diagnosis.reasons import explain_gradients
-from tmlattice.diagnosis.response_causes import causes_among_errors
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView, ring_tunes
+from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
 from tmlattice.diagnosis.state import begin
 from tmlattice.diagnosis.strangers import strangers
 from tmlattice.effects import Cause, apply, find, names
@@ -104,23 +103,9 @@ def diagnose_response(
         said += odd
         found, degenerate = told(fit.state)
         verdict = _verdict(fit, false_alarm)
-        findings: tuple[Finding, ...] = ()
-        if verdict != "nothing":
-            findings = causes_among_errors(
-                fit.state.data,
-                fit.state,
-                fit.state.split,
-                effects,
-                max_effects,
-                judgement,
-                seed,
-                progress,
-            )
-        if findings:
-            verdict = max((own.verdict for own in findings), key=VERDICTS.index)
     else:
         fit, found, degenerate = few.fit, few.told, ()
-        verdict, findings = few.verdict, few.findings
+        verdict = few.verdict
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
@@ -132,7 +117,7 @@ def diagnose_response(
         ring, fit, fit.state.at.errors.ring, found,
         noise_estimated=measured.noise is None,
         verdict=verdict,
-        findings=with_consequences(ring, findings, causes),
+        findings=() if few is None else with_consequences(ring, few.findings, causes),
         warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
         hypotheses=rows,

@@ -1,13 +1,10 @@
-"""Single causes in orbit responses among the small errors that a machine has everywhere.
+"""What changed between two orbit responses of one machine, among the small errors that both have.
 
-Of one response: a magnet, a corrector or a monitor far outside its family's size, which is learnt
-beside it (`causes_among_errors`). Of two responses of one machine: what changed. The first
-measurement leaves the small errors known with a covariance, and from there the second one is
-searched: what the first does not know of the optics is in every amount's error and in every
-comparison of hypotheses (`change_among_errors`).
-
-Where small errors of the usual kinds and a few causes do not explain the readings to their noise,
-both say nothing: the model lacks something, or monitors and correctors drift between the two.
+The first measurement leaves the small errors of ring, monitors and correctors known with a
+covariance, and from there the second one is searched: what the first does not know of the optics is
+in every amount's error and in every comparison of hypotheses. Where small errors of the usual kinds
+and a few changes do not explain both to their noise, this says nothing: the model lacks something
+that the difference of the two is free of, or monitors and correctors drift.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,9 +14,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.diagnosis.few import MOST, Few, few_told, used
-from tmlattice.diagnosis.findings import findings_of
 from tmlattice.diagnosis.joint import among_errors
-from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import State, begin
 from tmlattice.diagnosis.strategy import POOR
 from tmlattice.effects import CATALOGUE, Cause, background_rms, find, modelled, rare
@@ -116,49 +111,6 @@ def changes(data: ResponseData, effects: Sequence[str] | None) -> list[tuple[str
 def _problem(data: ResponseData, judgement: Judgement) -> Response:
     base = Predicted(data, Errors.none(data)).bend()
     return Response(base=base, used=np.isfinite(data.orbits), places={}, judgement=judgement)
-
-
-def causes_among_errors(
-    data: ResponseData,
-    fitted: State,
-    split: Split,
-    effects: Sequence[str] | None,
-    most: int,
-    judgement: Judgement,
-    seed: int = 0,
-    progress: Callable[[str], Any] = lambda stage: None,
-) -> tuple[Finding, ...]:
-    """The few causes of one response that are no small errors.
-
-    Args:
-        data: what was measured.
-        fitted: families of errors fitted to it.
-        split: held-out correctors give half of their monitors to the search.
-        effects: names of those that may be the cause; None: all usual ones.
-        most: findings at most.
-        judgement: thresholds.
-        seed: of the threshold's simulation.
-        progress: told what is being done.
-    """
-    hypotheses = single_causes(data, effects)
-    if data.orbits.size > ROWS or _typical(fitted) > NEARLY or not hypotheses:
-        return ()
-    places = {name: sum(h[0] == name for h in hypotheses) for name, _ in hypotheses}
-    problem = replace(
-        _problem(data, judgement), used=used(data, split), places=places,
-        rare=rare(data.ring, list(places)),
-    )  # fmt: skip
-    search = Search(
-        problem, hypotheses, min(most, MOST), unnamed=False, seed=seed, progress=progress
-    )
-    start = fit(problem, (), problem.first)
-    try:
-        found, small = among_errors(search, start, _usual(problem, data.ring), learn=True)
-    except np.linalg.LinAlgError:  # too large to be small errors
-        return ()
-    if small is None or not _noise(found.fit, len(found.fit.residual) - len(found.fit.causes)):
-        return ()
-    return findings_of(data.ring, found, (), judgement)
 
 
 def _usual(problem: Response, ring: Ring) -> Known:
