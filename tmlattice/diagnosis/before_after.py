@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.change_among_errors import change_among_errors
 from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one, score
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.family import Told
-from tmlattice.diagnosis.few import few_causes
+from tmlattice.diagnosis.few import Few, few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
@@ -41,6 +42,7 @@ from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import (
+    Errors,
     Predicted,
     ResponseData,
     Split,
@@ -127,16 +129,16 @@ def diagnose_change(
         errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     else:
         errors = fitted.at.errors
-    there, change = response_change(first, errors, second)
-    data = response_data(there, change)
-    split = split_columns(data, holdout, rng)
-    judgement = Judgement(false_alarm=false_alarm)
     options = {
         "reference": True, "holdout": holdout,
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    judgement = Judgement(false_alarm=false_alarm)
+    split = split_columns(first, holdout, rng)
+    asked = (effects, max_effects, judgement, seed, progress)
+    shared = change_among_errors(first, second, fitted, split, *asked) if trials else None
+    there, few, data = shared or _few_in_difference(first, second, errors, split, *asked)
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
         return as_diagnosis(
@@ -165,6 +167,15 @@ def diagnose_change(
         noise_estimated=True,
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
+
+
+def _few_in_difference(
+    first: ResponseData, second: ResponseData, errors: Errors, split: Split, *asked: Any
+) -> tuple[Ring, Few | None, ResponseData]:
+    """The ring of the first measurement, few causes of the difference, and that itself."""
+    there, change = response_change(first, errors, second)
+    data = response_data(there, change)
+    return there, few_causes(data, split, *asked), data
 
 
 def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
