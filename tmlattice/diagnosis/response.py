@@ -121,7 +121,7 @@ def diagnose_response(
         noise_estimated=measured.noise is None,
         verdict=verdict,
         findings=() if few is None else with_consequences(ring, few.findings, causes),
-        warnings=(*said, *(() if few is None else few.said), *_warnings(fit)),
+        warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
@@ -321,7 +321,7 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    return (*reversed_ones(fit.state), *said, *odd_readings(fit.state))
+    return (*said, *odd_readings(fit.state))
 
 
 def _misfit(fit: DenseFit, read: Array) -> Misfit:
