@@ -91,43 +91,6 @@ def test_a_measurement_against_itself_is_nothing(small_ring, before):
     assert (same.verdict, same.findings) == ("nothing", ())
 
 
-def among_errors(ring, changes=(), seed=1):
-    """Measured by AT in a machine with all usual small errors, which nobody states."""
-    return simulate_response(
-        ring, changes, background={"all": None}, noise=(5e-7, 3e-7), seed=seed, machine_seed=11,
-        progress=False,
-    ).measured  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def usual(small_ring):
-    return among_errors(small_ring)
-
-
-@pytest.mark.parametrize(
-    "cause",
-    [
-        Cause("family_gradient", "QF", 1e-4),
-        pytest.param(Cause("family_sextupole", "sf", 0.01), marks=pytest.mark.slow),
-    ],
-    ids=lambda cause: cause.effect,
-)
-def test_a_supply_is_told_among_small_errors_that_both_have(small_ring, usual, cause):
-    """One horizontal corrector and the RF tell little of the horizontal optics: what is not known
-    of it makes no magnet out of a supply, and is in the amount's error."""
-    result = diagnose(small_ring, among_errors(small_ring, [cause], 2), reference=usual)
-    (found,) = result.findings
-    assert (found.effect, found.element) == (cause.effect, cause.element)
-    assert abs(found.amount - cause.amount) < 3 * found.amount_sigma
-    assert found.amount_sigma < 0.2 * abs(cause.amount)
-
-
-@pytest.mark.slow
-def test_nothing_changed_among_small_errors(small_ring, usual):
-    same = diagnose(small_ring, among_errors(small_ring, (), 3), reference=usual)
-    assert (same.verdict, same.findings) == ("nothing", ())
-
-
 def test_a_corrector_that_was_reversed_since_is_named(small_ring, before):
     kicks = np.where(np.arange(len(before.kicks)) == 4, -1.0, 1.0)
     wrong = replace(before, response=before.response * kicks[:, None, None])

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.change_among_errors import change_among_errors
 from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one, score
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.family import Told
-from tmlattice.diagnosis.few import Few, few_causes
+from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.magnets import families
@@ -32,7 +31,8 @@ from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, t
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.diagnosis.rounds import linear, marginal, settle
 from tmlattice.diagnosis.state import State, begin, bend, jump
-from tmlattice.effects import Cause, RingEffect, find
+from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
+from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -42,7 +42,6 @@ from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import (
-    Errors,
     Predicted,
     ResponseData,
     Split,
@@ -129,16 +128,17 @@ def diagnose_change(
         errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     else:
         errors = fitted.at.errors
+    there, change = response_change(first, errors, second)
+    data = response_data(there, change)
+    split = split_columns(data, holdout, rng)
+    judgement = Judgement(false_alarm=false_alarm)
     options = {
         "reference": True, "holdout": holdout,
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    judgement = Judgement(false_alarm=false_alarm)
-    split = split_columns(first, holdout, rng)
-    asked = (effects, max_effects, judgement, seed, progress)
-    shared = change_among_errors(first, second, fitted, split, *asked) if trials else None
-    there, few, data = shared or _few_in_difference(first, second, errors, split, *asked)
+    asked = changes() if effects is None else effects
+    few = few_causes(data, split, asked, max_effects, judgement, seed, progress)
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
         return as_diagnosis(
@@ -169,13 +169,11 @@ def diagnose_change(
     )  # fmt: skip
 
 
-def _few_in_difference(
-    first: ResponseData, second: ResponseData, errors: Errors, split: Split, *asked: Any
-) -> tuple[Ring, Few | None, ResponseData]:
-    """The ring of the first measurement, few causes of the difference, and that itself."""
-    there, change = response_change(first, errors, second)
-    data = response_data(there, change)
-    return there, few_causes(data, split, *asked), data
+def changes() -> list[str]:
+    """Names of what changes between two measurements: every usual effect, and supplies of families,
+    which one measurement alone does not ask for all of."""
+    families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
+    return list(dict.fromkeys([*modelled(), *families]))
 
 
 def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:

@@ -23,7 +23,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Search, explain
-from tmlattice.observe.orbit_response import Hypothesis, Predicted, ResponseData, Split
+from tmlattice.observe.orbit_response import Hypothesis, ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
 
 Flags = NDArray[np.bool_]
@@ -99,7 +99,7 @@ def few_causes(
     places = {name: sum(h[0] == name for h in hypotheses) for name in {h[0] for h in hypotheses}}
     problem = Response(
         base=design.at.bend(),
-        used=used(data, split),
+        used=_used(data, split),
         places=places,
         rare=rare(data.ring, list(places)),
         judgement=judgement,
@@ -124,7 +124,7 @@ def few_causes(
         found = explain(replace(search, most=number), before, found)
     if found.fit.chi2 > search.enough:
         return None
-    return few_told(data, split, found, before.point.view, count, judgement)
+    return _told(data, split, found, count, judgement)
 
 
 def _hopeless(
@@ -157,30 +157,16 @@ def _beyond(problem: Response, before: Fit, patterns: int, enough: float) -> flo
     return rest
 
 
-def used(data: ResponseData, split: Split) -> Flags:
+def _used(data: ResponseData, split: Split) -> Flags:
     """Readings that the search fits, [column, monitor, 2]."""
     half = split.held.copy()
     half[-1] = True  # the RF
     return np.isfinite(data.orbits) & (~half[:, None] | split.half)[:, :, None]
 
 
-def few_told(
-    data: ResponseData,
-    split: Split,
-    found: Explanation,
-    base: Predicted,
-    count: int,
-    judgement: Judgement,
+def _told(
+    data: ResponseData, split: Split, found: Explanation, count: int, judgement: Judgement
 ) -> Few:
-    """What a search says, with its causes as steps from what is known.
-
-    Args:
-        data, split: what the steps are judged by.
-        found: by the search.
-        base: what is known.
-        count: of readings that were searched.
-        judgement: thresholds.
-    """
     causes = found.fit.causes
     p_value = float(chi2.sf(found.fit.chi2, count - len(causes)))
     findings = findings_of(data.ring, found, (), judgement)
@@ -188,6 +174,7 @@ def few_told(
         replace(found, full=False), findings, p_value, False, judgement
     )
     design = begin(data, split)
+    base = found.before.point.view
     steps = [Step.scored("design", 0, score(design, split.held))]
     state = design
     for i, cause in enumerate(causes, 1):

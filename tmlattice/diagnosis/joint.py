@@ -44,7 +44,7 @@ from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.newton import Fit, Outcome, fit
+from tmlattice.inference.newton import Outcome, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
@@ -129,7 +129,7 @@ def diagnose_together(
         (name, place) for name in (rms or background_rms({"all": None}))
         for place in find(name).places(ring)
     ]  # fmt: skip
-    found, small = sought(search, everywhere, rms, known)
+    found, small = _sought(search, everywhere, rms, known)
     progress("report")
     return _told(
         ring, parts, problem, found, small, how,
@@ -163,20 +163,13 @@ def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]
 
 
 # --- the search ----
-def sought(
+def _sought(
     search: Search,
     everywhere: Sequence[Hypothesis],
     told: Mapping[str, float] | None,
     known: Known | None,
 ) -> tuple[Explanation, Learnt | None]:
-    """Few causes alone, or a few among small errors everywhere: what the data speak for.
-
-    Args:
-        search: what is searched.
-        everywhere: every small error.
-        told: their rms by effect; None: the data say.
-        known: of them beforehand.
-    """
+    """Few causes alone, or a few among small errors everywhere: what the data speak for."""
     problem = search.problem
     search.progress("scan")
     start = fit(problem, (), problem.first)
@@ -193,32 +186,10 @@ def sought(
             if few.full and not explained(few) and search.most > FEW:
                 few = explain(search, start)
             return few, None
+    search.progress("small errors")
     usual = background_rms({"all": None}) if told is None else told
     seen = [h for h in everywhere if problem.sees(h)]
     start_from = Known.usual(seen, usual) if known is None else known
-    return among_errors(search, start, start_from, learn=learn, few=few)
-
-
-def among_errors(
-    search: Search,
-    start: Fit,
-    start_from: Known,
-    *,
-    learn: bool,
-    few: Explanation | None = None,
-) -> tuple[Explanation, Learnt | None]:
-    """A few causes among small errors everywhere.
-
-    Args:
-        search: what is searched.
-        start: nuisances alone.
-        start_from: what is known of the small errors beforehand.
-        learn: their sizes are learnt.
-        few: what few causes explain alone, where that was tried: it stands where the data speak for
-            no small errors.
-    """
-    problem = search.problem
-    search.progress("small errors")
 
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:
         return small_errors_of(problem, start_from, nuisances, causes, learn=learn)
@@ -236,7 +207,8 @@ def among_errors(
     if not tried:  # the readings are none of small errors
         return (few if few is not None else explain(search, start)), None
     found, small = max(tried, key=lambda one: _density(*one))
-    if few is not None and learn and small.log_evidence < CLEAR:
+    if learn and small.log_evidence < CLEAR:
+        assert few is not None
         return (explain(search, start) if few.full else few), None
     for _ in range(problem.judgement.retaken):
         if not found.named:

@@ -235,13 +235,8 @@ class Among(Problem):
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         return np.array([find(name).some_left(amount) for (name, _), amount in own])
 
-    def learnt(self, explained: Fit, best: float = BEST) -> Known:
-        """What is known of the small errors since, beside an explanation.
-
-        Args:
-            explained: nuisances, and what was found.
-            best: share of the variance of a direction that is known at most.
-        """
+    def learnt(self, explained: Fit) -> Known:
+        """What is known of the small errors since, beside an explanation."""
         seen = explained.projection.out(self.white(self.rows))
         values, vectors = np.linalg.eigh(seen @ seen.T)
         big = values > LEAST
@@ -252,7 +247,7 @@ class Among(Problem):
         big = share > LEAST
         return replace(
             self.known, amounts=self.estimate(explained.clean), seen=directions[:, big].T,
-            share=np.minimum(share[big], best),
+            share=np.minimum(share[big], BEST),
         )  # fmt: skip
 
 
