@@ -18,6 +18,7 @@ PLACES = {
     "quadrupole_offset_x": ["qd::12", "qa3::2"],
     "quadrupole_offset_y": ["qd::12", "qa3::2"],
     "family_gradient": ["qd", "qe5"],
+    "family_sextupole": ["s1", "s4"],
     "dipole_field": ["b::28", "b_in::10", "bo_out::5"],
     "dipole_roll": ["b::28", "b_in::10", "bo_out::5"],
     "bend_gradient": ["b::28", "b_in::10", "bo_out::5"],

@@ -94,6 +94,17 @@ def test_family_gradient_changes_every_member_and_no_other(small_ring):
     assert np.abs(family - AtEngine(small_ring).track(launch)).max() > 1e-6
     with pytest.raises(UnknownNameError, match="QF"):
         AtEngine(small_ring, [Cause("family_gradient", "QG", 0.01)])
+    family = AtEngine(small_ring, [Cause("family_sextupole", "sf", 0.1)]).track(launch)
+    single = [Cause("sextupole_strength", f"sf::{i}", 0.1) for i in range(16)]
+    np.testing.assert_array_equal(family, AtEngine(small_ring, single).track(launch))
+
+
+def test_two_errors_of_one_strength_multiply_as_in_the_model(small_ring):
+    launch = LAUNCH[None] / 10
+    twice = [Cause("quadrupole_gradient", "qf::3", a) for a in (0.2, -0.1)]
+    once = [Cause("quadrupole_gradient", "qf::3", 1.2 * 0.9 - 1)]
+    both = [AtEngine(small_ring, causes).track(launch) for causes in (twice, once)]
+    np.testing.assert_allclose(*both, rtol=0, atol=1e-14)
 
 
 def test_quadrupole_offset_is_that_of_its_centre(tmp_path):
@@ -267,7 +278,7 @@ def test_gradient_of_a_bend_is_that_of_another_design(tmp_path):
 def test_no_effect_is_left_untested():
     """Runs last of the effects' tests: each has met a formula above."""
     on_one = {n for n, e in CATALOGUE.items() if isinstance(e, RingEffect) and not e.energy}
-    assert on_one - {"family_gradient"} <= TOUCHED
+    assert on_one - {"family_gradient", "family_sextupole"} <= TOUCHED
 
 
 def test_octupole_multipole_and_solenoid(tmp_path):

@@ -112,6 +112,7 @@ CASES = {
     "sextupole_offset_y": ("sextupole", 1e-6),
     "insertion_device_focusing": ("wiggler", 1e-6),
     "family_gradient": ("family", 1e-6),
+    "family_sextupole": ("family", 1e-3),
     "corrector_roll": ("hcorrector", 1e-4),
     "radiation_loss_bends": (None, 1e-4),
     "radiation_loss_wigglers": (None, 1e-4),

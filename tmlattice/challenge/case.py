@@ -43,9 +43,9 @@ TRUTH = "tmlattice-challenge-truth"
 
 CAUSES = {
     "A": (1, 1), "B": (1, 1), "C": (2, 3), "D": (0, 1), "E": (0, 0),
-    "R": (1, 1), "T": (1, 1), "P": (1, 1000), "M": (1, 1),
+    "R": (1, 1), "T": (1, 1), "P": (1, 1), "M": (1, 1),
 }  # fmt: skip
-"""Fewest and most of a case, by tier; a pair may differ by all the sextupoles of a family."""
+"""Fewest and most of a case, by tier."""
 TIERS = tuple(CAUSES)
 
 BEFORE = "before_"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tmlattice.challenge.baselines import SUSPECTS, Guesses, pursuits
 from tmlattice.challenge.case import Case, Truth, ring_of
-from tmlattice.challenge.kinds import problem_of
+from tmlattice.challenge.kinds import CHANGES, problem_of
 from tmlattice.challenge.oracle import REFINED, answer
 from tmlattice.effects import Cause, find, modelled
 from tmlattice.inference.judgement import DEFAULT
@@ -95,8 +95,11 @@ def weighed(case: Case, truth: Truth) -> Weighed:
 
 def _hypotheses(case: Case, problem: Problem) -> list[Hypothesis]:
     ring = ring_of(case.lattice)
+    names = modelled(case.options.get("effects"), turns=True)
+    if case.before and "effects" not in case.options:
+        names = list(dict.fromkeys([*names, *(name for some in CHANGES for name in some)]))
     return [
-        (name, place) for name in modelled(case.options.get("effects"), turns=True)
+        (name, place) for name in names
         for place in find(name).places(ring) if problem.sees((name, place))
     ]  # fmt: skip
 

@@ -45,9 +45,9 @@ READING_NOISE = 2e-5
 
 CHANGES = (
     ("quadrupole_gradient",), ("family_gradient",), ("insertion_device_focusing",),
-    ("sextupole_strength",), ("corrector_calibration",), ("monitor_gain_x", "monitor_gain_y"),
+    ("family_sextupole",), ("corrector_calibration",), ("monitor_gain_x", "monitor_gain_y"),
 )  # fmt: skip
-"""What a pair may differ by, drawn evenly; of sextupoles all of a family."""
+"""What a pair may differ by, drawn evenly."""
 
 
 @dataclass(frozen=True)
@@ -243,9 +243,5 @@ def _pair(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...] | None:
     if effect.name not in (asked.effects or names) or not places:
         return None
     place = places[int(random.integers(len(places)))]
-    some = [place]
-    if effect.name == "sextupole_strength" and place is not None:
-        family = ring[place].family
-        some = [p for p in places if p is not None and ring[p].family == family]
     cap = effect.largest * float(random.choice([-1.0, 1.0]))
-    return draw.sized(ruler, [Cause(effect.name, p, cap) for p in some], draw.target())
+    return draw.sized(ruler, [Cause(effect.name, place, cap)], draw.target())

@@ -33,7 +33,7 @@ class Places:
         for element in ring.elements:
             self.s.setdefault(element.name, []).append(element.s)
         for element in ring.elements:
-            if element.kind == "quadrupole" and element.family not in self.s:
+            if element.kind in ("quadrupole", "sextupole") and element.family not in self.s:
                 members = [e.s for e in ring.elements if e.family == element.family]
                 self.s[element.family] = members
 

@@ -218,9 +218,6 @@ def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
     first = findings[0] if findings else None
     small = bool(answer.get("priors"))  # errors everywhere are no fault
     row: Row = {"detected": bool(findings) or (answer["verdict"] == "distributed" and not small)}
-    if truth.tier == "P":  # all the sextupoles of a family are one change
-        named = [c for c in truth.causes if first is not None and c.element == first["element"]]
-        return row | finding_row(first, (*named, *truth.causes)[0], places)
     if len(truth.causes) == 1:
         return row | finding_row(first, truth.causes[0], places)
     if truth.unknown is not None and truth.unknown.get("element"):

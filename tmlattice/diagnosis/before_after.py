@@ -31,7 +31,8 @@ from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, t
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.diagnosis.rounds import linear, marginal, settle
 from tmlattice.diagnosis.state import State, begin, bend, jump
-from tmlattice.effects import Cause, RingEffect, find
+from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
+from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -136,7 +137,8 @@ def diagnose_change(
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    asked = changes() if effects is None else effects
+    few = few_causes(data, split, asked, max_effects, judgement, seed, progress)
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
         return as_diagnosis(
@@ -165,6 +167,13 @@ def diagnose_change(
         noise_estimated=True,
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
+
+
+def changes() -> list[str]:
+    """Names of what changes between two measurements: every usual effect, and supplies of families,
+    which one measurement alone does not ask for all of."""
+    families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
+    return list(dict.fromkeys([*modelled(), *families]))
 
 
 def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects import Cause, RingEffect, find
-from tmlattice.effects.effect import StrengthEffect
+from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
+from tmlattice.effects.effect import FamilyEffect, StrengthEffect
 from tmlattice.lattice import Element, Kind, Ring
 
 Array = NDArray[np.float64]
@@ -183,9 +183,9 @@ def _is_element(ring: Ring, name: str) -> bool:
 def _members(ring: Ring, name: str | None) -> list[Element]:
     """The element of this name, or the family's."""
     own = [element for element in ring.elements if element.name == name]
-    family = find("family_gradient")
-    assert isinstance(family, RingEffect)
-    return own or [ring.elements[i] for i in family.members(ring, name)]
+    families = (effect for effect in CATALOGUE.values() if isinstance(effect, FamilyEffect))
+    shared = (effect.members(ring, name) for effect in families)
+    return own or [ring.elements[i] for i in next((some for some in shared if some), ())]
 
 
 def _kind(ring: Ring, name: str | None) -> Kind | None:

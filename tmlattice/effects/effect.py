@@ -6,6 +6,7 @@ To add an effect, write a class of one of them and `register` it: see docs/new_e
 """
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Literal
 
@@ -18,6 +19,7 @@ from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
+from tmlattice.lattice.slices import stem
 from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
@@ -280,6 +282,23 @@ class StrengthEffect(RingEffect):
         if abs(1 + amount) < LEAST_FIELD:
             return None
         return self.changed(element, 1 / (1 + amount) - 1, 0.0)
+
+
+class FamilyEffect(StrengthEffect):
+    """The same error of all magnets of a family: their supply's."""
+
+    def places(self, ring: Ring) -> list[str | None]:
+        """Families in the order of their first members."""
+        count = Counter(e.family for e in ring.elements if self.sits_on(e))
+        return [family for family, members in count.items() if members > 1]
+
+    def members(self, ring: Ring, place: str | None) -> list[int]:
+        """All magnets of the family; or, where none is called so, those whose names begin so, up
+        to an underscore, a dot or a number of their own."""
+        name = (place or "").casefold()
+        powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
+        family = [i for i in powered if ring.elements[i].family.casefold() == name]
+        return family or [i for i in powered if stem(ring.elements[i].name) == name]
 
 
 LEAST_FIELD = 0.1

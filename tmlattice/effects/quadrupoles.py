@@ -1,11 +1,14 @@
 """What goes wrong with quadrupoles, and with gradients anywhere."""
 
-from collections import Counter
-
 from tmlattice.effects.build import Build
-from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
-from tmlattice.lattice import Element, Ring
-from tmlattice.lattice.slices import stem
+from tmlattice.effects.effect import (
+    ErrorEffect,
+    FamilyEffect,
+    RingEffect,
+    StrengthEffect,
+    register,
+)
+from tmlattice.lattice import Element
 
 
 class _OnQuadrupole(RingEffect):
@@ -167,7 +170,7 @@ class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
 
 
 @register
-class FamilyGradient(_OnQuadrupole, StrengthEffect):
+class FamilyGradient(_OnQuadrupole, FamilyEffect):
     """The power supply of a family of quadrupoles is off: all of them have the same error."""
 
     name = "family_gradient"
@@ -184,16 +187,3 @@ class FamilyGradient(_OnQuadrupole, StrengthEffect):
     )
     largest = 0.05
     sits_on_text = "families of two or more quadrupoles with k1 not 0, by the family's name"
-
-    def places(self, ring: Ring) -> list[str | None]:
-        """Families in the order of their first members."""
-        count = Counter(e.family for e in ring.elements if self.sits_on(e))
-        return [family for family, members in count.items() if members > 1]
-
-    def members(self, ring: Ring, place: str | None) -> list[int]:
-        """All quadrupoles of the family; or, where none is called so, those whose names begin so,
-        up to an underscore, a dot or a number of their own."""
-        name = (place or "").casefold()
-        powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
-        family = [i for i in powered if ring.elements[i].family.casefold() == name]
-        return family or [i for i in powered if stem(ring.elements[i].name) == name]

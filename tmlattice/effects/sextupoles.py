@@ -1,6 +1,12 @@
 """What goes wrong with sextupoles."""
 
-from tmlattice.effects.effect import ErrorEffect, RingEffect, StrengthEffect, register
+from tmlattice.effects.effect import (
+    ErrorEffect,
+    FamilyEffect,
+    RingEffect,
+    StrengthEffect,
+    register,
+)
 from tmlattice.lattice import Element
 
 
@@ -67,3 +73,23 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     to_check = "Survey its height against the quadrupoles beside it."
     background = 1e-4
     largest = 3e-3
+
+
+@register
+class FamilySextupole(_OnSextupole, FamilyEffect):
+    """The power supply of a family of sextupoles is off: all of them have the same error."""
+
+    name = "family_sextupole"
+    words = "wrong strength of a whole family of sextupoles"
+    usual = False  # between two measurements of one machine, or where somebody names it
+    strength = "k2"
+    unit = "relative"
+    sign = "k2 of every member becomes (1 + amount) k2; -2 reverses them"
+    quantity = "integrated strength of every member"
+    remedy = "set or repair the supply of the family {}"
+    to_check = (
+        "Read back the current of the family's common supply with a second instrument; compare its "
+        "setting with the lattice file."
+    )
+    largest = 2.0
+    sits_on_text = "families of two or more sextupoles with k2 not 0, by the family's name"

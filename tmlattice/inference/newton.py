@@ -189,6 +189,8 @@ def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Poin
         if point.projection is None:
             break
         change = point.projection.coordinates(point.residual)
+        if not len(change):
+            break
         point = problem.at(causes, problem.moved(point.nuisances, change))
     return point
 

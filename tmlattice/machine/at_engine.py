@@ -375,12 +375,13 @@ def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
     """What is wrong with the elements, in the ring itself and by causes, by place in the ring."""
     causes = list(causes)
     check(ring, causes)
-    amounts: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    amounts: dict[int, dict[str, float]] = defaultdict(dict)
     for cause in causes:
         effect = find(cause.effect)
         if isinstance(effect, RingEffect):
             for i in effect.members(ring, cause.element):
-                amounts[i][effect.name] += cause.amount
+                own = amounts[i]
+                own[effect.name] = effect.joined(own.get(effect.name, 0.0), cause.amount)
     wrong = {
         i: errors_of(e, ring.energy) for i, e in enumerate(ring.elements) if e.errors != NO_ERRORS
     }
