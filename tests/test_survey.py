@@ -36,9 +36,18 @@ def test_places_between_elements_lie_on_the_orbit(small_ring):
 
 
 def test_names_of_findings_that_stand_together_step_aside(small_ring):
-    found = [SimpleNamespace(s=s, where=None) for s in (10.0, 11.0, 12.0, 60.0)]
-    diagnosis = SimpleNamespace(
-        ring=small_ring, findings=(*found, SimpleNamespace(s=None, where=None))
-    )
-    placed = plan.placed(diagnosis, survey(small_ring))
-    assert [(number, off) for number, _, _, off in placed] == [(1, 0), (2, 1), (3, 2), (4, 0)]
+    """The name of the last but one would stand on that of the one before, from the other side."""
+    places = {"a": 10.0, "b": 11.0, "c": 12.0, "end_1": 13.2, "QF::3": 20.0, "d": 60.0}
+    found = [SimpleNamespace(s=s, where=None, element=name) for name, s in places.items()]
+    nowhere = SimpleNamespace(s=None, where=None, element=None)
+    plan_of = survey(small_ring)
+    diagnosis = SimpleNamespace(ring=small_ring, findings=(*found, nowhere))
+    placed = plan.placed(diagnosis, plan_of)
+    assert [number for number, *_ in placed] == [1, 2, 3, 4, 5, 6]
+    assert placed[0][-1] == placed[-1][-1] == 0
+    boxes = [
+        plan._box(at, plan.label(number, own), lines, plan_of) for number, own, at, lines in placed
+    ]
+    for i, one in enumerate(boxes):
+        for other in boxes[:i]:
+            assert (one[1] <= other[0]).any() or (other[1] <= one[0]).any()

@@ -28,8 +28,8 @@ class Small:
 SMALL = {"monitor": Small("o", "tab:cyan", 0.02), "corrector": Small("^", "tab:orange", -0.02)}
 """By kind."""
 
-ROOM = 0.4
-"""Of the ring's size: nearer to each other than that the names of two findings would overlap."""
+LETTER, LINE, BESIDE = 0.022, 0.06, 0.06
+"""Of the ring's size: a letter's width and a line's height of a name, and how far it stands off."""
 
 CULPRIT, SUSPECT = "#d1105a", "#c58a00"
 
@@ -72,15 +72,33 @@ def inwards(place: Array, plan: Survey) -> tuple[str, str]:
 def placed(diagnosis: Diagnosis, plan: Survey) -> list[tuple[int, Finding, Array, int]]:
     """Findings that have a place: number, finding, (x, y), m, and by how many lines its name steps
     aside for the names of those near it."""
-    room = ROOM * float(np.ptp(plan.ends, axis=0).max())
     found: list[tuple[int, Finding, Array, int]] = []
+    boxes: list[Array] = []
     for number, finding in enumerate(diagnosis.findings, 1):
         at = place_of(finding, diagnosis, plan)
         if at is None:
             continue
-        taken = {off for *_, other, off in found if np.hypot(*(at - other)) < room}
-        found.append((number, finding, at, next(n for n in range(99) if n not in taken)))
+        asides = ((n, _box(at, label(number, finding), n, plan)) for n in range(99))
+        lines, box = next((n, b) for n, b in asides if not any(_meet(b, own) for own in boxes))
+        boxes.append(box)
+        found.append((number, finding, at, lines))
     return found
+
+
+def _box(at: Array, name: str, lines: int, plan: Survey) -> Array:
+    """What a name takes up that steps aside by so many lines, [(low, high), (x, y)], m."""
+    size = float(np.ptp(plan.ends, axis=0).max())
+    high, side = inwards(at, plan)
+    off, width = BESIDE * size, LETTER * size * len(name)
+    left = at[0] - off - width if side == "left" else at[0] + off
+    away = -1.0 if high == "bottom" else 1.0
+    middle = at[1] + away * (LINE * size * lines + (off if high != "middle" else 0.0))
+    half = LINE * size / 2
+    return np.array([[left, middle - half], [left + width, middle + half]])
+
+
+def _meet(one: Array, other: Array) -> bool:
+    return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())
 
 
 def label(number: int, finding: Finding) -> str:
