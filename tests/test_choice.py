@@ -91,7 +91,10 @@ def test_more_than_three_faults_are_no_small_errors_everywhere(small_ring, fault
     scan sees a fourth; of the second they do not, though neighbouring monitors agree."""
     data = simulate(small_ring, faults, shots=8, seed=seed).measurement()
     found = diagnose(small_ring, data)
-    named = {(f.effect, f.element) for f in found.findings}
-    assert {(fault.effect, fault.element) for fault in faults[:clear]} <= named
+    named = {(f.effect, f.element): f for f in found.findings}
+    for fault in faults[:clear]:
+        told = named[fault.effect, fault.element]
+        assert abs(told.amount - fault.amount) < 4 * told.amount_sigma
+        assert told.amount_sigma < 0.1 * abs(fault.amount)
     assert len(named) == len(faults)
     assert not found.priors

@@ -338,8 +338,7 @@ def _good_monitors(state: State) -> Flags:
         count = np.maximum(seen.sum(axis=0), 1)
         rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
         rms[(seen.sum(axis=0) == 0) | (gain < 0.2)] = np.inf  # reversed, until gains come in
-        if np.isfinite(
-            typical := np.median(rms)
-        ):  # else the fit is astray, not half of the monitors
+        typical = np.median(rms)
+        if np.isfinite(typical):  # else the fit is astray, not half of the monitors
             ratio = np.maximum(ratio, rms / typical)
     return np.asarray(ratio <= BAD)

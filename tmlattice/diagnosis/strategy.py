@@ -20,7 +20,7 @@ from tmlattice.errors import BeamLostError
 from tmlattice.inference import chi2
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Problem
-from tmlattice.inference.search import Explanation, Search, explain, revised
+from tmlattice.inference.search import Explanation, Search, explain, on_readings, revised
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import turns_of
@@ -164,13 +164,10 @@ def _likelier(few: Explanation, among: Explanation) -> bool:
 def _log_marginal(found: Explanation, dropped: NDArray[np.bool_]) -> float:
     """Log evidence, launches and small errors integrated out, up to a constant of the readings."""
     problem = turns_of(found).without(dropped)
-    again = fit(problem, found.fit.causes, found.fit.nuisances, found.fit.kicks)
+    evidence, again = on_readings(problem, found)
     if not again.good:
         return -np.inf
-    aside = problem.unknown_prior(len(problem.monitors)) * len(found.monitors)
-    aside += problem.judgement.spike * len(found.spikes)
-    volume = problem.whitening.log_volume + again.projection.log_volume
-    return again.log_evidence + aside + volume
+    return evidence + problem.whitening.log_scale + again.projection.log_volume
 
 
 def _errors(found: Found, small: SmallErrors) -> list[Cause]:

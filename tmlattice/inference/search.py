@@ -219,10 +219,19 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
 
 def _weighed(search: Search, one: State, other: State) -> float:
     """Log evidence of an explanation on the readings that both keep."""
-    problem = search.problem.without(one.dropped | other.dropped)
-    refitted = fit(problem, one.fit.causes, one.fit.nuisances, one.fit.kicks)
-    aside = problem.unknown_prior(len(problem.monitors)) * len(one.monitors)
-    return refitted.log_evidence + aside + problem.judgement.spike * len(one.spikes)
+    return on_readings(search.problem.without(one.dropped | other.dropped), one)[0]
+
+
+def on_readings(problem: Problem, state: State) -> tuple[float, Fit]:
+    """Log evidence of what is explained, refitted on the readings of a problem; and that fit.
+
+    Args:
+        problem: with the readings that two explanations are compared on.
+        state: one of them.
+    """
+    refitted = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
+    aside = problem.unknown_prior(len(problem.monitors)) * len(state.monitors)
+    return refitted.log_evidence + aside + problem.judgement.spike * len(state.spikes), refitted
 
 
 # --- looking ----

@@ -72,7 +72,7 @@ class Whitening:
             assert failed == 0
 
     @property
-    def log_volume(self) -> float:
+    def log_scale(self) -> float:
         """Log density at their peak of readings in units of their own noise, over that of noise
         alone: what it costs the likelihood that small errors might be anywhere."""
         return 0.0 if self._inverse is None else float(np.log(np.diag(self._inverse)).sum())
