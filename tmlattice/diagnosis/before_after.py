@@ -26,6 +26,7 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
+from tmlattice.diagnosis.left_open import left_open
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, trials_of
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
@@ -138,7 +139,7 @@ def diagnose_change(
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
     asked = changes() if effects is None else effects
-    few = few_causes(data, split, asked, max_effects, judgement, seed, progress)
+    few = few_causes(data, split, asked, max_effects, judgement, seed, progress, left_open(fitted))
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
         return as_diagnosis(

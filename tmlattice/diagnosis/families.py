@@ -26,7 +26,13 @@ from tmlattice.diagnosis.fields import (
 from tmlattice.diagnosis.magnets import families
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import DELTA, Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import (
+    DELTA,
+    Errors,
+    Hypothesis,
+    Predicted,
+    ResponseData,
+)
 
 Array = NDArray[np.float64]
 
@@ -71,6 +77,10 @@ class MonitorGain(_Monitors):
             for i, name in enumerate(names)
         ]
 
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each its own."""
+        return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
+
 
 class MonitorRoll(_Monitors):
     """What each plane of a monitor reads of the other: roll and coupling."""
@@ -99,6 +109,15 @@ class MonitorRoll(_Monitors):
             for effect, amount in zip(self.effects, ((x - y) / 2, (x + y) / 2), strict=True)
         ]
 
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """What x reads of y, and y of x."""
+        roll, coupling = self.effects
+        return [
+            {(roll, name): side / 2, (coupling, name): 0.5}
+            for name in data.measured.monitors
+            for side in (1, -1)
+        ]
+
 
 class _Columns(Family):
     per = "column"
@@ -108,6 +127,13 @@ class _Columns(Family):
 
     def count(self, data: ResponseData) -> int:
         return len(data.kicks) - 1  # the RF's step is known
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each its own; of the RF there is none."""
+        own: list[dict[Hypothesis, float]] = [
+            {(self.name, name): 1.0} for name in data.measured.correctors
+        ]
+        return [*own, {}]
 
     def _told(self, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
         names = data.measured.correctors
@@ -202,6 +228,10 @@ class EnergySpread(Family):
             return []
         amount = DELTA * float(np.sqrt(values[0]))
         return [(Cause("energy_spread", None, amount), DELTA**2 * float(sigma[0]) / (2 * amount))]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """By the square of the amount."""
+        return [{("energy_spread", None): DELTA**2}]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
 
 Array = NDArray[np.float64]
 Told = tuple[Cause, float]
@@ -65,6 +65,11 @@ class Family(ABC):
     @abstractmethod
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
         """As causes, with errors."""
+
+    @abstractmethod
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """What a unit of each number is of the catalogue's effects (amounts, to their powers): of
+        small numbers."""
 
     def count(self, data: ResponseData) -> int:
         """Parameters, for people."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.dense import DenseFit, Step, score
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
+from tmlattice.diagnosis.left_open import LeftOpen, blurred
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import find, rare
@@ -23,7 +24,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Search, explain
-from tmlattice.observe.orbit_response import Hypothesis, ResponseData, Split
+from tmlattice.observe.orbit_response import Hypothesis, Predicted, ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
 
 Flags = NDArray[np.bool_]
@@ -49,6 +50,10 @@ where it is worth no more: of a column that is read by half, a round finds half 
 LARGER = 2.0
 """Times the largest fault: a kick of more is none, and stands for what it does to the tunes by all
 sextupoles."""
+
+
+BLURRED, AGAIN = 2 * 10**7, 3
+"""Readings times what is left open, from which on that is not looked at; searches at most."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,7 @@ def few_causes(
     judgement: Judgement,
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
+    open_: LeftOpen | None = None,
 ) -> Few | None:
     """The few causes of a response, or None where few do not explain it.
 
@@ -90,6 +96,7 @@ def few_causes(
         judgement: thresholds.
         seed: of the threshold's simulation.
         progress: told what is being done.
+        open_: what is not known of the ring, whose response is known nevertheless.
     """
     hypotheses = single_causes(data, effects)
     if not hypotheses:
@@ -124,7 +131,22 @@ def few_causes(
         found = explain(replace(search, most=number), before, found)
     if found.fit.chi2 > search.enough:
         return None
-    return _told(data, split, found, count, judgement)
+    if open_ is not None and len(open_.root.T) * problem.used.size <= BLURRED:
+        found = _unsure(search, problem, found, open_)
+    return _told(data, split, problem.base, found, count, judgement)
+
+
+def _unsure(search: Search, plain: Response, found: Explanation, open_: LeftOpen) -> Explanation:
+    """The search repeated where what causes do is known no better than the ring is."""
+    for _ in range(AGAIN):
+        problem = blurred(plain, open_, found.fit.causes)
+        again = explain(replace(search, problem=problem), fit(problem, (), problem.first))
+        if not again.fit.causes or again.fit.chi2 > search.enough:
+            break
+        same, found = again.names == found.names, again
+        if same:
+            break
+    return found
 
 
 def _hopeless(
@@ -165,7 +187,12 @@ def _used(data: ResponseData, split: Split) -> Flags:
 
 
 def _told(
-    data: ResponseData, split: Split, found: Explanation, count: int, judgement: Judgement
+    data: ResponseData,
+    split: Split,
+    base: Predicted,
+    found: Explanation,
+    count: int,
+    judgement: Judgement,
 ) -> Few:
     causes = found.fit.causes
     p_value = float(chi2.sf(found.fit.chi2, count - len(causes)))
@@ -174,7 +201,6 @@ def _told(
         replace(found, full=False), findings, p_value, False, judgement
     )
     design = begin(data, split)
-    base = found.before.point.view
     steps = [Step.scored("design", 0, score(design, split.held))]
     state = design
     for i, cause in enumerate(causes, 1):

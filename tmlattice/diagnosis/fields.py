@@ -16,7 +16,7 @@ from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
 
 Array = NDArray[np.float64]
 
@@ -66,6 +66,13 @@ class _Magnets(Family):
             (Cause(self.effect, place, share * float(value)), share * float(error))
             for pieces, value, error in zip(self.shares(data), values, sigma, strict=True)
             for place, share in pieces.items()
+        ]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Of every piece."""
+        return [
+            {(self.effect, place): share for place, share in pieces.items()}
+            for pieces in self.shares(data)
         ]
 
 

@@ -171,6 +171,7 @@ def _sought(
 ) -> tuple[Explanation, Learnt | None]:
     """Few causes alone, or a few among small errors everywhere: what the data speak for."""
     problem = search.problem
+    seen = [h for h in everywhere if problem.sees(h)]
     search.progress("scan")
     start = fit(problem, (), problem.first)
     if start.point.lost:
@@ -182,13 +183,12 @@ def _sought(
         few = explain(replace(narrow, unnamed=False), start)
         if search.unnamed and not explained(few) and not _crowded(few):
             few = explain(narrow, start)
-        if told is not None or explained(few) or len(start.residual) > MOST:
+        if told is not None or explained(few) or len(start.residual) * len(seen) > MOST:
             if few.full and not explained(few) and search.most > FEW:
                 few = explain(search, start)
             return few, None
     search.progress("small errors")
     usual = background_rms({"all": None}) if told is None else told
-    seen = [h for h in everywhere if problem.sees(h)]
     start_from = Known.usual(seen, usual) if known is None else known
 
     def learnt(causes: Sequence[Cause], nuisances: Array) -> Learnt:

@@ -22,7 +22,7 @@ from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.among import MOST, Among, small_errors_of
+from tmlattice.inference.among import Among, small_errors_of
 from tmlattice.inference.newton import settled
 from tmlattice.inference.problem import Problem
 from tmlattice.inference.rivals import Rival
@@ -119,7 +119,7 @@ def _among(problem: Problem, explanation: Explanation, first: Rival) -> Problem:
     if not isinstance(among, Among):
         return problem
     rows = int(problem.valid.sum())
-    if rows > MOST or rows * len(among.known.hypotheses) > ROOM:
+    if rows * len(among.known.hypotheses) > ROOM:
         raise TmlatticeError("too many readings among small errors")
     known = among.learnt(explanation.fit)
     causes = [c for c in first.fit.causes if problem.sees((c.effect, c.element))]

@@ -13,14 +13,13 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky
-from scipy.linalg.lapack import dtrtri
 
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.newton import Fit, fit, settled
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
+from tmlattice.inference.root import Root, inverse_root
 from tmlattice.inference.sizes import Sizes, learn_sizes
 from tmlattice.inference.whitening import Projection
 
@@ -43,8 +42,8 @@ hundredth of their size."""
 LEAST = 0.02
 """Share of the variance of a direction that has to be known for it to be remembered."""
 
-MOST = 14_000
-"""Rows that can be whitened: a matrix of 1.6 GB, and a minute of work."""
+MOST = 10**8
+"""Rows times small errors: 0.8 GB, of which a few are held at a time."""
 
 
 @dataclass(frozen=True)
@@ -92,24 +91,18 @@ class Known:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Among(Problem):
-    """A problem whose rows small errors move too.
+class Blurred(Problem):
+    """A problem whose rows errors move too that nobody asks for: Gaussian, of size 1.
 
     Attributes:
-        inner: with the likeliest small errors among its fixed causes.
-        known: of the small errors beforehand.
-        spread: d reading / d coordinate of `known.mixed`, [error, *shape of `valid`].
-        shift: what the amounts in the model, beyond the likeliest beforehand, make of the readings,
-            of the shape of `valid`.
-        open: of which family each is, and the covariance of the logarithms of their sizes where
-            those were learnt; or None.
+        inner: what is asked.
+        spread: d reading / d error, [error, *shape of `valid`].
+        shift: what is to be put back on the readings, of the shape of `valid`; or 0.
     """
 
     inner: Problem = field(repr=False)
-    known: Known = field(repr=False)
     spread: Array = field(repr=False)
-    shift: Array = field(repr=False)
-    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
+    shift: Array | float = field(default=0.0, repr=False)
 
     @cached_property
     def rows(self) -> Array:
@@ -117,24 +110,22 @@ class Among(Problem):
         return self.inner.as_rows(self.spread)
 
     @cached_property
-    def _factor(self) -> Array:
-        """Inverse of the Cholesky factor of the rows' covariance."""
-        covariance = self.rows.T @ self.rows
-        covariance[np.diag_indices(len(covariance))] += 1.0
-        factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
-        inverse, failed = dtrtri(factor, lower=1, overwrite_c=1)
-        assert failed == 0
-        return np.asarray(np.tril(inverse))
+    def _shifted(self) -> Array | float:
+        return self.inner.as_rows(self.shift) if isinstance(self.shift, np.ndarray) else self.shift
+
+    @cached_property
+    def _root(self) -> Root:
+        return inverse_root(self.rows)
 
     @property
     def log_scale(self) -> float:
         """Of the rows' density beside the exponential of chi-square: -1/2 log det of their
         covariance, by which explanations among other small errors compare."""
-        return float(np.log(np.diagonal(self._factor)).sum())
+        return self._root.log_scale
 
     def white(self, rows: Array) -> Array:
         """Rows [..., row] of the inner problem in the covariance of all."""
-        return np.asarray(rows @ self._factor.T)
+        return self._root.white(rows)
 
     # --- the model ------------------------------------------------------------------------------
     @property
@@ -163,8 +154,8 @@ class Among(Problem):
             return replace(point, view=point)
         return replace(
             point,
-            residual=self.white(point.residual + self.inner.as_rows(self.shift)),
-            projection=Projection(self._factor[None] @ point.projection.matrix()[None]),
+            residual=self.white(point.residual + self._shifted),
+            projection=Projection(self.white(point.projection.matrix().T).T[None]),
             view=point,
         )
 
@@ -178,19 +169,9 @@ class Among(Problem):
 
     def metric(self, point: Point) -> Metric:
         """Signatures made and whitened."""
-        return _AmongMetric(self, point)
+        return _BlurredMetric(self, point)
 
-    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
-        """By how the variance along it changes with the sizes of small errors."""
-        if self.open is None or point.projection is None:
-            return np.inf
-        family, covariance = self.open
-        row = point.projection.out(self.metric(point).rows([hypothesis]))[0]
-        squares = (self.rows @ (row @ self._factor)) ** 2
-        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
-        return 2 / max(float(slope @ covariance @ slope), 1e-9)
-
-    def everywhere(self) -> "Among":
+    def everywhere(self) -> Self:
         """As the inner one."""
         return replace(self, inner=self.inner.everywhere())
 
@@ -227,11 +208,38 @@ class Among(Problem):
             return self
         return replace(self, inner=self.inner.without(dropped))
 
-    # --- the small errors -----------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class Among(Blurred):
+    """A problem among small errors.
+
+    Its inner problem has the likeliest small errors among its fixed causes, its errors are the
+    coordinates of `known.mixed`, and its shift is what the amounts in the model, beyond the
+    likeliest beforehand, make of the readings.
+
+    Attributes:
+        known: of the small errors beforehand.
+        open: of which family each is, and the covariance of the logarithms of their sizes where
+            those were learnt; or None.
+    """
+
+    known: Known = field(repr=False)
+    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
+
+    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
+        """By how the variance along it changes with the sizes of small errors."""
+        if self.open is None or point.projection is None:
+            return np.inf
+        family, covariance = self.open
+        row = point.projection.out(self.metric(point).rows([hypothesis]))[0]
+        squares = (self.rows @ self._root.back(row)) ** 2
+        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
+        return 2 / max(float(slope @ covariance @ slope), 1e-9)
+
     def estimate(self, clean: Array) -> Array:
         """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
         known = self.known
-        amounts = known.amounts + known.rms * known.mixed(self.rows @ (clean @ self._factor))
+        amounts = known.amounts + known.rms * known.mixed(self.rows @ self._root.back(clean))
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         return np.array([find(name).some_left(amount) for (name, _), amount in own])
 
@@ -251,10 +259,10 @@ class Among(Problem):
         )  # fmt: skip
 
 
-class _AmongMetric(Metric):
+class _BlurredMetric(Metric):
     chunk = 256
 
-    def __init__(self, problem: Among, point: Point) -> None:
+    def __init__(self, problem: Blurred, point: Point) -> None:
         assert point.projection is not None
         super().__init__(point.projection)
         self.problem, self.inner = problem, problem.inner.metric(point.view)
@@ -323,7 +331,7 @@ def small_errors_of(
             raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
         slopes = _signatures(inner, alone, known.hypotheses)
         on = [find(n).chain(a) for (n, _), a in zip(known.hypotheses, amounts, strict=True)]
-        slopes = np.array(on)[:, None] * slopes
+        slopes *= np.array(on)[:, None]
         shift = (amounts - known.amounts) @ slopes
         spread = known.mixed(known.rms[:, None] * slopes)
         if learn:
@@ -334,7 +342,7 @@ def small_errors_of(
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
             known = replace(known, rms=known.rms * found.scale[belongs])
-            spread = found.scale[belongs][:, None] * spread
+            spread *= found.scale[belongs][:, None]
         among = Among(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
             judgement=problem.judgement, inner=inner, known=known,
