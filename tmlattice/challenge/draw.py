@@ -10,9 +10,11 @@ from tmlattice.effects import Cause, Effect, find
 from tmlattice.errors import TmlatticeError
 
 TRIES = 1000
+SUDDEN = 2.0
+"""Times the signal to noise that was asked for, from which on an amount does not set it."""
 
 Lost = tuple[str, str | None, float]
-"""What was asked for and could not be reached: effect, place, signal to noise at the cap."""
+"""What was asked for and could not be reached: effect, place, the signal to noise that came."""
 
 
 class Measures(Protocol):
@@ -31,7 +33,7 @@ class Draw:
         signal: smallest and largest signal to noise, log-uniform.
         amount: of every effect instead, of random sign.
         halves: how often a largest amount that no beam survives is halved.
-        unreachable: what could not reach the smallest signal to noise.
+        unreachable: what has no amount with the signal to noise that was asked for.
     """
 
     random: np.random.Generator
@@ -79,7 +81,8 @@ class Draw:
     def sized(
         self, ruler: Measures, caps: Sequence[Cause], target: float
     ) -> tuple[Cause, ...] | None:
-        """Causes in this proportion, and no larger, with this signal to noise; None: too small."""
+        """Causes in this proportion, and no larger, with this signal to noise; None: too small,
+        or as large as that however little there is of it (energy losses turn an RF on)."""
         share, size = 1.0, ruler.of(caps)
         for _ in range(self.halves):
             if np.isfinite(size):
@@ -96,6 +99,9 @@ class Draw:
                 size = ruler.of(_scaled(caps, share))
                 if abs(size / target - 1) < 1e-3:
                     break
+            if not size < SUDDEN * target:
+                self.unreachable.append((caps[0].effect, caps[0].element, size))
+                return None
         return _scaled(caps, share)
 
 

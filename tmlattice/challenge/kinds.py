@@ -1,7 +1,7 @@
 """Cases of any kinds of measurement: what is wrong, what AT makes of it, how clearly it is seen."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -192,7 +192,9 @@ def kinds_case(asked: Asked, number: int, name: str) -> tuple[Case, Truth, Draw]
     total, measured = 0.0, healthy
     if asked.tier != "E":
         ruler = Ruler(problem_of(ring, healthy, healthy if pair else {}, background))
-        causes, measured = _drawn(asked, draw, ruler, lambda some: machine(some, 0))
+        causes, measured = _drawn(
+            replace(asked, kinds=kinds), draw, ruler, lambda some: machine(some, 0)
+        )
         total = ruler.of(causes)
         if len(kinds) > 1:
             for kind in kinds:

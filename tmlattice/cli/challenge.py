@@ -118,7 +118,7 @@ def make(
         screen.print(f"{options['cases']} cases of tier {tier.upper()} in {folder}")
         if lost:
             rows = ", ".join(f"{name} {count}" for name, count in sorted(lost.items()))
-            screen.print(f"drawn anew, for they cannot reach the smallest signal to noise: {rows}")
+            screen.print(f"drawn anew, for no amount has the signal to noise asked for: {rows}")
 
 
 @challenge.command("run")

@@ -312,7 +312,8 @@ def small_errors_of(
         learn: the sizes are learnt; else they are as known.
 
     Raises:
-        UnstableRingError: the likeliest small errors leave no stored beam.
+        UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
+            causes.
     """
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     belongs = np.array([names.index(name) for name, _ in known.hypotheses])
@@ -354,6 +355,8 @@ def small_errors_of(
         nuisances = point.nuisances
         amounts = among.estimate(point.projection.out(point.residual))
     before = fit(among, (), nuisances)
+    if before.point.lost:
+        raise UnstableRingError(f"{before.point.lost} without what was found beside small errors")
     sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
     return Learnt(among, before, sizes, errors, evidence)
 
