@@ -15,15 +15,18 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.dense import DenseFit, Step, score
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
-from tmlattice.diagnosis.left_open import LeftOpen, blurred
+from tmlattice.diagnosis.left_open import Blur, LeftOpen
+from tmlattice.diagnosis.one_change import OneChange
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import find, rare
+from tmlattice.effects.effect import FamilyEffect
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.rivals import Detection, leading
 from tmlattice.inference.scan import scan
-from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.inference.search import Explanation, Named, Search, explain
 from tmlattice.observe.orbit_response import Hypothesis, Predicted, ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
 
@@ -52,8 +55,9 @@ LARGER = 2.0
 sextupoles."""
 
 
-BLURRED, AGAIN = 2 * 10**7, 3
-"""Readings times what is left open, from which on that is not looked at; searches at most."""
+BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
+"""Readings times what is left open, from which on that is not looked at; searches at most; and
+hypotheses that are weighed among it, before and after one of them is known to explain them."""
 
 
 @dataclass(frozen=True)
@@ -117,36 +121,92 @@ def few_causes(
     gap = max(before.chi2 - count, 1.0)
     enough = float(chi2.isf(judgement.noise[1], count))
     enough = max(enough, min(NOISE * count, count + REST * gap))
-    if _hopeless(problem, hypotheses, before, number, enough):
-        return None
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
+    found = _explained(search, problem, before, number, gap)
+    if open_ is not None and open_.root.size and open_.size(problem) <= BLURRED:
+        found = _among_open(search, problem, before, found, open_)
+    if found is None:
+        return None
+    return _told(data, split, problem.base, found, count, judgement)
+
+
+def _explained(
+    search: Search, problem: Response, before: Fit, number: int, gap: float
+) -> Explanation | None:
+    """Few causes in the ring as it is known; None where so few do not explain it."""
+    if _hopeless(problem, search.hypotheses, before, number, search.enough):
+        return None
     found = explain(search, before)
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
         return None  # the strongest of a few would explain its share
     if found.fit.chi2 > search.enough and number > 1:
-        if _hopeless(problem, hypotheses, found.fit, number - 1, enough):
+        if _hopeless(problem, search.hypotheses, found.fit, number - 1, search.enough):
             return None
         found = explain(replace(search, most=number), before, found)
-    if found.fit.chi2 > search.enough:
-        return None
-    if open_ is not None and len(open_.root.T) * problem.used.size <= BLURRED:
-        found = _unsure(search, problem, found, open_)
-    return _told(data, split, problem.base, found, count, judgement)
+    return None if found.fit.chi2 > search.enough else found
 
 
-def _unsure(search: Search, plain: Response, found: Explanation, open_: LeftOpen) -> Explanation:
-    """The search repeated where what causes do is known no better than the ring is."""
+def _among_open(
+    search: Search, plain: Response, before: Fit, found: Explanation | None, open_: LeftOpen
+) -> Explanation | None:
+    """The same where what causes do is known no better than the ring is: one cause where one is
+    likelier than what was found, else what was found."""
+    seen = found.first if found else scan(
+        plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
+    )  # fmt: skip
+    statistic = float(seen.statistic.max(initial=0.0))
+    detection = Detection(
+        statistic, seen.threshold(plain.judgement.false_alarm), seen.p_value(statistic)
+    )
+    if detection.p_value > plain.judgement.false_alarm:
+        return found
+    blur = Blur(plain, open_)
+    changes = OneChange(blur)
+    starts: dict[Hypothesis, float | None] = {
+        h: None for h in search.hypotheses if isinstance(find(h[0]), FamilyEffect)
+    }
+    starts |= leading(plain, seen, LEADING)
+    if found is not None:
+        starts |= {(c.effect, c.element): c.amount for c in found.fit.causes}
+    tried = changes.all_of(starts)
+    if tried and tried[0].fit.chi2 <= search.enough:  # its like, among what is open of it
+        about = changes.among(tried[0])
+        there = about.at((), about.first)
+        again = scan(about.metric(there), search.hypotheses, there.residual, effective=1.0)
+        near = leading(about, again, NEAR)
+        tried = (*tried, *changes.all_of({h: a for h, a in near.items() if h not in starts}))
+        tried = tuple(sorted(tried, key=lambda one: -one.fit.log_evidence))
+    tried = tuple(one for one in tried if one.fit.chi2 <= search.enough)
+    if found is not None and len(found.fit.causes) > 1:
+        found, evidence = _unsure(search, blur, found)
+        if tried and tried[0].fit.log_evidence < evidence:
+            return found
+    if not tried:
+        return found
+    nothing = np.zeros(plain.valid.shape, dtype=bool)
+    return Explanation(
+        plain, tried[0].fit, nothing, (Named(detection, tried),),
+        before=before, first=seen, scan=seen,
+    )  # fmt: skip
+
+
+def _unsure(search: Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
+    """The search repeated among what is open of what was found; and its log evidence."""
+    evidence = -np.inf
     for _ in range(AGAIN):
-        problem = blurred(plain, open_, found.fit.causes)
-        again = explain(replace(search, problem=problem), fit(problem, (), problem.first))
+        problem = blur.among(blur.of(found.fit.causes))
+        again = explain(
+            replace(search, problem=problem, most=MOST), fit(problem, (), problem.first)
+        )
         if not again.fit.causes or again.fit.chi2 > search.enough:
             break
         same, found = again.names == found.names, again
+        evidence = problem.log_scale + found.fit.log_evidence
         if same:
             break
-    return found
+    return found, evidence
 
 
 def _hopeless(

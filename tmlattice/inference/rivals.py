@@ -155,3 +155,20 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
         clean = others.projection.out(np.nan_to_num(point.residual, nan=1e3))
         left.append(float(clean @ clean))
     return causes[int(np.argmin(left))]
+
+
+def leading(problem: Problem, found: Scan, count: int) -> dict[Hypothesis, float]:
+    """The likeliest hypotheses by a scan, with its amounts.
+
+    Args:
+        problem: for the priors.
+        found: the scan.
+        count: so many at most.
+    """
+    ranks = linear_evidence(problem, found)
+    first = (
+        (found.hypotheses[i], _first_guess(found, int(i)))
+        for i in np.argsort(-ranks)[:count]
+        if np.isfinite(ranks[i])
+    )
+    return {h: cause.amount for h, cause in first if cause is not None}
