@@ -307,15 +307,14 @@ def look(state: State, block: int) -> State:
     """What the model lacks now; and the monitors that are bad, their own gains apart."""
     data = state.data
     use = weight(state, block) > 0
-    left = np.where(use, data.pick(state.at.left, block), np.nan)[:-1]
+    left = np.where(use, data.pick(state.at.left, block), np.nan)
     if state.share is not None:
-        state = replace(state, share=shares(state, block, left))
-    typical = float(np.nanmedian(np.abs(left[:, state.good]))) / 0.6745
+        state = replace(state, share=shares(state, block, left[:-1]))
+    typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
     noise = float(np.median(data.noise))
-    squares = np.full(data.shape[0], typical**2)  # the RF's readings are few
-    counts = 1.0 if state.share is None else state.share[block][:-1]
+    counts = 1.0 if state.share is None else state.share[block]
     shared = TYPICAL * typical**2 + np.nansum(counts * left**2, axis=1)
-    squares[:-1] = shared / (TYPICAL + use[:-1].sum(axis=1))
+    squares = shared / (TYPICAL + use.sum(axis=1))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
     good = state.good if block else _good_monitors(state)
