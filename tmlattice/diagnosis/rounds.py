@@ -30,6 +30,9 @@ FEW = 4
 """Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
 TYPICAL = 10.0
 """The median misfit of all columns counts as so many readings of each one's own."""
+DISPERSION = "quadrupole_gradient"
+"""The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
+times what all others are, and would make the monitors' gains what fits it."""
 ROUNDS = 12
 """Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
 GAIN = 3e-3
@@ -315,6 +318,8 @@ def look(state: State, block: int) -> State:
     counts = 1.0 if state.share is None else state.share[block]
     shared = TYPICAL * typical**2 + np.nansum(counts * left**2, axis=1)
     squares = shared / (TYPICAL + use.sum(axis=1))
+    if state.allows(DISPERSION):
+        squares[-1] = typical**2  # it is one column among many, and counts like any
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
     good = state.good if block else _good_monitors(state)

@@ -1,0 +1,137 @@
+"""One change of a machine that is known with errors: each weighed with what they make of it."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from tmlattice import diagnose
+from tmlattice.diagnosis.dense import one_by_one
+from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.left_open import Blur, LeftOpen, left_open
+from tmlattice.diagnosis.one_change import OneChange, _Line
+from tmlattice.diagnosis.state import begin
+from tmlattice.effects import Cause
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
+from tmlattice.observe.response_problem import Response
+
+
+def machine(ring, changes=(), seed=1):
+    """With all usual small errors, the same ones each time, as AT tracks it."""
+    return simulate_response(
+        ring, changes, kick=1e-4, noise=2e-6, rf_step=-1000.0, background={"all": None},
+        machine_seed=31, seed=seed, progress=False,
+    ).measured  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def before(small_ring):
+    return machine(small_ring)
+
+
+@pytest.fixture(scope="module")
+def fitted(small_ring, before):
+    """The machine as the first measurement shows it."""
+    data = response_data(small_ring, before)
+    split = split_columns(data, 0.2, np.random.default_rng(0))
+    *_, (_, state) = one_by_one(begin(data, split), STEPS)
+    return state
+
+
+@pytest.fixture(scope="module")
+def problem(small_ring, before):
+    data = response_data(small_ring, before)
+    used = np.isfinite(data.orbits)
+    return Response(base=Predicted(data, Errors.none(data)), used=used, places={"any": 1})
+
+
+def chi2_per_reading(state):
+    left = state.data.pick(state.at.left)[:-1] / state.data.noise_of(0)[:-1]
+    return np.nanmean(left[state.fitted[:-1]] ** 2)
+
+
+def test_dispersion_that_gradients_make_does_not_draw_the_gains_astray(fitted):
+    """One horizontal corrector and the RF are all that this ring's horizontal gains have."""
+    assert chi2_per_reading(fitted) < 1.5
+    assert fitted.groups["monitor_gain"].rms < 0.05  # 0.025 are there
+
+
+def test_every_number_of_a_fit_is_told_as_what_it_does(fitted):
+    data, rng = fitted.data, np.random.default_rng(4)
+    nothing = Predicted(data, Errors.none(data))
+    for family in {f.variable: f for f in fitted.families}.values():
+        values = 1e-6 * rng.standard_normal(family.size(data))
+        if family.variable == "calibration":
+            values[-1] = 0.0  # the RF has none
+        amounts: dict[Hypothesis, float] = {}
+        for value, moves in zip(values, family.moves(data), strict=True):
+            for hypothesis, share in moves.items():
+                amounts[hypothesis] = amounts.get(hypothesis, 0.0) + share * float(value)
+        put = Predicted(data, family.put(Errors.none(data), values, data)).read - nothing.read
+        if family.variable == "spread":  # by the square of the amount
+            continue
+        told = nothing.with_causes([Cause(*h, a) for h, a in amounts.items()]).read - nothing.read
+        seen = np.isfinite(put) & (np.abs(told) > 1e-3 * np.nanmax(np.abs(told)))
+        assert put[seen] == pytest.approx(told[seen], rel=2e-3), family.name
+
+
+def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
+    """Against differences of the full model, with the change and without."""
+    whole = left_open(fitted)
+    alone = np.array([effect != "energy_spread" for effect, _ in whole.hypotheses])
+    open_ = LeftOpen(whole.hypotheses, whole.root * alone[:, None])  # that goes with the square
+    change = Cause("quadrupole_gradient", "QF::3", 0.01)
+    of = Blur(problem, open_).of([change])
+    for error in (5, 40, open_.root.shape[1] - 3):
+        h = 1e-3
+        small = [
+            Cause(*hypothesis, h * amount)
+            for hypothesis, amount in zip(open_.hypotheses, open_.root[:, error], strict=True)
+            if amount
+        ]
+        read = {
+            (changed, side): problem.view(
+                [*([change] if changed else []), *(Cause(c.effect, c.element, side * c.amount)
+                                                    for c in small)]
+            ).read
+            for changed in (True, False) for side in (1, -1)
+        }  # fmt: skip
+        slope = (read[True, 1] - read[True, -1] - read[False, 1] + read[False, -1]) / (2 * h)
+        size = np.nanmax(np.abs(slope))
+        assert np.nanmax(np.abs(of[error] - slope)) < 0.02 * size + 1e-9
+
+
+def test_the_density_of_a_change_is_a_gaussian_of_its_own_covariance():
+    rng = np.random.default_rng(8)
+    for errors in (3, 30):
+        left, slope = rng.normal(size=(2, 12))
+        spread = rng.normal(size=(errors, 12))
+        line = _Line(left, slope, spread)
+        strengths = np.array([0.0, 0.3, -2.0])
+        exact = [
+            multivariate_normal(t * slope, np.eye(12) + t**2 * spread.T @ spread).logpdf(left)
+            for t in strengths
+        ]
+        assert line.log_density(strengths) + 6 * -np.log(2 * np.pi) == pytest.approx(exact)
+
+
+def test_a_supply_of_sextupoles_shows_by_the_orbit_that_nobody_knows(small_ring, before):
+    after = machine(small_ring, [Cause("family_sextupole", "sd", 0.1)], seed=2)
+    result = diagnose(small_ring, after, reference=before)
+    (found,) = result.findings
+    assert ("family_sextupole", "sd") in [(m.effect, m.element) for m in found.credible_set]
+    assert abs(found.amount - 0.1) < 4 * found.amount_sigma
+
+
+def test_a_supply_of_quadrupoles_is_not_one_of_its_magnets(small_ring, before):
+    after = machine(small_ring, [Cause("family_gradient", "QF", 1e-3)], seed=2)
+    (found,) = diagnose(small_ring, after, reference=before).findings
+    assert (found.effect, found.element) == ("family_gradient", "QF")
+    assert abs(found.amount - 1e-3) < 4 * found.amount_sigma
+
+
+def test_a_change_that_readings_do_not_want_is_none(fitted, problem):
+    same = OneChange(Blur(problem, left_open(fitted)))
+    same.left = np.zeros_like(same.left)
+    assert same.likeliest(("quadrupole_gradient", "QF::3")) is None
