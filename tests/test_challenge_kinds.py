@@ -10,8 +10,9 @@ import pytest
 from command import tmlattice
 from conftest import SMALL
 
-from tmlattice.challenge import make, read_case, read_truth, run, score
+from tmlattice.challenge import kinds, make, read_case, read_truth, run, score
 from tmlattice.challenge.case import Truth
+from tmlattice.challenge.draw import Draw
 from tmlattice.challenge.figures import summary
 from tmlattice.challenge.ideal import weighed
 from tmlattice.challenge.kinds import Ruler, problem_of
@@ -106,6 +107,38 @@ def test_the_oracle_weighs_the_truth_by_the_full_model(several):
     assert found.statistic[at] > found.statistic.max() - 9
     assert found.statistic[at] == pytest.approx(truth.total**2, rel=0.5)  # one draw of noise
     assert found.amount[at] == pytest.approx(cause.amount, rel=0.2)
+
+
+def test_an_effect_that_no_amount_makes_small_is_drawn_in_vain():
+    """An RF that comes on with any loss of energy makes what is seen, not the loss."""
+
+    class Sudden:
+        def of(self, causes):
+            return 150.0 + causes[0].amount
+
+    draw = Draw(np.random.default_rng(0), (5.0, 100.0))
+    assert draw.sized(Sudden(), [Cause("radiation_loss_bends", None, 1.0)], 20.0) is None
+    assert draw.unreachable[0][:2] == ("radiation_loss_bends", None)
+    (kept,) = draw.sized(Sudden(), [Cause("radiation_loss_bends", None, 1.0)], 140.0)
+    assert kept.amount > 0
+
+
+def test_a_cause_is_drawn_among_what_is_measured_of_the_case(monkeypatch, tmp_path):
+    """A monitor that counts its turns late is no fault where no turns are read."""
+    seen = []
+
+    def drawn(asked, draw, ruler, machine):
+        seen.append((asked.kinds, [part.monitors for part in ruler.problem.parts]))
+        raise TmlatticeError("enough")
+
+    monkeypatch.setattr(kinds, "_drawn", drawn)
+    with pytest.raises(TmlatticeError, match="enough"):
+        make(
+            "M", 1, 2, tmp_path, lattice=LATTICE, progress=False,
+            kinds=["closed_orbit", "tunes", "dispersion", "trajectory"],
+        )  # fmt: skip
+    ((asked, parts),) = seen
+    assert len(asked) == len(parts) < 4
 
 
 def test_the_supply_of_a_family_of_sextupoles_is_one_change(small_ring, tmp_path):
