@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tmlattice.diagnosis.dense import DenseFit, Step, score
+from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, score
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.others import with_number
 from tmlattice.diagnosis.remedies import remedy_of
@@ -44,10 +44,13 @@ log = logging.getLogger(__name__)
 
 FAULTS = 8
 """At most: more are a family."""
-WORTH = 9.0
+WORTH = 15.0
 """Statistic, with a family's size not yet learnt without it, from which on a cause is tried."""
 TRIES = 3
 """Causes that are tried at a step; one alone in a response of many readings."""
+NEAR, SHARE = 8.0, 0.1
+"""Log evidence by which another one may be behind the likeliest to be tried beside it, and what of
+the statistic adds to it: the linear model errs by a share of that."""
 BEHIND = 2.0
 """Log evidence by which a rival has to be ahead, where a cause was put in, to be tried instead."""
 LISTED = 24
@@ -181,14 +184,16 @@ class _Search:
         return None
 
     def leaders(self) -> list[tuple[Hypothesis, Array]]:
-        """What is tried: the likeliest by the linear model, one of each remedy; with the information
-        of each block."""
+        """What is tried: the likeliest by the linear model, one of each remedy; and what each block
+        knows of it."""
         ring = self.state.data.ring
         seen = self.seen(self.state)
         own = seen.beside()
         evidence = self.evidence(seen, own)
         evidence[own.statistic < WORTH] = -np.inf
-        order = [int(h) for h in np.argsort(-evidence) if np.isfinite(evidence[h])]
+        first = int(np.argmax(evidence))
+        least = evidence[first] - NEAR - SHARE * own.statistic[first]
+        order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
         found: dict[str, tuple[Hypothesis, Array]] = {}
         have = [one.cause for one in self.state.apart]
         for h in order:
@@ -304,7 +309,7 @@ def _settled(state: State) -> State | None:
     state = replace(state, groups={})
     for begin in (_stepped, replace):
         try:
-            return settle(bend(settle(begin(state))))
+            return settle(bend(settle(begin(state), gain=ROUGH)))
         except (TmlatticeError, np.linalg.LinAlgError):
             continue
     return None

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from tmlattice.diagnosis.dense import ROUGH, fit_chi2
 from tmlattice.diagnosis.families import (
     CorrectorCalibration,
     CorrectorRoll,
@@ -46,6 +47,8 @@ USUAL: tuple[Family, ...] = (
 ANEW = 20_000
 """Readings up to which everything is also fitted from the design on: where the families alone went
 astray, they hide what they made up."""
+EXPLAINED = 1.5
+"""Chi-square per reading of each plane at which one start is enough."""
 SIZES = 12
 """Rounds of EM for the sizes."""
 SHARED = {
@@ -69,19 +72,20 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     everybody = Split(nobody, nobody, split.half, np.zeros_like(split.inner_rf))
     design = replace(begin(data, everybody), good=fitted.good, exploring=False)
     families = _families(design, fitted.families)
-    starts = [_from(design, families, fitted)]
-    if data.orbits.size <= ANEW:
-        starts.append(allow(design, families))
+    beside = _from(design, families, fitted)
+    few = data.orbits.size <= ANEW
     found: list[tuple[float, State]] = []
-    for start in starts:
+    for start in (allow(design, families), beside) if few else (beside,):
         try:
-            state = settle(jump(bend(start), beyond=1.0))
+            state = settle(jump(bend(start), beyond=1.0), gain=ROUGH)
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # astray
             continue
         found.append((log_evidence(state, state.good), state))
-    log.info("small errors: evidence %s", [round(e, 1) for e, _ in found])
-    return max(found, key=lambda one: one[0])[1] if found else starts[0]
+        log.info("small errors: evidence %.1f", found[-1][0])
+        if all(own.per_reading < EXPLAINED for own in fit_chi2(state)[:2]):
+            break
+    return max(found, key=lambda one: one[0])[1] if found else beside
 
 
 def _near(data: ResponseData, split: Split) -> ResponseData:
