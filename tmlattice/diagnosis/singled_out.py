@@ -44,8 +44,9 @@ log = logging.getLogger(__name__)
 
 FAULTS = 8
 """At most: more are a family."""
-WORTH = 15.0
-"""Statistic, with a family's size not yet learnt without it, from which on a cause is tried."""
+WORTH, HIDDEN = 15.0, 8.0
+"""Statistic, with sizes not yet learnt without it, from which on a cause is tried: of one number of
+a family, and of others, which make all patterns of an orbit larger."""
 TRIES = 3
 """Causes that are tried at a step; one alone in a response of many readings."""
 NEAR, SHARE = 8.0, 0.1
@@ -190,7 +191,8 @@ class _Search:
         seen = self.seen(self.state)
         own = seen.beside()
         evidence = self.evidence(seen, own)
-        evidence[own.statistic < WORTH] = -np.inf
+        worth = [HIDDEN if one.block is None else WORTH for one in seen.suspects]
+        evidence[own.statistic < worth] = -np.inf
         first = int(np.argmax(evidence))
         least = evidence[first] - NEAR - SHARE * own.statistic[first]
         order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
