@@ -191,10 +191,10 @@ def _faults(
     found = [swap_of(state, name, judgement) for name in swaps
              if effects is None or "monitor_swap" in effects]  # fmt: skip
     hypotheses = single_causes(state.data, effects)
-    alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
-    if alone.faults:
-        fit = beside_faults(fit, alone.state.apart)
-    found += [fault.finding(ring, judgement) for fault in alone.faults]
+    if hypotheses:
+        alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
+        fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
+        found += [fault.finding(ring, judgement) for fault in alone.faults]
     return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic)[:most])
 
 

@@ -20,7 +20,7 @@ from scipy.stats import t as student
 
 from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, score
 from tmlattice.diagnosis.findings import finding_of
-from tmlattice.diagnosis.others import with_number
+from tmlattice.diagnosis.others import KINDS, with_number
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.rounds import linear, log_evidence, settle
@@ -217,12 +217,7 @@ class _Search:
         if suspect.block is None:
             state = with_number(state, cause, int(np.argmax(information)))
             (suspect,) = suspects_of(state, [cause])
-        assert suspect.block is not None
-        assert suspect.members is not None
-        apart = Apart(
-            cause, suspect.variable, suspect.block, suspect.members, find(cause[0]).largest
-        )
-        return _settled(replace(state, apart=(*state.apart, apart)))
+        return _settled(_apart(state, cause))
 
     def better(self, state: State, one: Apart) -> State:
         """Another cause in the place of one, where that explains more."""
@@ -296,6 +291,15 @@ class _Search:
         )
 
 
+def _apart(state: State, cause: Hypothesis) -> State:
+    """With a prior of its own for a number of the fit."""
+    (suspect,) = suspects_of(state, [cause])
+    assert suspect.block is not None
+    assert suspect.members is not None
+    own = Apart(cause, suspect.variable, suspect.block, suspect.members, find(cause[0]).largest)
+    return replace(state, apart=(*state.apart, own))
+
+
 def _place(seen: Seen, one: Apart) -> int:
     return next(h for h, suspect in enumerate(seen.suspects) if suspect.cause == one.cause)
 
@@ -335,13 +339,13 @@ def beside_faults(fit: DenseFit, apart: Sequence[Apart]) -> DenseFit:
     where held-out correctors want none of it."""
     state = fit.state
     for one in apart:
-        if not one.variable.startswith("others") and one.variable not in state.values:
-            state = allow(state, [f for f in USUAL if f.variable == one.variable])
-    for one in apart:
-        if one.variable.startswith("others"):
+        if one.variable in (kind.variable for kind in KINDS):
             state = with_number(state, one.cause, one.block)
+        elif one.variable not in state.values:
+            state = allow(state, [f for f in USUAL if f.variable == one.variable])
     own = {one.cause: one for one in apart}
-    state = replace(state, apart=tuple(own.values()))
+    for cause in own:
+        state = _apart(state, cause)
     settled = _settled(state)
     if settled is None:
         return fit
