@@ -5,6 +5,7 @@ import pytest
 
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.exchanged import planes_back, swapped
+from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.orbit_modes import orbit_families
 from tmlattice.diagnosis.rounds import linear
 from tmlattice.diagnosis.singled_out import singled_out
@@ -12,7 +13,7 @@ from tmlattice.diagnosis.small_errors import sizes_in, small_errors
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.machine.response import simulate_response
+from tmlattice.machine.response import NOISE, simulate_response
 from tmlattice.observe.orbit_response import response_data, split_columns
 from tmlattice.observe.response_problem import single_causes
 
@@ -110,3 +111,13 @@ def test_patterns_of_kicks_are_few_and_focus(small_ring, measured_with):
         strength = np.sqrt((rows**2).sum(axis=(1, 2)))
         assert strength[0] > 10 * np.median(data.noise)
         assert strength[0] > strength[-1]
+
+
+def test_a_few_causes_that_lead_astray_are_none(small_ring):
+    """The search ended where the ring has no orbit off its energy, and so did the diagnosis."""
+    supply = Cause("family_gradient", "QD", -0.023501608727675934)
+    measured = simulate_response(
+        small_ring, [supply], background=USUAL, progress=False, seed=1384498935,
+        machine_seed=1384498935, noise=tuple(1.5126369 * rms for rms in NOISE),
+    ).measured  # fmt: skip
+    assert few_causes(*parted(small_ring, measured), None, 10, DEFAULT) is None

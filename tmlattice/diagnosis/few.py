@@ -18,6 +18,7 @@ from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import find, rare
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
@@ -115,16 +116,25 @@ def few_causes(
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
+    try:
+        found = _found(search, before, number, gap)
+    except UnstableRingError:  # a few causes lead to where no beam is stored
+        return None
+    return None if found is None else _told(data, split, found, count, judgement)
+
+
+def _found(search: Search, before: Fit, number: int, gap: float) -> Explanation | None:
+    """So many causes that explain enough; None where they do not."""
+    problem, hypotheses, enough = search.problem, search.hypotheses, search.enough
+    assert isinstance(problem, Response)
     found = explain(search, before)
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
         return None  # the strongest of a few would explain its share
-    if found.fit.chi2 > search.enough and number > 1:
+    if found.fit.chi2 > enough and number > 1:
         if _hopeless(problem, hypotheses, found.fit, number - 1, enough):
             return None
         found = explain(replace(search, most=number), before, found)
-    if found.fit.chi2 > search.enough:
-        return None
-    return _told(data, split, found, count, judgement)
+    return None if found.fit.chi2 > enough else found
 
 
 def _hopeless(
