@@ -37,26 +37,34 @@ def parted(ring, measured, seed=0):
     return data, split_columns(data, 0.2, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize(
-    "cause",
-    [
-        Cause("quadrupole_gradient", "QF::2", 0.03),
-        Cause("corrector_calibration", "v3", -2.0),
-        Cause("monitor_gain_y", "bpm::6", -2.0),
-    ],
-)
-def test_one_fault_among_usual_errors_is_named(small_ring, measured_with, cause):
-    """Families were fitted, and nothing was a finding."""
-    result = diagnose(small_ring, measured_with(cause))
+def named(ring, measured, cause):
+    """The diagnosis, of which the cause is the one finding."""
+    result = diagnose(ring, measured)
     assert result.verdict == "named"
     (found,) = result.findings
     assert (found.effect, found.element) == (cause.effect, cause.element)
     assert abs(found.amount - cause.amount) < 4 * found.amount_sigma
     # known no better than the family scatters
     assert found.amount_sigma > 0.5 * USUAL[cause.effect]
-    assert result.steps[-1].effect == f"{cause.effect} {cause.element}"
+    return result
+
+
+def test_one_quadrupole_among_usual_errors_is_named(small_ring, measured_with):
+    """Families were fitted, and nothing was a finding."""
+    cause = Cause("quadrupole_gradient", "QF::2", 0.03)
+    result = named(small_ring, measured_with(cause), cause)
+    assert result.steps[-1].effect == "quadrupole_gradient QF::2"
     assert len(result.causes) > 100  # the small errors are told beside it
-    assert found.consequences is not None
+    assert result.findings[0].consequences is not None
+    assert "alone" not in " ".join(result.priors)
+
+
+@pytest.mark.parametrize(
+    "cause",
+    [Cause("corrector_calibration", "v3", -2.0), Cause("monitor_gain_y", "bpm::6", -2.0)],
+)
+def test_what_is_reversed_among_usual_errors_is_named(small_ring, measured_with, cause):
+    named(small_ring, measured_with(cause), cause)
 
 
 def test_a_fault_that_no_family_holds_is_named(small_ring, measured_with):
