@@ -20,6 +20,7 @@ from scipy.stats import t as student
 
 from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, score
 from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.orbit_modes import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.others import KINDS, with_number
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Finding
@@ -42,6 +43,7 @@ Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
+ORBITS = (HorizontalOrbit.name, VerticalOrbit.name)
 FAULTS = 8
 """At most: more are a family."""
 WORTH, HIDDEN = 15.0, 8.0
@@ -61,7 +63,7 @@ BEYOND = 1.5
 WORSE = 1.02
 """What held-out correctors may be left more with the faults than without, at most."""
 MEMBERS = 16
-"""Degrees of freedom of the size of errors that no family's numbers are."""
+"""As many as an orbit's patterns, where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,13 +257,19 @@ class _Search:
             state = self.better(fewer, fewer.apart[-1])
         return state
 
-    def members(self, one: Apart) -> int:
-        """Of the family whose size the statistic rests on."""
-        return max(len(one.members) - 1, 1) if not one.variable.startswith("others") else MEMBERS
+    def members(self, state: State, one: Apart) -> int:
+        """Numbers that the size of errors rests on which the statistic has: of the family, or the
+        patterns of the orbit."""
+        if one.variable not in (kind.variable for kind in KINDS):
+            return max(len(one.members) - 1, 1)
+        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block)
+                 if f.name in ORBITS]  # fmt: skip
+        return max(min(orbit, default=MEMBERS) - 1, 1)
 
-    def p_value(self, statistic: float, one: Apart) -> float:
+    def p_value(self, seen: Seen, statistic: float, one: Apart) -> float:
         """Chance that the largest of so many errors stands out like this."""
-        own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), self.members(one)))
+        members = self.members(seen.state, one)
+        own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), members))
         return min(1.0, own * len(self.hypotheses))
 
     def clear(self, seen: Seen, one: Apart) -> bool:
@@ -271,7 +279,7 @@ class _Search:
         statistic = float(own.statistic[here])
         if not abs(own.amount[here]) < BEYOND * find(one.cause[0]).largest:
             return False
-        return statistic > CLEAR and self.p_value(statistic, one) < self.judgement.false_alarm
+        return statistic > CLEAR and self.p_value(seen, statistic, one) < self.judgement.false_alarm
 
     def fault(self, seen: Seen, one: Apart) -> Fault:
         """With its amount, its error and its rivals."""
@@ -285,7 +293,7 @@ class _Search:
             Cause(*one.cause, float(own.amount[here])),
             float(own.sigma[here]),
             statistic,
-            self.p_value(statistic, one),
+            self.p_value(seen, statistic, one),
             tuple(Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in order),
             evidence[order],
         )
