@@ -59,11 +59,8 @@ def test_one_quadrupole_among_usual_errors_is_named(small_ring, measured_with):
     assert "alone" not in " ".join(result.priors)
 
 
-@pytest.mark.parametrize(
-    "cause",
-    [Cause("corrector_calibration", "v3", -2.0), Cause("monitor_gain_y", "bpm::6", -2.0)],
-)
-def test_what_is_reversed_among_usual_errors_is_named(small_ring, measured_with, cause):
+def test_a_reversed_monitor_among_usual_errors_is_named(small_ring, measured_with):
+    cause = Cause("monitor_gain_y", "bpm::6", -2.0)
     named(small_ring, measured_with(cause), cause)
 
 
