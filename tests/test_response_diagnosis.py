@@ -80,7 +80,9 @@ def test_gradients_close_the_held_out_gap(result):
         key=lambda c: -abs(c.amount),
     )[:4]
     assert {"QD::5", "QF::9"} <= {c.element for c in strongest}
-    assert result.verdict == "distributed"
+    # five that are wrong alone, more than the search for a few takes, stand out of the families
+    found = {(own.effect, own.element) for own in result.findings}
+    assert found == {(cause.effect, cause.element) for cause in CAUSES}
     assert not result.bad_monitors
 
 

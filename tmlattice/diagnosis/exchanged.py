@@ -1,4 +1,5 @@
-"""Neighbouring correctors whose columns are exchanged: each answers as the other one should.
+"""Neighbouring correctors whose columns are exchanged: each answers as the other one should. And
+monitors whose planes are.
 
 A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
 the model's far too well for a stranger: it seems displaced by the way to its neighbour.
@@ -10,7 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import State
+from tmlattice.effects import Cause
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.levels import CLEAR
+from tmlattice.inference.rivals import Detection
 from tmlattice.measurement import OrbitResponse
 
 Array = NDArray[np.float64]
@@ -62,3 +70,46 @@ def put_right(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
     return replace(
         measured, response=measured.response[order], kicks=np.asarray(measured.kicks)[order]
     )
+
+
+def swapped(state: State) -> list[str]:
+    """Monitors that read in each plane what the model has in the other one, whatever their gain."""
+    data, read = state.data, state.at.seen(state.at.beam)
+    found = []
+    for m, name in enumerate(data.measured.monitors):
+        seen = np.isfinite(data.orbits[:-1, m]).all(axis=1)
+        d, u = data.orbits[:-1, m][seen], read[:-1, m][seen]
+        if len(d) and _left(d, u[:, ::-1]) < SHARE * _left(d, u):
+            found.append(name)
+    return found
+
+
+def _left(measured: Array, model: Array) -> float:
+    """Of readings [column, 2], with a gain of each plane that is not negative."""
+    gain = np.maximum((measured * model).sum(axis=0), 0.0)
+    gain = gain / np.maximum((model**2).sum(axis=0), 1e-300)
+    return float(np.sum((measured - gain * model) ** 2))
+
+
+def planes_back(measured: OrbitResponse, monitors: Sequence[str]) -> OrbitResponse:
+    """The measurement with the planes of some monitors exchanged."""
+    at = [measured.monitors.index(name) for name in monitors]
+    response, rf = measured.response.copy(), measured.rf
+    response[:, at] = response[:, at, ::-1]
+    if rf is not None and rf.orbit is not None:
+        orbit = rf.orbit.copy()
+        orbit[at] = orbit[at, ::-1]
+        rf = replace(rf, orbit=orbit)
+    return replace(measured, response=response, rf=rf)
+
+
+def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
+    """The finding of a monitor whose planes were put back."""
+    data = state.data
+    at = data.measured.monitors.index(name)
+    model, d = state.at.read[:, at], data.orbits[:, at]
+    as_read = np.nansum((d[:, ::-1] - model) ** 2 - (d - model) ** 2, axis=0)
+    statistic = float(np.sum(as_read / data.noise[at] ** 2))
+    cause = Cause("monitor_swap", data.ring[name].name, 1.0)
+    seen = Detection(statistic, CLEAR, min(1.0, 2 * len(data.at) * chi2.sf(statistic, 1)))
+    return finding_of(data.ring, [cause], np.ones(1), [cause], 0.0, seen, judgement.mass)

@@ -21,6 +21,7 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import find, rare
 from tmlattice.effects.effect import FamilyEffect
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
@@ -124,7 +125,10 @@ def few_causes(
     search = Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
     )
-    found = _explained(search, problem, before, number, gap)
+    try:
+        found = _explained(search, problem, before, number, gap)
+    except UnstableRingError:  # a few causes lead to where no beam is stored
+        found = None
     if open_ is not None and open_.root.size and open_.size(problem) <= BLURRED:
         found = _among_open(search, problem, before, found, open_)
     if found is None:

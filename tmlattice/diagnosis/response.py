@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.exchanged import exchanged, put_right
+from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swap_of, swapped
 from tmlattice.diagnosis.exchanged import told as told_exchanged
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
@@ -33,7 +33,8 @@ from tmlattice.diagnosis.findings import with_consequences
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.reasons import explain_gradients
-from tmlattice.diagnosis.result import Diagnosis, ResponseView, ring_tunes
+from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView, ring_tunes
+from tmlattice.diagnosis.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.state import begin
 from tmlattice.diagnosis.strangers import reversed_ones, strangers
 from tmlattice.effects import Cause, apply, find, names
@@ -45,6 +46,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import ResponseData, response_data, split_columns
 from tmlattice.observe.response_noise import learnt_noise
+from tmlattice.observe.response_problem import single_causes
 
 Array = NDArray[np.float64]
 
@@ -54,6 +56,10 @@ UNDERSTATED = 2.0
 """So many times the stated noise is told, where the readings show it."""
 PATTERNS = 8
 """The strongest patterns of what is left."""
+LARGE = 60_000
+"""Readings up to which single faults among small errors are sought: every number is fitted anew
+for each of them."""
+TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
 BLOCKS = ("in-plane", "coupling", "RF")
 
 
@@ -102,25 +108,30 @@ def diagnose_response(
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
     if few is None:
-        fit, measured, odd = _families(ring, measured, trials, holdout, max_effects, seed, progress)
-        said += odd
+        fit, measured, odd, swaps = _families(
+            ring, measured, trials, holdout, max_effects, seed, progress
+        )
+        said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
+        fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
         found, degenerate = told(fit.state)
         verdict = _verdict(fit, false_alarm)
+        if findings:
+            verdict = max((own.verdict for own in findings), key=VERDICTS.index)
     else:
         fit, found, degenerate = few.fit, few.told, ()
-        verdict = few.verdict
+        verdict, findings = few.verdict, few.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
         **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    causes = tuple(cause for cause, _ in found)
+    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in findings)
     return as_diagnosis(
         ring, fit, fit.state.at.errors.ring, found,
         noise_estimated=measured.noise is None,
         verdict=verdict,
-        findings=() if few is None else with_consequences(ring, few.findings, causes),
+        findings=with_consequences(ring, findings, causes),
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
         hypotheses=rows,
@@ -137,9 +148,11 @@ def _families(
     most: int,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[DenseFit, OrbitResponse, list[str]]:
-    """The dense fit of what resembles the model; what was fitted, and what was done to it."""
+) -> tuple[DenseFit, OrbitResponse, list[str], list[str]]:
+    """The dense fit of what resembles the model; what was fitted, and what was done to it; and
+    monitors whose planes are exchanged."""
     said: list[str] = []
+    swaps: list[str] = []
     known: list[tuple[str, str]] = []
     fit: DenseFit | None = None
     while True:
@@ -152,6 +165,11 @@ def _families(
             known += pairs
             measured, fit = put_right(measured, pairs), None
             continue
+        crossed = [name for name in swapped(state) if name not in swaps]
+        if crossed:
+            swaps += crossed
+            measured, fit = planes_back(measured, crossed), None
+            continue
         odd = strangers(state)
         if odd.any:
             said += odd.said
@@ -159,8 +177,29 @@ def _families(
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))
         elif fit is not None:
-            return fit, measured, said
+            return fit, measured, said, swaps
         fit = fit_steps(data, split, trials, most, progress)
+
+
+def _faults(
+    fit: DenseFit,
+    swaps: Sequence[str],
+    effects: Sequence[str] | None,
+    most: int,
+    judgement: Judgement,
+    progress: Callable[[str], Any],
+) -> tuple[DenseFit, tuple[Finding, ...]]:
+    """What is wrong alone among small errors, and the fit beside it."""
+    state = fit.state
+    ring = state.data.ring
+    found = [swap_of(state, name, judgement) for name in swaps
+             if effects is None or "monitor_swap" in effects]  # fmt: skip
+    hypotheses = single_causes(state.data, effects)
+    if hypotheses and state.data.measured.response.size <= LARGE:
+        alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
+        fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
+        found += [fault.finding(ring, judgement) for fault in alone.faults]
+    return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic)[:most])
 
 
 def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
@@ -240,7 +279,11 @@ def as_diagnosis(
         steps=fit.steps,
         refused=fit.refused,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
-        priors={name: group.rms for name, group in fit.state.groups.items()},
+        priors={
+            name: group.rms
+            for name, group in fit.state.groups.items()
+            if name not in {one.name for one in fit.state.apart}
+        },
         **told,
     )
 

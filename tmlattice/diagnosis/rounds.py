@@ -145,6 +145,10 @@ def linear(state: State, block: int) -> Linear:
             basis[where[family.variable]] = own.basis
             known = state.groups.get(own.name, own)
             groups.append(replace(own, basis=basis, rms=known.rms, each=known.each))
+    for one in (one for one in state.apart if one.block == block and one.variable in where):
+        basis = np.zeros((end, 1))
+        basis[where[one.variable], 0] = one.members
+        groups.append(Group(one.name, basis, one.wide, fixed=True))
     return Linear(
         normal, np.concatenate(start), np.concatenate(trust), rows["monitor"], rows["column"],
         by_ring, where, tuple(groups), kept,

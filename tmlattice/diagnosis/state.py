@@ -27,6 +27,31 @@ FEW = 3
 """Readings that it takes to judge the gain of a monitor."""
 
 
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """Numbers of one variable that are wrong together and alone: a prior of their own, beside that
+    of their family, which so learns nothing from them.
+
+    Attributes:
+        cause: effect and place.
+        variable: whose numbers.
+        block: 0 in-plane, 1 coupling.
+        members: the numbers for a unit of the cause's amount, [number].
+        wide: prior rms of the amount.
+    """
+
+    cause: tuple[str, str | None]
+    variable: str
+    block: int
+    members: Array
+    wide: float
+
+    @property
+    def name(self) -> str:
+        """Of its prior."""
+        return f"alone: {self.cause[0]} {self.cause[1]}"
+
+
 class Kept(NamedTuple):
     """What the ring's numbers of one variable do to the readings, and where that was taken."""
 
@@ -53,6 +78,7 @@ class State:
         exploring: the inner correctors choose, and are not fitted.
         kept: rows of the ring's variables, that stand until the ring has moved.
         share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
+        apart: numbers that are wrong alone.
     """
 
     data: ResponseData
@@ -66,6 +92,7 @@ class State:
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
     share: Array | None = None
+    apart: tuple[Apart, ...] = ()
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

@@ -1,0 +1,128 @@
+"""One fault among all usual small errors of an orbit response; with AT as the machine."""
+
+import numpy as np
+import pytest
+
+from tmlattice import Cause, diagnose
+from tmlattice.diagnosis.exchanged import planes_back, swapped
+from tmlattice.diagnosis.few import few_causes
+from tmlattice.diagnosis.orbit_modes import orbit_families
+from tmlattice.diagnosis.rounds import linear
+from tmlattice.diagnosis.singled_out import singled_out
+from tmlattice.diagnosis.small_errors import sizes_in, small_errors
+from tmlattice.diagnosis.state import begin
+from tmlattice.effects import background_rms
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.machine.response import NOISE, simulate_response
+from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.response_problem import single_causes
+
+USUAL = background_rms({"all": None})
+
+
+@pytest.fixture(scope="module")
+def measured_with(small_ring):
+    """A response of the small ring with everything a little wrong, and with some causes."""
+
+    def measured(*causes, seed=5):
+        return simulate_response(
+            small_ring, causes, background=USUAL, progress=False, seed=seed, machine_seed=seed
+        ).measured
+
+    return measured
+
+
+def parted(ring, measured, seed=0):
+    data = response_data(ring, measured)
+    return data, split_columns(data, 0.2, np.random.default_rng(seed))
+
+
+def named(ring, measured, cause):
+    """The diagnosis, of which the cause is the one finding."""
+    result = diagnose(ring, measured)
+    assert result.verdict == "named"
+    (found,) = result.findings
+    assert (found.effect, found.element) == (cause.effect, cause.element)
+    assert abs(found.amount - cause.amount) < 4 * found.amount_sigma
+    # known no better than the family scatters
+    assert found.amount_sigma > 0.5 * USUAL[cause.effect]
+    return result
+
+
+def test_one_quadrupole_among_usual_errors_is_named(small_ring, measured_with):
+    """Families were fitted, and nothing was a finding."""
+    cause = Cause("quadrupole_gradient", "QF::2", 0.03)
+    result = named(small_ring, measured_with(cause), cause)
+    assert result.steps[-1].effect == "quadrupole_gradient QF::2"
+    assert len(result.causes) > 100  # the small errors are told beside it
+    assert result.findings[0].consequences is not None
+    assert "alone" not in " ".join(result.priors)
+
+
+def test_a_reversed_monitor_among_usual_errors_is_named(small_ring, measured_with):
+    cause = Cause("monitor_gain_y", "bpm::6", -2.0)
+    named(small_ring, measured_with(cause), cause)
+
+
+def test_a_fault_that_no_family_holds_is_named(small_ring, measured_with):
+    """A displaced sextupole focuses; the gradients of the quadrupoles beside it made that up."""
+    cause = Cause("sextupole_offset_y", "sf::2", -0.003)
+    data, split = parted(small_ring, measured_with(cause))
+    (fault,) = singled_out(data, split, begin(data, split), single_causes(data), 8, DEFAULT).faults
+    members = fault.finding(small_ring, DEFAULT).credible_set
+    assert (cause.effect, cause.element) in [(m.effect, m.element) for m in members]
+
+
+def test_usual_errors_are_no_fault(small_ring, measured_with):
+    result = diagnose(small_ring, measured_with(seed=8))
+    assert result.findings == ()
+    assert result.verdict == "distributed"
+
+
+def test_exchanged_planes_of_a_monitor_are_put_back_and_told(small_ring, measured_with):
+    """They were a bad monitor, left out without a reason."""
+    measured = measured_with(Cause("monitor_swap", "end_6", 1.0))
+    data, split = parted(small_ring, measured)
+    assert swapped(begin(data, split)) == ["end_6"]
+    right, split = parted(small_ring, planes_back(measured, ["end_6"]))
+    assert swapped(begin(right, split)) == []
+    result = diagnose(small_ring, measured)
+    (found,) = result.findings
+    assert (found.effect, found.element, found.verdict) == ("monitor_swap", "end_6", "named")
+    assert found.detection.statistic > 1000
+    assert not result.bad_monitors
+
+
+def test_sizes_of_small_errors_are_learnt_beside_a_fault(small_ring, measured_with):
+    """A reversed corrector makes the rms of 17 calibrations 0.5; it is 0.04 without."""
+    data, split = parted(small_ring, measured_with(Cause("corrector_calibration", "v3", -2.0)))
+    state = small_errors(data, split, begin(data, split))
+    sizes = {group.name: group.rms for block in (0, 1) for group in sizes_in(linear(state, block))}
+    # of some tens of numbers each: to a fifth, and what is left of the families' slack
+    assert 0.5 < sizes["quadrupole_gradient"] / USUAL["quadrupole_gradient"] < 2
+    assert 0.5 < sizes["monitor_gain"] / USUAL["monitor_gain_x"] < 2
+    assert 0.3 < sizes["horizontal orbit"] < 3  # in units of the bends' usual errors
+
+
+def test_patterns_of_kicks_are_few_and_focus(small_ring, measured_with):
+    data, split = parted(small_ring, measured_with())
+    state = begin(data, split)
+    families = orbit_families(small_ring, state.at.model)
+    assert [family.block for family in families] == [0, 1]
+    bends = sum(e.kind == "bend" for e in small_ring.elements)
+    for family in families:
+        assert 0 < family.size(data) < bends
+        rows = family.rows(state.at, np.zeros(family.size(data)))
+        strength = np.sqrt((rows**2).sum(axis=(1, 2)))
+        assert strength[0] > 10 * np.median(data.noise)
+        assert strength[0] > strength[-1]
+
+
+def test_a_few_causes_that_lead_astray_are_none(small_ring):
+    """The search ended where the ring has no orbit off its energy, and so did the diagnosis."""
+    supply = Cause("family_gradient", "QD", -0.023501608727675934)
+    measured = simulate_response(
+        small_ring, [supply], background=USUAL, progress=False, seed=1384498935,
+        machine_seed=1384498935, noise=tuple(1.5126369 * rms for rms in NOISE),
+    ).measured  # fmt: skip
+    assert few_causes(*parted(small_ring, measured), None, 10, DEFAULT) is None
