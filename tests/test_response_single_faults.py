@@ -59,6 +59,14 @@ def test_one_quadrupole_among_usual_errors_is_named(small_ring, measured_with):
     assert "alone" not in " ".join(result.priors)
 
 
+def test_a_reversed_corrector_that_is_held_out_is_named(small_ring, measured_with):
+    cause = Cause("corrector_calibration", "v3", -2.0)
+    measured = measured_with(cause)
+    _, split = parted(small_ring, measured)
+    assert split.held[list(measured.correctors).index("v3")]
+    named(small_ring, measured, cause)
+
+
 def test_a_reversed_monitor_among_usual_errors_is_named(small_ring, measured_with):
     cause = Cause("monitor_gain_y", "bpm::6", -2.0)
     named(small_ring, measured_with(cause), cause)

@@ -18,7 +18,7 @@ from tmlattice.diagnosis.family import Family, Told
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Ring
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,11 @@ class _Orbit(Family):
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
         """Nothing: other kicks make the same orbit."""
         return []
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Kicks of all bends."""
+        hypotheses: list[Hypothesis] = [(self.effect, place) for place in self.places]
+        return [dict(zip(hypotheses, pattern, strict=True)) for pattern in self.patterns.tolist()]
 
 
 class HorizontalOrbit(_Orbit):

@@ -63,6 +63,10 @@ class _Others(Family):
         rows = zip(self.causes, amounts, sigmas, strict=True)
         return [(Cause(*h, a), s) for h, a, s in rows]
 
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each its own."""
+        return [{h: u} for h, u in zip(self.causes, self.units.tolist(), strict=True)]
+
 
 class OthersInPlane(_Others):
     """Whose amount the plane of the kick tells."""

@@ -36,6 +36,7 @@ from tmlattice.inference.priors import SMALLEST, Group
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     """
     data = _near(data, split)
     nobody = np.zeros_like(split.held)
-    everybody = Split(nobody, nobody, split.half, np.zeros_like(split.inner_rf))
+    everybody = Split(nobody, nobody, _halves(split), np.zeros_like(split.inner_rf))
     design = replace(begin(data, everybody), good=fitted.good, exploring=False)
     families = _families(design, fitted.families)
     beside = _from(design, families, fitted)
@@ -94,6 +95,15 @@ def _near(data: ResponseData, split: Split) -> ResponseData:
     orbits = data.orbits.copy()
     orbits[:-1][far] = np.nan
     return replace(data, orbits=orbits)
+
+
+def _halves(split: Split) -> Flags:
+    """Monitors that give a corrector its kick while the others say whether it is that; of held-out
+    ones half of those that are read here."""
+    half = split.half.copy()
+    for column in np.flatnonzero(split.held):
+        half[column, np.flatnonzero(half[column])[::2]] = False
+    return half
 
 
 def _families(design: State, more: Sequence[Family]) -> list[Family]:
