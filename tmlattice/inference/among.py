@@ -43,7 +43,10 @@ LEAST = 0.02
 """Share of the variance of a direction that has to be known for it to be remembered."""
 
 MOST = 10**8
-"""Rows times small errors: 0.8 GB, of which a few are held at a time."""
+"""Rows times small errors: 0.8 GB, of which some are held at a time (8 GB at most)."""
+
+AT_ONCE = 256
+"""Small errors whose rows are taken at a time."""
 
 
 @dataclass(frozen=True)
@@ -336,9 +339,11 @@ def small_errors_of(
         shift = (amounts - known.amounts) @ slopes
         spread = known.mixed(known.rms[:, None] * slopes)
         if learn:
-            rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
             moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
-            found = _sizes(moved, alone.projection, rows, belongs, len(names))
+            found = _sizes(
+                moved, alone.projection, inner.as_rows(spread.reshape(-1, *inner.valid.shape)),
+                belongs, len(names),
+            )  # fmt: skip
             evidence = found.log_evidence if turn == 0 else evidence
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
@@ -368,9 +373,12 @@ def _signatures(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]
     out later: `as_rows` of ones says what that is.
     """
     unit = problem.as_rows(np.ones(problem.valid.shape))
-    rows = problem.everywhere().metric(point).rows(hypotheses)
+    about, there = problem.everywhere().metric(point), unit > 0
     out = np.zeros((len(hypotheses), problem.valid.size))
-    out[:, problem.valid.ravel()] = (rows[:, unit > 0]) / unit[unit > 0]
+    for start in range(0, len(hypotheses), AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        rows = about.rows(hypotheses[some])
+        out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
     return out
 
 
