@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, score
+from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, fit_chi2, score
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.orbit_modes import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.others import KINDS, with_number
@@ -60,6 +60,9 @@ LISTED = 24
 """Rivals of a fault that are told apart."""
 BEYOND = 1.5
 """Times the largest fault: a larger amount is none."""
+LACKS = 2.0
+"""Chi-square per reading of each plane beside small errors, up to which faults are sought in any
+case."""
 WORSE = 1.02
 """What held-out correctors may be left more with the faults than without, at most."""
 MEMBERS = 16
@@ -130,7 +133,7 @@ def singled_out(
     search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
     progress("what stands out")
     seen_before: list[set[Hypothesis]] = []
-    while len(search.state.apart) < min(most, FAULTS):
+    while not search.drowned() and len(search.state.apart) < min(most, FAULTS):
         state = search.next()
         if state is None:
             break
@@ -157,6 +160,15 @@ class _Search:
             base=state.at, used=np.isfinite(state.data.orbits), places=places,
             rare=rare(state.data.ring, list(places)), judgement=judgement,
         )  # fmt: skip
+
+    def drowned(self) -> bool:
+        """Whether far more than noise is left, and no single cause makes most of that: the model
+        lacks something, and what stands out may be that."""
+        own = max(fit_chi2(self.state)[:2], key=lambda plane: plane.per_reading)
+        if own.per_reading <= LACKS or self.state.apart:
+            return False
+        most = float(self.seen(self.state).beside().statistic.max(initial=0.0))
+        return most < own.readings * (1 - 1 / own.per_reading) / 2
 
     def seen(self, state: State) -> Seen:
         """All suspects there."""
