@@ -244,7 +244,10 @@ def test_options_act_and_are_told(small_ring, measured):
         small_ring, measured, seed=1, max_effects=1, false_alarm=0.01,
         effects=["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"],
     )  # fmt: skip
-    assert len(found.steps) == 2
+    (fault,) = found.findings
+    design, family, alone = found.steps
+    assert (design.effect, family.kept) == ("design", True)
+    assert alone.effect == f"{fault.effect} {fault.element}"
     options = found.as_json()["provenance"]["options"]
     assert options["effects"] == ["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"]
     assert options["max_effects"] == 1
@@ -472,7 +475,7 @@ def test_report_and_json(result):
     jsonschema.validate(json.loads(json.dumps(document)), schema)
     assert [s["effect"] for s in document["steps"]] == [s.effect for s in result.steps]
     text = report_text(result)
-    assert "DISTRIBUTED" in text
+    assert "NAMED: 5 faults" in text  # and no small errors beside them
     assert "QD::5" in text
 
 

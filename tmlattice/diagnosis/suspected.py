@@ -100,6 +100,11 @@ def _numbers(state: State) -> dict[Hypothesis, tuple[int, str, list[int], list[f
         elif isinstance(family, KINDS):
             for i, cause in enumerate(family.causes):
                 out[cause] = (family.block, family.variable, [i], [1 / float(family.units[i])])
+        elif family.per == "ring":
+            for i, moves in enumerate(family.moves(data)):
+                for cause, share in moves.items():
+                    if len(moves) == 1 and cause[1] is not None:
+                        out[cause] = (family.block, family.variable, [i], [1 / share])
     return out
 
 
