@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
 from tmlattice.diagnosis.left_open import Blur
@@ -23,6 +22,7 @@ from tmlattice.inference.among import Blurred
 from tmlattice.inference.newton import Fit, Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Rival
+from tmlattice.inference.root import directions_of
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,6 @@ LINEARISED = 3
 """Times that a change is taken at its likeliest amount."""
 SAME = 0.02
 """Of the amount, to which that is enough."""
-FELT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,21 +51,10 @@ class _Line:
     spread: Array
 
     @cached_property
-    def _along(self) -> tuple[Array, Array]:
-        """Variances along the directions of B, and these, [direction, row]."""
-        errors, rows = self.spread.shape
-        if errors >= rows:
-            values, vectors = eigh(self.spread.T @ self.spread, check_finite=False)
-            return np.maximum(values, 0.0), vectors.T
-        values, vectors = eigh(self.spread @ self.spread.T, check_finite=False)
-        felt = values > FELT * max(float(values[-1]), 1e-300)
-        values = values[felt]
-        return values, (vectors[:, felt] / np.sqrt(values)).T @ self.spread
-
-    @cached_property
     def _parts(self) -> tuple[Array, Array, Array, Array]:
-        """Variances along these, the rows and the slope there; and their products beyond."""
-        values, along = self._along
+        """Variances along the directions of B, the rows and the slope there; and their products
+        beyond them."""
+        values, along = directions_of(self.spread)
         both = np.stack([self.left, self.slope])
         inside = both @ along.T
         beyond = both @ both.T - inside @ inside.T

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.fields import QuadrupoleGradient, SkewGradient
-from tmlattice.diagnosis.others import KINDS
 from tmlattice.diagnosis.rounds import Linear, linear, weight
 from tmlattice.diagnosis.small_errors import sizes_in
 from tmlattice.diagnosis.state import State
@@ -97,9 +96,6 @@ def _numbers(state: State) -> dict[Hypothesis, tuple[int, str, list[int], list[f
                     if strength and len(pieces) == 1:
                         turned = [-2 * strength / share]
                         out[("quadrupole_roll", name)] = (1, family.variable, [i], turned)
-        elif isinstance(family, KINDS):
-            for i, cause in enumerate(family.causes):
-                out[cause] = (family.block, family.variable, [i], [1 / float(family.units[i])])
         elif family.per == "ring":
             for i, moves in enumerate(family.moves(data)):
                 for cause, share in moves.items():

@@ -85,8 +85,24 @@ def inverse_root(spread: Array) -> Root:
         inverse, failed = dtrtri(factor, lower=1, overwrite_c=1)
         assert failed == 0
         return _Triangle(np.tril(inverse))
-    values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
-    felt = values > FELT * max(float(values[-1]), 1.0) if errors else np.zeros(0, dtype=bool)
-    values = values[felt]
-    directions = (vectors[:, felt] / np.sqrt(values)).T @ spread
+    values, directions = directions_of(spread)
     return _Symmetric(directions, 1 / np.sqrt(1 + values))
+
+
+def directions_of(spread: Array) -> tuple[Array, Array]:
+    """Orthonormal directions of the rows that errors of size 1 move.
+
+    Args:
+        spread: S, [error, row].
+
+    Returns:
+        The variance along each, [direction]; and the directions, [direction, row].
+    """
+    errors, rows = spread.shape
+    if errors >= rows:
+        values, vectors = eigh(spread.T @ spread, overwrite_a=True, check_finite=False)
+        return np.maximum(values, 0.0), vectors.T
+    values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
+    felt = values > FELT * values.max(initial=1e-300)
+    values = values[felt]
+    return values, (vectors[:, felt] / np.sqrt(values)).T @ spread
