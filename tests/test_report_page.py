@@ -154,8 +154,9 @@ def test_zoom_changes_what_is_drawn(opened, first_turns):
 
 def test_a_response_has_tables_that_are_sorted_and_copied(opened, response):
     tab = opened(response, permissions=["clipboard-read", "clipboard-write"])
-    assert {"suspects", "notes", "gap", "steps", "optics", "errors"} <= set(headings(tab))
-    assert "QD::5" in tab.inner_text(".suspects")
+    assert {"findings", "notes", "gap", "steps", "optics", "errors"} <= set(headings(tab))
+    assert "QD::5" in tab.inner_text("#answer")
+    assert "suspects" not in headings(tab)  # what would be one is a finding
     table = tab.locator("table.sortable").first
     column = "all => all.map(row => row.cells[2].textContent)"
     for _ in range(2):

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.diagnosis.rounds import _good_monitors
-from tmlattice.inference.normal import normal_equations, solve
+from tmlattice.diagnosis import dense, rounds
+from tmlattice.diagnosis.fields import QuadrupoleGradient
+from tmlattice.diagnosis.rounds import _good_monitors, linear, one_round
+from tmlattice.diagnosis.state import allow, begin
+from tmlattice.effects import Cause
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.normal import Normal, normal_equations, solve
 from tmlattice.inference.priors import Group
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import response_data, split_columns
 
 
 @pytest.fixture
@@ -25,7 +32,7 @@ def problem(rng):
     return residual, weight, plane, u, v, J
 
 
-def dense(residual, weight, plane, u, v, J):
+def written_out(residual, weight, plane, u, v, J):
     """The whole design matrix, [reading, parameter]."""
     columns, monitors = residual.shape
     rows = []
@@ -41,7 +48,7 @@ def dense(residual, weight, plane, u, v, J):
 
 def test_fit_vs_dense_least_squares(problem, rng):
     residual, weight, *_ = problem
-    X = dense(*problem)
+    X = written_out(*problem)
     size = X.shape[1]
     start = 0.05 * rng.standard_normal(size)
     rms = np.concatenate([np.full(18, 0.3), np.full(12, 0.2), np.full(7, 0.1)])
@@ -55,7 +62,7 @@ def test_fit_vs_dense_least_squares(problem, rng):
 
 def test_a_family_shares_its_error_vs_a_correlated_prior(problem):
     """Members and their family: the prior's covariance is D + t^2 of ones."""
-    X = dense(*problem)
+    X = written_out(*problem)
     residual, weight, *_ = problem
     size = X.shape[1]
     own = Group("own", np.eye(size), 0.1)
@@ -119,3 +126,51 @@ def test_monitors_are_bad_against_the_others_and_not_all_at_once(rng, astray):
     state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
     expected = np.full(9, True) if astray else np.arange(9) != 4
     assert (_good_monitors(state) == expected).all()
+
+
+def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
+    """What the data leave to the priors (the scale of all correctors against that of all monitors)
+    was said to be known, as soon as the one number that taught its size was small."""
+    alike = np.array([[1.0], [1.0]])  # only the sum of two numbers is read
+    there = Normal(1e8 * alike @ alike.T, 1e8 * 0.02 * alike[:, 0])
+    sigma = []
+    for usual in (0.0, 0.05):
+        groups = [
+            Group("gain", np.eye(2)[:, :1], 0.03, fixed=True),
+            Group("calibration", np.eye(2)[:, 1:], 0.05, usual=usual),
+        ]
+        sigma.append(solve(there, groups, rounds=60).sigma[1])
+    assert sigma[0] < 0.01
+    assert 0.015 < sigma[1] < 0.03
+
+
+def test_a_round_follows_a_bent_valley(small_ring, monkeypatch):
+    """Two quadrupoles are off by 10 %: along the tangent the step leads up the wall."""
+    causes = [Cause("quadrupole_gradient", *own) for own in (("QD::5", 0.1), ("QF::9", -0.1))]
+    measured = simulate_response(
+        small_ring, causes, kick=1e-5, noise=1e-8, rf_step=-3000.0, engine="ocelot", progress=False
+    ).measured
+    data = response_data(small_ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    state = allow(begin(data, split), [QuadrupoleGradient()])
+    there = linear(state, 0)
+    far = one_round(state, 0, there, bold=10.0)
+    monkeypatch.setattr(rounds, "CORRECTED", 0)
+    plain = one_round(state, 0, there, bold=10.0)
+    assert plain.after > plain.before
+    assert far.after < 0.6 * far.before
+
+
+def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
+    """It ended the diagnosis of a measured ring, whose dispersion ran away without gradients."""
+
+    def lost(state, trial):
+        raise UnstableRingError("no closed orbit")
+
+    monkeypatch.setattr(dense, "_quickly", lambda *_: ({"gradients": 1.0}, {"gradients": False}))
+    monkeypatch.setattr(dense, "_without", lost)
+    monkeypatch.setattr(dense, "inner", lambda state: None)
+    monkeypatch.setattr(dense, "log_evidence", lambda *_: 0.0)
+    monkeypatch.setattr(dense, "_title", str)
+    state = SimpleNamespace(good=None, independent=None)
+    assert dense._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})

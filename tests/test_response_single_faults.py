@@ -126,6 +126,25 @@ def test_patterns_of_kicks_are_few_and_focus(small_ring, measured_with):
         assert strength[0] > strength[-1]
 
 
+def test_a_pattern_of_kicks_moves_the_response_as_at_has_it(small_ring):
+    """Sign and size of both orbits' rows: kicks of the bends as AT tracks them, no noise."""
+
+    def seen(*causes):
+        machine = simulate_response(small_ring, causes, noise=1e-12, progress=False)
+        return response_data(small_ring, machine.measured)
+
+    design = seen()
+    at = begin(design, split_columns(design, 0.2, np.random.default_rng(0))).at
+    for family in orbit_families(small_ring, at.model):
+        value = np.zeros(family.size(design))
+        value[0] = 0.05
+        put = family.put(at.errors, value, design).ring
+        moved = design.pick(seen(*put).orbits - design.orbits, family.block)
+        told = 0.05 * family.rows(at, value)[0]
+        rest = np.linalg.norm((moved - told)[:-1]) / np.linalg.norm(moved[:-1])
+        assert rest < 0.05  # of second order in the kicks
+
+
 def test_a_few_causes_that_lead_astray_are_none(small_ring):
     """The search ended where the ring has no orbit off its energy, and so did the diagnosis."""
     supply = Cause("family_gradient", "QD", -0.023501608727675934)
@@ -134,3 +153,10 @@ def test_a_few_causes_that_lead_astray_are_none(small_ring):
         machine_seed=1384498935, noise=tuple(1.5126369 * rms for rms in NOISE),
     ).measured  # fmt: skip
     assert few_causes(*parted(small_ring, measured), None, 10, DEFAULT) is None
+
+
+def test_a_reversed_monitor_with_few_correctors_in_its_plane_is_named(small_ring, measured_with):
+    """Two horizontal correctors and the RF read it: what it left of these took their weight, and
+    the search did not begin."""
+    cause = Cause("monitor_gain_x", "end_1", -1.33)
+    named(small_ring, measured_with(cause), cause)

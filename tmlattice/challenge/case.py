@@ -4,6 +4,7 @@ DIR/challenge.json                   tier and lattice
 DIR/cases/NAME/case.json             options that the diagnosis may know
 DIR/cases/NAME/fit|heldout|reference measurement folders of first turns, or one of each kind, and
                                      before_KIND of the machine before the fault
+DIR/cases/NAME/learnt                its orbit response before the fault
 DIR/truth/NAME.json, NAME.npz        causes, launches, readings without noise
 DIR/truth/made.json                  seed, and what was drawn anew
 DIR/results/NAME.json                the diagnosis
@@ -31,6 +32,7 @@ from tmlattice.lattice.load import contents
 from tmlattice.measurement import (
     AnyMeasurement,
     Measurement,
+    OrbitResponse,
     read_measurement,
     write_measurement,
 )
@@ -50,6 +52,8 @@ TIERS = tuple(CAUSES)
 
 BEFORE = "before_"
 """What the folder of a kind is called that was measured before the fault."""
+LEARNT = "learnt"
+"""What the folder is called of an orbit response of the machine before the fault."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,8 @@ class Case:
         name: of the case.
         lattice: what `load_ring` takes.
         parts: the measurements by folder: fit, heldout and perhaps reference of first turns; or
-            one of each kind by its name, and `before_KIND` of the machine before the fault.
+            one of each kind by its name, and `before_KIND` of the machine before the fault; and
+            `learnt`, an orbit response of that.
         options: of `diagnose`: background, effects.
         kinds: those that are diagnosed together; () of first turns.
     """
@@ -85,6 +90,11 @@ class Case:
     def reference(self) -> Measurement | None:
         """First turns before the fault, or None."""
         return cast(Measurement | None, self.parts.get("reference"))
+
+    @property
+    def learnt(self) -> OrbitResponse | None:
+        """Of the machine before the fault, or None."""
+        return cast(OrbitResponse | None, self.parts.get(LEARNT))
 
     @property
     def measured(self) -> dict[str, AnyMeasurement]:
@@ -151,6 +161,7 @@ def write_case(folder: Path, case: Case, truth: Truth) -> None:
         "lattice": case.lattice,
         "reference": bool(case.before) or "reference" in case.parts,
         "options": dict(case.options),
+        **({LEARNT: True} if case.learnt is not None else {}),
         **({"kinds": list(case.kinds)} if case.kinds else {}),
     }
     with output_file(own / "case.json") as path:
@@ -271,6 +282,8 @@ def read_case(folder: Path, name: str) -> Case:
     wanted = {kind: kind for kind in kinds} or {"fit": "trajectory", "heldout": "trajectory"}
     if public["reference"]:
         wanted |= {BEFORE + kind: kind for kind in kinds} or {"reference": "trajectory"}
+    if public.get(LEARNT):
+        wanted[LEARNT] = "orbit_response"
     parts = {}
     for folder_name, kind in wanted.items():
         parts[folder_name] = read_measurement(own / folder_name)

@@ -3,6 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from tqdm.auto import tqdm
 from tmlattice.batch import fingerprint
 from tmlattice.challenge.case import (
     CONTENTS,
+    LEARNT,
     RECORDS,
     SET,
     TIERS,
@@ -24,7 +26,7 @@ from tmlattice.challenge.case import (
     write_case,
 )
 from tmlattice.challenge.draw import Draw
-from tmlattice.challenge.kinds import TIER_KINDS, Asked, kinds_case
+from tmlattice.challenge.kinds import TIER_KINDS, Asked, kinds_case, measure
 from tmlattice.challenge.ruler import Ruler
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
 from tmlattice.effects import (
@@ -69,6 +71,7 @@ def make(
     *,
     lattice: str = "petra3",
     reference: bool = False,
+    learnt: bool = False,
     shots: int = 4,
     effects: Sequence[str] | None = None,
     amount: float | None = None,
@@ -90,6 +93,8 @@ def make(
         folder: for the challenge.
         lattice: what `load_ring` takes.
         reference: tier B, with a measurement from before the fault.
+        learnt: tier B, with an orbit response from before the fault, from whose diagnosis that of
+            the case starts.
         shots: of first turns and kicks of a stored beam; of the fit, two more are held out.
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a signal to noise that is drawn.
@@ -108,15 +113,8 @@ def make(
     """
     if tier not in TIERS:
         raise TmlatticeError(f"no tier '{tier}'; there are {', '.join(TIERS)}")
-    if reference and tier != "B":
-        raise TmlatticeError("a reference is for tier B; leave --reference out")
     kinds = _kinds(tier, kinds)
-    if background and tier != "B" and not kinds:
-        raise TmlatticeError(
-            "small errors everywhere are for tier B and for those of kinds; leave --background out"
-        )
-    if told and "orbit_response" in kinds:
-        raise TmlatticeError("an orbit response says those sizes by itself; leave --told out")
+    _check(tier, kinds, reference, learnt, told, bool(background))
     everywhere = background or ({"all": None} if tier in ("B", "P") else {})
     rms = background_rms(everywhere) if everywhere else {}
     chosen = names(effects)
@@ -136,6 +134,8 @@ def make(
     }
     if tier == "B" or kinds:
         public["told"] = told
+    if learnt:
+        public[LEARNT] = True
     if kinds:
         public["kinds"] = list(kinds)
     _begin(folder, public, seed)
@@ -147,18 +147,9 @@ def make(
             continue
         if kinds:
             asked = Asked(
-                tier,
-                lattice,
-                ring,
-                seed,
-                kinds,
-                tuple(chosen) if effects else None,
-                shots,
-                signal,
-                amount,
-                rms,
-                told,
-            )
+                tier, lattice, ring, seed, kinds, tuple(chosen) if effects else None, shots, signal,
+                amount, rms, told,
+            )  # fmt: skip
             case, truth, lost = kinds_case(asked, number, name)
         else:
             drawn = CaseDraw(
@@ -166,6 +157,8 @@ def make(
                 told,
             )  # fmt: skip
             case, truth = drawn.make(name)
+            if learnt:
+                case = replace(case, parts={**case.parts, LEARNT: _response_before(drawn)})
             lost = drawn.draw
         write_case(folder, case, truth)
         unreachable.update(effect for effect, _, _ in lost.unreachable)
@@ -173,6 +166,30 @@ def make(
     with output_file(folder / "truth" / "made.json") as path:
         write_json(path, {"format": "tmlattice-challenge-made", "version": 1, **made})
     return dict(unreachable)
+
+
+def _check(
+    tier: str, kinds: Sequence[str], reference: bool, learnt: bool, told: bool, background: bool
+) -> None:
+    """Whether a tier has what is asked of it."""
+    if reference and tier != "B":
+        raise TmlatticeError("a reference is for tier B; leave --reference out")
+    if learnt and (tier != "B" or reference or told):
+        raise TmlatticeError(
+            "a machine is learnt in tier B alone, without --reference or --told; leave --learnt out"
+        )
+    if background and tier != "B" and not kinds:
+        raise TmlatticeError(
+            "small errors everywhere are for tier B and for those of kinds; leave --background out"
+        )
+    if told and "orbit_response" in kinds:
+        raise TmlatticeError("an orbit response says those sizes by itself; leave --told out")
+
+
+def _response_before(drawn: "CaseDraw") -> AnyMeasurement:
+    """The orbit response of a case's machine without the fault, in usual noise."""
+    own = {"background": drawn.background, "machine_seed": drawn.seed, "seed": drawn.seed + 2}
+    return measure("orbit_response", drawn.ring, (), 1.0, drawn.fit_shots, **own)
 
 
 def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:

@@ -17,13 +17,14 @@ from tmlattice.challenge.case import (
     trusted_case,
 )
 from tmlattice.diagnosis import diagnose
+from tmlattice.diagnosis.twin import known_of
 
 log = logging.getLogger(__name__)
 
 
 def diagnose_case(case: Case) -> dict[str, Any]:
     """The diagnosis of one case as JSON, and the seconds it took; of several kinds also what is
-    found in each alone."""
+    found in each alone. Where the machine was learnt before, from what that left known."""
     ring = ring_of(case.lattice)
     begun = time.perf_counter()
     if case.kinds:
@@ -36,6 +37,10 @@ def diagnose_case(case: Case) -> dict[str, Any]:
             one = diagnose(ring, case.measured[kind], **case.options).as_json()
             alone[kind] = {key: one[key] for key in ("verdict", "findings", "priors")}
         return {**together, "seconds": seconds, **({"alone": alone} if alone else {})}
+    if case.learnt is not None:
+        before = diagnose(ring, case.learnt)
+        found = diagnose(before.as_found, case.fit, known=known_of(before))
+        return {**found.as_json(), "seconds": time.perf_counter() - begun}
     found = diagnose(
         ring,
         case.fit,

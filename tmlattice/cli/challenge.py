@@ -65,6 +65,11 @@ def _cluster_options(function: Any) -> Any:
 @click.option("--lattice", default="petra3", show_default=True, help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
 @click.option(
+    "--learnt",
+    is_flag=True,
+    help="Tier B: the diagnosis starts from an orbit response of the machine before the fault.",
+)
+@click.option(
     "--kind",
     "kinds",
     multiple=True,

@@ -167,6 +167,7 @@ def diagnose(
         if not response and (known := _known(ring, lattice)) is not None:
             options["known"] = known
         if response:
+            said += _not_used(lattice)
             _refuse("an orbit response", background=background)
         if not turns:
             what = "an orbit response" if response else "several measurements or a stored beam's"
@@ -234,6 +235,19 @@ def _read(
         found[str(path) if twice else name], own = read_data(path, ring, map_file, unit, quiet)
         said += own
     return found, said
+
+
+def _not_used(lattice: str) -> list[str]:
+    """What stands beside a lattice that an orbit response does not start from."""
+    from tmlattice.diagnosis.twin import known_beside
+
+    beside = known_beside(Path(lattice))
+    if not beside.is_file():
+        return []
+    return [
+        f"'{beside}' is not used: an orbit response tells calibrations and small errors by itself; "
+        "--reference says what changed since an earlier one"
+    ]
 
 
 def _known(ring: "Ring", lattice: str) -> "Known | None":

@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one, score
+from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
+from tmlattice.diagnosis.judges import score
 from tmlattice.diagnosis.left_open import left_open
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.response import as_diagnosis, assumed_of, provenance, trials_of

@@ -9,25 +9,25 @@ Gradients and skew gradients are fitted together, because skew ones move the tun
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
+from tmlattice.diagnosis.judges import Chi2, Score, against, inner, lost, score
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
 from tmlattice.diagnosis.state import (
     State,
     allow,
-    amplitudes,
     begin,
     bend,
     forbid,
     jump,
-    rms_of,
 )
+from tmlattice.diagnosis.stated import stated
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.observe.orbit_response import ResponseData, Split
@@ -39,41 +39,12 @@ log = logging.getLogger(__name__)
 
 LEAST = 5.0
 """Log evidence that a step has to have."""
-JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
-"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
-25 readings), and by how much their sum may fall without a step that stays all the same: evidence
-takes what the model lacks for noise, and gladly fits it."""
 SPOILT = 0.05
-"""By how much it may fall without any."""
+"""By how much the judges' figures may rise with all families together."""
 SURE = 100.0
 """Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
 FIRST, ROUGH = 4, 0.03
 """Rounds of each block after a family came in, or went, and what one has to gain for another."""
-
-
-class Chi2(NamedTuple):
-    """A sum of squares in units of the noise, and of how many readings."""
-
-    total: float
-    readings: int
-
-    @property
-    def per_reading(self) -> float:
-        """1 is noise."""
-        return self.total / max(self.readings, 1)
-
-
-@dataclass(frozen=True)
-class Score:
-    """What the judges say: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
-
-    in_plane: float
-    coupling: float
-    chi2_per_dof: float
-    dispersion: float
-    position: float
-    roll: float
-    chi2: tuple[Chi2, Chi2, Chi2]
 
 
 @dataclass(frozen=True)
@@ -113,59 +84,6 @@ class Step:
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
         return {name: value for name, value in vars(self).items() if name != "kept"}
-
-
-# --- the judges -----------------------------------------------------------------------------------
-def score(state: State, judges: Flags, rf: Flags | None = None) -> Score:
-    """What correctors that were not fitted say; each has its kick from its near monitors.
-
-    Args:
-        state: that is judged.
-        judges: the correctors that judge, [column].
-        rf: monitors that judge the RF's response; None: those that did not fit it.
-    """
-    data, at, half = state.data, state.at, state.split.half
-    read = at.seen(at.beam)
-    straight, across = data.pick(read), data.pick(read, 1)
-    orbits, orbits_across = data.pick(data.orbits), data.pick(data.orbits, 1)
-    jumps = data.pick(at.seen(at.jumps))
-    turned = state.allows("corrector_roll")
-    rolls = data.pick(at.seen(at.across), 1) if turned else np.zeros_like(straight)
-    variance, variance_across = (data.noise_of(block) ** 2 for block in (0, 1))
-    inside, jumped, outside, rolled, squares, spread = [], [], [], [], [], []
-    cross = [np.zeros(0)]
-    for c in np.flatnonzero(judges):
-        seen = np.isfinite(orbits[c]) & state.good
-        near, far = seen & half[c], seen & ~half[c]
-        # all alike: what the model lacks is not the readings' noise
-        kick, miss = amplitudes(straight[c][:, None], orbits[c], near, far)
-        inside.append(miss)
-        squares.append(miss**2 / variance[c, far])
-        # the kick's own error stands beside the reading's
-        spread.append(1 + straight[c, far] ** 2 / np.sum(straight[c, near] ** 2))
-        jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
-        left = orbits_across[c] - kick[0] * across[c]
-        there = np.isfinite(left)
-        outside.append(left[far & there])
-        cross.append(outside[-1] ** 2 / variance_across[c, far & there])
-        if rolls[c].any():
-            rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
-    judge = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
-    of_rf = (orbits[-1] - straight[-1])[judge]
-    own, others = np.concatenate(squares), np.concatenate(cross)
-    return Score(
-        in_plane=rms_of(inside),
-        coupling=rms_of(outside),
-        chi2_per_dof=float(np.mean(own)),
-        dispersion=rms_of([of_rf]),
-        position=rms_of(jumped),
-        roll=rms_of(rolled) if rolled else float("nan"),
-        chi2=(
-            Chi2(float(np.sum(own / np.concatenate(spread))), len(own)),
-            Chi2(float(np.sum(others)), len(others)),
-            Chi2(float(np.sum(of_rf**2 / variance[-1, judge])), len(of_rf)),
-        ),
-    )
 
 
 def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
@@ -229,7 +147,8 @@ def fit_steps(
         count = sum(family.count(data) for family in trial.families)
         steps[trial] = Step.scored(_title(trial), count, score(state, split.held))
     progress("all together")
-    state = settle(bend(jump(state)))
+    state = settle(bend(jump(replace(state, independent=np.ones((2, 2))))))
+    log.info("independent readings: %s", state.independent)
     refused: list[Step] = []
     worth, without = _worth(state, steps, progress)
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
@@ -242,7 +161,8 @@ def fit_steps(
         if doubted:
             again, without = _worth(state, doubted, progress)
             worth |= again
-    if _lost(_inner(design), _inner(state)) < -SPOILT:  # all together spoil what they should mend
+    spoilt = -lost(inner(design), inner(state))[0]
+    if spoilt > SPOILT:  # all together spoil what they should mend
         refused += [replace(step, kept=False) for step in steps.values()]
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
                         (before, before))  # fmt: skip
@@ -280,20 +200,6 @@ def _blocks(trial: Trial) -> list[int]:
     return [1] * (trial.across > 0) + [0] * (trial.own > 0)
 
 
-def _inner(state: State) -> Array:
-    """What chooses: in-plane, coupling and dispersion rms of correctors held out for it; each half
-    of their monitors gives the kick once."""
-    other = replace(state, split=replace(state.split, half=~state.split.half))
-    said = [score(one, state.split.inner, state.split.inner_rf) for one in (state, other)]
-    rms = [[one.in_plane, one.coupling, one.dispersion] for one in said]
-    return np.asarray(np.sqrt(np.mean(np.square(rms), axis=0)))
-
-
-def _lost(without: Array, inner: Array) -> float:
-    """By how much the judges' figures rise; those that nobody read (no RF step) say nothing."""
-    return float(np.nansum(JUDGES * np.log(without / np.maximum(inner, 1e-300))))
-
-
 def _worth(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, float], dict[Trial, State]]:
@@ -308,16 +214,21 @@ def _worth(
     states: dict[Trial, State] = {}
     if not doubtful:
         return worth, states
-    inner, evidence = _inner(state), log_evidence(state, state.good)
+    chosen_by, shares = inner(state), state.independent
+    evidence = log_evidence(state, state.good, shares)
     for trial in doubtful:
         progress(f"without {_title(trial)}")
-        without = states[trial] = _without(state, trial)
+        try:
+            without = states[trial] = _without(state, trial)
+        except TmlatticeError:  # no closed orbit without it
+            worth[trial] = np.inf
+            continue
         good = state.good & without.good
-        with_it = evidence if (good == state.good).all() else log_evidence(state, good)
-        gained = with_it - log_evidence(without, good) - LEAST
-        lost = _lost(_inner(without), inner)
-        log.info("without %s: evidence %+.1f, judges %+.3f", _title(trial), -gained, lost)
-        worth[trial] = min(gained, lost) if _asked(trial) and lost < -VETO else gained
+        with_it = evidence if (good == state.good).all() else log_evidence(state, good, shares)
+        gained = with_it - log_evidence(without, good, shares) - LEAST
+        said = lost(inner(without), chosen_by)
+        log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
+        worth[trial] = min(gained, said[0]) if _asked(trial) and against(said) else gained
     return worth, states
 
 
@@ -337,13 +248,13 @@ def _quickly(
     """Log evidence of each trial, linear about where the fit stands, which is enough for what
     nobody doubts; and whether the judges would rather be without it."""
     worth: dict[Trial, float] = {}
-    against: dict[Trial, bool] = {}
-    inner = _inner(state)
+    unwanted: dict[Trial, bool] = {}
+    judged = inner(state)
     blocks: dict[int, tuple[Linear, float]] = {}
     for trial in trials:
         progress(f"is {_title(trial)} needed")
         if not any(state.values[family.variable].any() for family in trial.families):
-            worth[trial], against[trial] = -LEAST, False  # held at zero: nothing is lost without
+            worth[trial], unwanted[trial] = -LEAST, False  # held at zero: nothing is lost without
             continue
         block = trial.families[0].block
         if block not in blocks:
@@ -353,12 +264,14 @@ def _quickly(
         other, values = linear_evidence(there, _priors(trial, state))
         worth[trial] = evidence - other - LEAST
         try:
-            lost = _lost(_inner(state.moved({**state.values, **values})), inner)
+            said = lost(inner(state.moved({**state.values, **values})), judged)
         except TmlatticeError:  # no closed orbit without it
-            lost = np.inf
-        against[trial] = _asked(trial) and lost < -VETO
-        log.info("%s: linear evidence %+.1f, judges %+.3f", _title(trial), worth[trial], lost)
-    return worth, against
+            said = np.inf, 0.0
+        unwanted[trial] = _asked(trial) and against(said)
+        log.info(
+            "%s: linear evidence %+.1f, judges %+.3f +- %.3f", _title(trial), worth[trial], *said
+        )
+    return worth, unwanted
 
 
 def _without(state: State, trial: Trial) -> State:
@@ -368,7 +281,7 @@ def _without(state: State, trial: Trial) -> State:
 
 # --- what was found -------------------------------------------------------------------------------
 def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
-    """The errors as causes, with posterior rms; and what the data alone do not settle, in words."""
+    """What is wrong as causes, with errors; and what the data alone do not settle, in words."""
     found: list[Told] = []
     said: tuple[str, ...] = ()
     for block in (0, 1):
@@ -377,9 +290,10 @@ def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
             continue
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        sigma = stated(state, block, there, posterior)
         for name, family in families.items():
-            sigma = posterior.sigma[there.where[name]]
-            found += family.told(state.at.errors, state.values[name], sigma, state.data)
+            own = sigma[there.where[name]]
+            found += family.told(state.at.errors, state.values[name], own, state.data)
         if block == 0:
             said = _degenerate(state, there, posterior)
     return [row for row in found if row[0].amount != 0 or row[1] != 0], said

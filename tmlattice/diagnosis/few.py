@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.dense import DenseFit, Step, score
+from tmlattice.diagnosis.dense import DenseFit, Step
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.findings import findings_of, verdict_of
+from tmlattice.diagnosis.judges import score
 from tmlattice.diagnosis.left_open import Blur, LeftOpen
 from tmlattice.diagnosis.one_change import OneChange
 from tmlattice.diagnosis.result import Finding

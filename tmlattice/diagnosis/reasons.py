@@ -20,6 +20,7 @@ from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import families, magnets
 from tmlattice.diagnosis.rounds import linear, marginal
 from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.stated import stated
 from tmlattice.inference.levels import Levels
 from tmlattice.inference.normal import solve
 from tmlattice.lattice import Element, Ring
@@ -145,10 +146,24 @@ def explain_gradients(state: State) -> Reasons | None:
     kinds, names, members = candidates(state.data.ring, own)
     known = state.groups.get(family.name)
     scatter = max(LEAST_SCATTER if known is None else known.rms, LEAST_SCATTER)
+    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    rows = there.where[family.variable]
+    spread = posterior.spread[rows]
+    covariance = spread @ posterior.covariance @ spread.T
+    sigma = stated(state, 0, there, posterior)[rows]
+    # what the stated errors have more than the posterior's is of the readings, and no scatter of
+    # the magnets; but it is in every error as that is
+    plain = np.maximum(np.diag(covariance), 1e-24)
+    more = np.sqrt(np.maximum(sigma**2 / plain - 1, 0))
+    beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more)
     levels = Levels(
-        information, pull, members, np.full(len(own), scatter**2), np.full(len(names), USUAL),
+        information,
+        pull,
+        members,
+        beside,
+        np.full(len(names), USUAL),
         np.array([COST[kind] for kind in kinds]),
-    )  # fmt: skip
+    )
     found = levels.reasons(levels.choose(MOST))
     places = [pieces[0].name for pieces in own]
     reasons = tuple(
@@ -163,24 +178,19 @@ def explain_gradients(state: State) -> Reasons | None:
     values = state.values[family.variable]
     shared = sum((one.amount * members[:, one.candidate] for one in found
                   if kinds[one.candidate] != "magnet"), np.zeros(len(own)))  # fmt: skip
-    posterior = solve(there.normal, there.groups, there.start, rounds=0)
-    spread = posterior.spread[there.where[family.variable]]
-    covariance = spread @ posterior.covariance @ spread.T
     size = float(np.sum(values**2))
     left = values - shared
     return Reasons(
         reasons,
-        _outliers(places, left, values, covariance),
+        _outliers(places, left, values, sigma, covariance / np.sqrt(np.outer(plain, plain))),
         1 - float(np.sum(left**2)) / size if size else 0.0,
         float(np.sqrt(np.mean(left**2))),
     )
 
 
 def _outliers(
-    places: Sequence[str], left: Array, values: Array, covariance: Array
+    places: Sequence[str], left: Array, values: Array, sigma: Array, correlation: Array
 ) -> tuple[Outlier, ...]:
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
-    correlation = covariance / np.outer(sigma, sigma)
     found = []
     for i in np.flatnonzero(np.abs(left) > TOLERANCE).tolist():
         other = np.argsort(-np.abs(correlation[i]))

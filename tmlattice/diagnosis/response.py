@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.dense import Chi2, DenseFit, Score, fit_chi2, fit_steps, told
+from tmlattice.diagnosis.dense import DenseFit, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swap_of, swapped
 from tmlattice.diagnosis.exchanged import told as told_exchanged
@@ -30,6 +30,7 @@ from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.findings import with_consequences
+from tmlattice.diagnosis.judges import Chi2, Score
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.reasons import explain_gradients

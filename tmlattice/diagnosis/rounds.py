@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import Family
+from tmlattice.diagnosis.independent import independent
 from tmlattice.diagnosis.odd_readings import shares
 from tmlattice.diagnosis.state import Kept, State
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.normal import Normal, normal_equations, solve
+from tmlattice.inference.normal import Normal, Posterior, normal_equations, solve
 from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
@@ -44,6 +45,10 @@ LEARN = 10
 RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
 """How often a round that went astray is repeated; by what trust falls then and grows else, and to
 how much at most."""
+CORRECTED, CORRECTS = 6, 1e-3
+"""How often a round corrects its step by what the readings say where it led, with the slopes of its
+start; and what share of the cost that has to gain to be repeated. Numbers that pull against one
+another go far in a valley that is narrow and bent: a step along its tangent leads up its wall."""
 STILL = 0.05
 """Share of what is trusted by which the ring moves, in the mean, before rows are taken anew."""
 
@@ -101,8 +106,17 @@ def weight(state: State, block: int) -> Array:
     if state.exploring:
         use[-1] &= ~split.inner_rf
     variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
-    counts = 1.0 if state.share is None else state.share[block]
+    counts = _counts(state, block)
+    if state.share is not None:
+        counts = counts * state.share[block]
     return np.where(use, counts / variance, 0.0)
+
+
+def _counts(state: State, block: int) -> Array:
+    """As how many readings each one counts, [column, 1]."""
+    plane = state.data.plane_of(block)
+    own = np.ones(len(plane)) if state.independent is None else state.independent[block, plane]
+    return np.asarray(own[:, None])
 
 
 def linear(state: State, block: int) -> Linear:
@@ -197,10 +211,9 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
     """
     found = solve(there.normal, there.groups, there.start, bold * there.trust, rounds=EACH)
     family = {f.variable: f for f in state.families}
-    values = {name: family[name].bounded(found.values[at]) for name, at in there.where.items()}
     groups = {group.name: group for group in found.groups}
+    learnt = replace(state, groups={**state.groups, **groups})
     weights = weight(state, block)
-    then = replace(state, groups={**state.groups, **groups}).moved({**state.values, **values})
 
     def cost(at: State) -> float:
         left = np.where(weights > 0, state.data.pick(at.at.left, block), 0.0)
@@ -210,11 +223,46 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         )
         return float(np.sum(weights * left**2)) + penalty
 
-    try:
-        after = cost(then)
-    except UnstableRingError:  # astray: nothing is stored there
-        after = np.inf
-    return Moved(then, cost(state), after)
+    best, aim = Moved(learnt, cost(state), np.inf), found.values
+    for _ in range(CORRECTED + 1):
+        values = {name: family[name].bounded(aim[at]) for name, at in there.where.items()}
+        then = learnt.moved({**state.values, **values})
+        try:
+            after = cost(then)
+        except UnstableRingError:  # astray: nothing is stored there
+            break
+        last = best.after
+        if after <= last:
+            best = best._replace(state=then, after=after)
+        if after > (1 - CORRECTS) * last:
+            break
+        # what the readings say there, as if the ring were linear with the slopes of the start
+        moved = np.zeros_like(there.start)
+        for name, at in there.where.items():
+            moved[at] = values[name] - there.start[at]
+        left = np.where(weights > 0, state.data.pick(then.at.left, block), 0.0)
+        pull = _pull(state, block, there, weights * left) + there.normal.matrix @ moved
+        aim, before = _aim(there, found, bold * there.trust, pull), aim
+        further = aim - before
+        if further @ there.normal.matrix @ further < CORRECTS * after:
+            break  # as straight as the step took it for
+    return best
+
+
+def _pull(state: State, block: int, there: Linear, weighted: Array) -> Array:
+    """J^T W residual with the slopes of the start, [parameter]."""
+    columns, monitors = state.data.shape
+    plane = state.data.plane_of(block)
+    by_monitor = there.by_monitor * weighted
+    alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
+    ring = there.by_ring.reshape(len(there.by_ring), columns * monitors) @ weighted.ravel()
+    return np.concatenate([alone.ravel(), (there.by_column * weighted).sum(axis=1), ring])
+
+
+def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
+    """Values that another vector leads to, from the same start with the same priors and trust."""
+    whole = vector + there.normal.matrix @ there.start + there.start / trust**2
+    return np.asarray(found.spread @ (found.covariance @ (found.spread.T @ whole)))
 
 
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
@@ -294,16 +342,23 @@ def linear_evidence(
     return total, {name: found.values[rows] for name, rows in there.where.items()}
 
 
-def log_evidence(state: State, good: Flags) -> float:
+def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
     """Of what is fitted, of the readings of some monitors, both blocks, what the model lacks and
-    the priors at their likeliest; up to a constant of the data."""
+    the priors at their likeliest; up to a constant of the data.
+
+    Args:
+        state: that is weighed.
+        good: the monitors.
+        shares: of the readings that are independent: the same for states that are compared.
+    """
     total = 0.0
     for block in (block for block in (0, 1) if state.reads(block)):
-        state = replace(look(state, block), good=good)
+        state = replace(look(state, block), good=good, independent=shares)
         weights = weight(state, block)
         use = weights > 0
         left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-        total += 0.5 * float(np.log(weights[use]).sum() - np.sum(weights * left**2))
+        counts = np.broadcast_to(_counts(state, block), use.shape)[use]
+        total += 0.5 * float(counts @ np.log(weights[use] / counts) - np.sum(weights * left**2))
         if state.of_block(block):
             there = linear(state, block)
             total += linear_evidence(there)[0]
@@ -327,7 +382,20 @@ def look(state: State, block: int) -> State:
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
     good = state.good if block else _good_monitors(state)
-    return replace(state, lacking=lacking, good=good)
+    return _independent(replace(state, lacking=lacking, good=good), block, left)
+
+
+def _independent(state: State, block: int, left: Array) -> State:
+    """With the share of independent readings, where that is looked at: not before there are
+    gradients, for all that they make is waves."""
+    if state.independent is None or not state.allows(DISPERSION):
+        return state
+    own, shares, noise = state.independent.copy(), state.share, state.data.noise_of(block)
+    read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
+    for p in (0, 1):
+        rows = state.data.plane_of(block)[:-1] == p
+        own[block, p] = independent(read[rows], noise[:-1][rows])
+    return replace(state, independent=own)
 
 
 def _good_monitors(state: State) -> Flags:

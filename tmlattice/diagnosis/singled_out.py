@@ -18,21 +18,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, fit_chi2, score
+from tmlattice.diagnosis.dense import ROUGH, DenseFit, Step, fit_chi2
 from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.judges import Chi2, score
 from tmlattice.diagnosis.orbit_modes import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.others import KINDS, with_number
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.result import Finding
-from tmlattice.diagnosis.rounds import linear, log_evidence, settle
+from tmlattice.diagnosis.rounds import Linear, linear, log_evidence, settle
 from tmlattice.diagnosis.small_errors import ANEW, USUAL, sizes_in, small_errors
 from tmlattice.diagnosis.state import Apart, State, allow, bend
-from tmlattice.diagnosis.suspected import Seen, Weighed, suspects_of
+from tmlattice.diagnosis.stated import doubt
+from tmlattice.diagnosis.suspected import Seen, Suspect, Weighed, suspects_of
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.normal import solve
+from tmlattice.inference.priors import Group
 from tmlattice.inference.rivals import Detection, linear_evidence
 from tmlattice.inference.scan import Scan
 from tmlattice.lattice import Ring
@@ -164,11 +167,26 @@ class _Search:
     def drowned(self) -> bool:
         """Whether far more than noise is left, and no single cause makes most of that: the model
         lacks something, and what stands out may be that."""
-        own = max(fit_chi2(self.state)[:2], key=lambda plane: plane.per_reading)
+        planes = fit_chi2(self.state)[:2]
+        worst = max((0, 1), key=lambda plane: planes[plane].per_reading)
+        own = planes[worst]
         if own.per_reading <= LACKS or self.state.apart:
             return False
-        most = float(self.seen(self.state).beside().statistic.max(initial=0.0))
-        return most < own.readings * (1 - 1 / own.per_reading) / 2
+        # by the noise alone: what one cause leaves in a column takes that column's weight
+        left = [self.left_beside(*leader)[worst].total for leader in self.leaders()]
+        return min(left, default=np.inf) > (own.total + own.readings) / 2
+
+    def left_beside(
+        self, cause: Hypothesis, amount: float, information: Array
+    ) -> tuple[Chi2, Chi2, Chi2]:
+        """Chi-square with one cause more, nothing else moved; infinite where no beam is stored."""
+        state, suspect = _as_number(self.state, cause, information)
+        assert suspect.members is not None
+        values = state.values[suspect.variable] + amount * suspect.members
+        try:
+            return fit_chi2(state.moved({**state.values, suspect.variable: values}))
+        except TmlatticeError:
+            return (Chi2(np.inf, 1),) * 3
 
     def seen(self, state: State) -> Seen:
         """All suspects there."""
@@ -188,7 +206,7 @@ class _Search:
     def next(self) -> State | None:
         """With one cause more, the likeliest that stands out; None: none does."""
         tried: list[tuple[float, State]] = []
-        for cause, information in self.leaders():
+        for cause, _, information in self.leaders():
             state = self.put(self.state, cause, information)
             if state is not None:
                 tried.append((log_evidence(state, state.good) + self.problem.prior(cause), state))
@@ -198,9 +216,9 @@ class _Search:
                 return self.revised(state)
         return None
 
-    def leaders(self) -> list[tuple[Hypothesis, Array]]:
-        """What is tried: the likeliest by the linear model, one of each remedy; and what each block
-        knows of it."""
+    def leaders(self) -> list[tuple[Hypothesis, float, Array]]:
+        """What is tried: the likeliest by the linear model, one of each remedy; its amount, and
+        what each block knows of it."""
         ring = self.state.data.ring
         seen = self.seen(self.state)
         own = seen.beside()
@@ -210,13 +228,13 @@ class _Search:
         first = int(np.argmax(evidence))
         least = evidence[first] - NEAR - SHARE * own.statistic[first]
         order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
-        found: dict[str, tuple[Hypothesis, Array]] = {}
+        found: dict[str, tuple[Hypothesis, float, Array]] = {}
         have = [one.cause for one in self.state.apart]
         for h in order:
             cause = seen.suspects[h].cause
             same = remedy_of(ring, Cause(*cause, float(own.amount[h])))
             if cause not in have and len(found) < self.tries:
-                found.setdefault(same, (cause, own.information[:, h]))
+                found.setdefault(same, (cause, float(own.amount[h]), own.information[:, h]))
         return list(found.values())
 
     def put(self, state: State, cause: Hypothesis, information: Array) -> State | None:
@@ -227,11 +245,7 @@ class _Search:
             cause: of the suspects.
             information: of each block on it, [2].
         """
-        (suspect,) = suspects_of(state, [cause])
-        if suspect.block is None:
-            state = with_number(state, cause, int(np.argmax(information)))
-            (suspect,) = suspects_of(state, [cause])
-        return _settled(_apart(state, cause))
+        return _settled(_apart(_as_number(state, cause, information)[0], cause))
 
     def better(self, state: State, one: Apart) -> State:
         """Another cause in the place of one, where that explains more."""
@@ -259,7 +273,7 @@ class _Search:
             state = self.better(state, one)
         while len(state.apart) > 1:
             seen = self.seen(state)
-            worth = [float(seen.beside(o.name).statistic[_place(seen, o)]) for o in state.apart]
+            worth = [_shown(seen, one)[0] for one in state.apart]
             if min(worth) > CLEAR:
                 break
             least = state.apart[int(np.argmin(worth))]
@@ -286,10 +300,8 @@ class _Search:
 
     def clear(self, seen: Seen, one: Apart) -> bool:
         """Whether it stands out."""
-        own = seen.beside(one.name)
-        here = _place(seen, one)
-        statistic = float(own.statistic[here])
-        if not abs(own.amount[here]) < BEYOND * find(one.cause[0]).largest:
+        statistic, cause, _ = _shown(seen, one)
+        if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
             return False
         return statistic > CLEAR and self.p_value(seen, statistic, one) < self.judgement.false_alarm
 
@@ -300,15 +312,24 @@ class _Search:
         here = _place(seen, one)
         order = [int(h) for h in np.argsort(-evidence)[:LISTED] if np.isfinite(evidence[h])]
         order = [here, *(h for h in order if h != here)]
-        statistic = float(own.statistic[here])
+        statistic, cause, sigma = _shown(seen, one)
         return Fault(
-            Cause(*one.cause, float(own.amount[here])),
-            float(own.sigma[here]),
+            cause,
+            sigma,
             statistic,
             self.p_value(seen, statistic, one),
             tuple(Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in order),
             evidence[order],
         )
+
+
+def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Suspect]:
+    """With a number of the fit for a cause, of the block that knows more of it, and which it is."""
+    (suspect,) = suspects_of(state, [cause])
+    if suspect.block is None:
+        state = with_number(state, cause, int(np.argmax(information)))
+        (suspect,) = suspects_of(state, [cause])
+    return state, suspect
 
 
 def _apart(state: State, cause: Hypothesis) -> State:
@@ -322,6 +343,28 @@ def _apart(state: State, cause: Hypothesis) -> State:
 
 def _place(seen: Seen, one: Apart) -> int:
     return next(h for h, suspect in enumerate(seen.suspects) if suspect.cause == one.cause)
+
+
+def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
+    """Of what is wrong alone: by how much it stands out, its amount and its error, where single
+    columns or monitors that contradict all others count."""
+    own, here = seen.beside(one.name), _place(seen, one)
+    it = seen.blocks[one.block]
+    posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
+    wider = doubt(seen.state, one, it.there, posterior)
+    amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
+    # a small error multiplies with the fault: of a kick three times as strong it is three times
+    share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
+    variance += (share**2 - 1) * _scatter(it.there, it.sizes, one) ** 2
+    return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
+
+
+def _scatter(there: Linear, sizes: Sequence[Group], one: Apart) -> float:
+    """rms of the amount by the small errors of its family."""
+    along = np.zeros(len(there.start))
+    along[there.where[one.variable]] = one.members / float(one.members @ one.members)
+    return float(np.sqrt(sum(np.sum((along @ group.basis * group.scale) ** 2)
+                             for group in sizes if group.name != one.name)))  # fmt: skip
 
 
 def _without(state: State, one: Apart) -> State:

@@ -79,6 +79,8 @@ class State:
         kept: rows of the ring's variables, that stand until the ring has moved.
         share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
         apart: numbers that are wrong alone.
+        independent: share of the readings that tell something of their own, see `independent`,
+            [block, plane that is read]; None: all are taken to.
     """
 
     data: ResponseData
@@ -93,6 +95,7 @@ class State:
     kept: Mapping[str, Kept] = field(default_factory=dict)
     share: Array | None = None
     apart: tuple[Apart, ...] = ()
+    independent: Array | None = None
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

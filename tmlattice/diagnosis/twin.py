@@ -7,7 +7,9 @@ lattice file starts from both.
 
 import base64
 import hashlib
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +18,23 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.result import Diagnosis, JointView, ResponseView
 from tmlattice.effects import Cause, RingEffect, background_rms, find
-from tmlattice.errors import MeasurementError
-from tmlattice.inference.among import Known
+from tmlattice.errors import MeasurementError, UnstableRingError
+from tmlattice.inference.among import Known, small_errors_of
+from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.response_problem import Response
 
 Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+READINGS_TIMES_ERRORS = 5 * 10**7
+"""Up to which the covariance of all small errors is taken from a response: two minutes, 4 GB."""
+HARDLY = 0.3
+"""Relative error of a family's size from which on the usual one is not made smaller: a response
+sees kicks by the orbit in the sextupoles alone, of which it is not linear."""
 
 FORMAT = "tmlattice-known"
 BESIDE = ".known.json"
@@ -36,11 +49,12 @@ def known_beside(lattice: Path) -> Path:
 def known_of(diagnosis: Diagnosis) -> Known | None:
     """What a diagnosis knows beside the ring as found; None: nothing of small errors.
 
-    Of a joint diagnosis the small errors with their covariance; of families that were fitted to an
-    orbit response each error's own standard deviation, its correlations left out: what neighbours
-    know together is known less well than it is.
+    The small errors with their covariance. Of an orbit response they are linear about its dense
+    fit; where there are too many readings for that, each error of the fit has its own standard
+    deviation, its correlations left out: what neighbours know together is known less well than it
+    is.
     """
-    view, ring = diagnosis.view, diagnosis.ring
+    view = diagnosis.view
     if isinstance(view, JointView):
         beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
         if view.known is None:
@@ -50,15 +64,77 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
     if not isinstance(view, ResponseView) or not diagnosis.steps:
         return None
     usual = background_rms({"all": None})
-    own = {(c.effect, c.element): (c.amount, s)
+    everywhere = [(name, place) for name in usual for place in find(name).places(diagnosis.ring)]
+    if view.data.size * len(everywhere) <= READINGS_TIMES_ERRORS:
+        try:
+            return _together(diagnosis, view, usual, everywhere)
+        except UnstableRingError:  # too far from its likeliest small errors for what is linear
+            log.info("no covariance of the small errors", exc_info=True)
+    return _each_alone(diagnosis, usual, everywhere)
+
+
+def _together(
+    diagnosis: Diagnosis,
+    view: ResponseView,
+    usual: Mapping[str, float],
+    everywhere: Sequence[Hypothesis],
+) -> Known:
+    """All small errors that the readings of a response allow, about its dense fit."""
+    ring = diagnosis.ring
+    data = response_data(ring, view.measured)
+    # what the model lacks is no noise, but without it all would be known better than it is
+    lacks = np.sqrt(max(diagnosis.fit_after.chi2_per_dof, 1.0))
+    data = replace(data, noise=data.noise * lacks)
+    found = {(finding.effect, finding.element) for finding in diagnosis.findings}
+    fitted: dict[Hypothesis, float] = {
+        (c.effect, c.element): c.amount for c in diagnosis.causes
+        if c.element is not None and (c.effect, c.element) not in found
+    }  # fmt: skip
+    # what else was fitted is as little certain: a skew gradient may be a quadrupole's roll
+    more = [h for h, amount in fitted.items() if h[0] not in usual and amount]
+    scatter = {name: float(np.sqrt(np.mean([fitted[h] ** 2 for h in more if h[0] == name])))
+               for name, _ in more}  # fmt: skip
+    usual, everywhere = {**usual, **scatter}, [*everywhere, *more]
+    problem = Response(
+        base=Predicted(data, Errors.none(data)).bend(),
+        used=np.isfinite(data.orbits) & view.good[:, None],
+        places={},
+        fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),
+    )
+    start = np.array([fitted.get(h, 0.0) for h in everywhere])
+    first = small_errors_of(problem, Known.usual(everywhere, usual), problem.first, about=start)
+    sizes = {
+        name: size if first.errors[name] < HARDLY else max(size, usual[name])
+        for name, size in first.sizes.items()
+    }
+    known = Known.usual(everywhere, sizes)
+    learnt = small_errors_of(problem, known, problem.first, learn=False, about=start)
+    known = learnt.problem.learnt(learnt.before)
+    inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the ring as found has them
+    return replace(
+        known,
+        amounts=known.amounts - np.where(inside, start, 0.0),
+        causes=tuple(c for c in problem.fixed if _beside(c)),
+    )
+
+
+def _each_alone(
+    diagnosis: Diagnosis, usual: Mapping[str, float], everywhere: Sequence[Hypothesis]
+) -> Known:
+    """Each error of a dense fit with its own standard deviation."""
+    own = {(c.effect, c.element): s
            for c, s in zip(diagnosis.causes, diagnosis.errors, strict=True)}  # fmt: skip
-    everywhere = [(name, place) for name in usual for place in find(name).places(ring)]
-    rms = [own[h][1] if h in own and own[h][1] > 0 else usual[h[0]] for h in everywhere]
+    rms = [own[h] if own.get(h, 0.0) > 0 else usual[h[0]] for h in everywhere]
     count = len(everywhere)
     return Known(
         tuple(everywhere), np.zeros(count), np.array(rms), np.zeros((0, count)), np.zeros(0),
-        tuple(c for c in diagnosis.causes if not _in_ring(c) and c.effect != "energy_spread"),
+        tuple(c for c in diagnosis.causes if _beside(c)),
     )  # fmt: skip
+
+
+def _beside(cause: Cause) -> bool:
+    """Whether it stands beside the ring as found: first turns have no energy spread."""
+    return not _in_ring(cause) and cause.effect != "energy_spread"
 
 
 def _in_ring(cause: Cause) -> bool:

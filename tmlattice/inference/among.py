@@ -304,6 +304,7 @@ def small_errors_of(
     causes: Sequence[Cause] = (),
     *,
     learn: bool = True,
+    about: Array | None = None,
 ) -> Learnt:
     """The background of a machine as these data show it, linear about its likeliest amounts.
 
@@ -313,6 +314,7 @@ def small_errors_of(
         nuisances: first guess.
         causes: what was found already: small errors are taken beside it.
         learn: the sizes are learnt; else they are as known.
+        about: amounts from which on it is linear at first, [error]; None: those that are known.
 
     Raises:
         UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
@@ -320,7 +322,7 @@ def small_errors_of(
     """
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     belongs = np.array([names.index(name) for name, _ in known.hypotheses])
-    amounts = known.amounts
+    amounts = stored = known.amounts if about is None else about
     evidence, errors, opened = 0.0, dict[str, float](), None
     for turn in range(ROUNDS):
         for _ in range(HALVES):
@@ -330,9 +332,10 @@ def small_errors_of(
             alone = settled(inner, causes, nuisances)
             if alone.projection is not None or not turn:
                 break
-            amounts = (amounts + known.amounts) / 2  # too far for what is linear
+            amounts = (amounts + stored) / 2  # too far for what is linear
         if alone.projection is None:
             raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
+        stored = amounts
         slopes = _signatures(inner, alone, known.hypotheses)
         on = [find(n).chain(a) for (n, _), a in zip(known.hypotheses, amounts, strict=True)]
         slopes *= np.array(on)[:, None]

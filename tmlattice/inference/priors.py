@@ -112,6 +112,9 @@ class Group:
         freedom: degree of freedom of Student's distribution; infinite: Gauss'.
         fixed: the scale stays.
         most: largest prior rms that physics allows one parameter.
+        usual: rms of one parameter more that learning has in mind: a scale that one or two
+            parameters alone would teach falls to nothing where the data leave them to the prior,
+            and would say that they are known to be zero; 0: none.
         each: prior rms of every parameter, as last found; None: `rms`.
     """
 
@@ -121,6 +124,7 @@ class Group:
     freedom: float = np.inf
     fixed: bool = False
     most: float = np.inf
+    usual: float = 0.0
     each: Array | None = None
 
     @property
@@ -139,7 +143,7 @@ class Group:
         rms = self.rms
         if not self.fixed:
             for _ in range(20):
-                mean = float(np.mean(self.share(squares, rms) * squares))
-                rms = max(float(np.sqrt(mean)), SMALLEST)
+                total = float(np.sum(self.share(squares, rms) * squares)) + self.usual**2
+                rms = max(float(np.sqrt(total / (len(squares) + (self.usual > 0)))), SMALLEST)
         each = rms / np.sqrt(self.share(squares, rms))
         return replace(self, rms=rms, each=np.minimum(each, self.most))

@@ -97,8 +97,10 @@ ENOUGH, MOST = 8, 8
 
 
 def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """What stands out of its kind in a dense fit: (kind, where, what); the clearest first."""
+    """What stands out of its kind in a dense fit and is no finding: (kind, where, what); the
+    clearest first."""
     found: list[tuple[float, tuple[str, str, str]]] = []
+    named = {(finding.effect, finding.element) for finding in diagnosis.findings}
     told = list(zip(diagnosis.causes, diagnosis.errors, strict=True))
     for effect in dict.fromkeys(cause.effect for cause, _ in told):
         own = [(c, sigma) for c, sigma in told if c.effect == effect and c.element is not None]
@@ -109,7 +111,7 @@ def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         scatter = 1.4826 * float(np.median(abs(off)))
         for (cause, sigma), distance in zip(own, abs(off), strict=True):
             times = float(distance / max(scatter, sigma, 1e-30))
-            if times > STANDS_OUT:
+            if times > STANDS_OUT and (effect, cause.element) not in named:
                 kind = diagnosis.ring[cause.element or ""].kind
                 what = f"{words(effect)} {amount_text(effect, cause.amount, sigma)}"
                 said = f"{what}, {times:.0f} times the scatter of its kind"

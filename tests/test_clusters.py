@@ -1,0 +1,93 @@
+"""Errors of a fit whose readings share what the model lacks, against machines that are known."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice.inference.clusters import Found, Rows, _mismatches, widened
+from tmlattice.inference.normal import normal_equations, solve
+from tmlattice.inference.priors import Group
+
+COLUMNS, MONITORS, ERRORS = 24, 20, 12
+NOISE = 1e-2
+
+
+def made_up(rng, lacking):
+    """Rows of a ring, and what it lacks, three times the noise: two waves in every column, with
+    which ring errors go too; or the like at every monitor; or nothing."""
+    plane = np.arange(COLUMNS) % 2
+    own = rng.standard_normal((COLUMNS, MONITORS))
+    drives, waves = rng.standard_normal((COLUMNS, 2)), rng.standard_normal((2, MONITORS))
+    by_ring = rng.standard_normal((ERRORS, COLUMNS, MONITORS))
+    gap = np.zeros(own.shape)
+    if lacking == "columns":
+        by_ring = rng.standard_normal((ERRORS, COLUMNS, 2)) @ waves
+        gap = rng.standard_normal((COLUMNS, 2)) @ waves
+    elif lacking == "monitors":
+        by_ring = drives @ rng.standard_normal((ERRORS, 2, MONITORS))
+        gap = drives @ rng.standard_normal((2, MONITORS))
+    noise = rng.standard_normal(own.shape)
+    return Rows(plane, own, own, by_ring), NOISE * (noise + 3 * gap / np.sqrt(2))
+
+
+def solved(rows, residual, weight):
+    """Posterior with numbers of rms 0.1."""
+    normal = normal_equations(residual, weight, *rows)
+    size = len(normal.vector)
+    found = solve(normal, [Group("all", np.eye(size), 0.1, fixed=True)], rounds=0)
+    return found, Found.of(normal.matrix, found.spread @ found.covariance @ found.spread.T)
+
+
+def readings(rows, values):
+    """What numbers make, [column, monitor]."""
+    shape = rows.by_monitor.shape
+    places = (axis.ravel() for axis in np.indices(shape))
+    return rows.times(*places, values[:, None]).reshape(shape)
+
+
+@pytest.mark.parametrize("lacking", ["nothing", "columns", "monitors"])
+def test_stated_errors_hold_where_readings_share_what_is_lacking(lacking):
+    """Posterior ones are 2.9 times too small there; of real rings up to seven times."""
+    rng = np.random.default_rng(4)
+    pulls, plain = [], []
+    for _ in range(30):
+        rows, noise = made_up(rng, lacking)
+        truth = 0.1 * rng.standard_normal(2 * MONITORS + COLUMNS + ERRORS)
+        weight = np.full(noise.shape, 1 / np.mean(noise**2))
+        residual = readings(rows, truth) + noise
+        found, there = solved(rows, residual, weight)
+        sigma = widened(rows, weight, residual - readings(rows, found.values), there)
+        assert (sigma >= found.sigma * (1 - 1e-9)).all()
+        pulls.append(((found.values - truth) / sigma)[-ERRORS:])
+        plain.append(((found.values - truth) / found.sigma)[-ERRORS:])
+    size, without = (np.sqrt(np.mean(np.square(own))) for own in (pulls, plain))
+    assert 0.8 < size < 1.3
+    assert without > 2 or lacking == "nothing"
+
+
+@pytest.mark.parametrize("by", [0, 1])
+def test_a_cluster_against_all_others_vs_a_fit_without_it(by, rng):
+    rows, noise = made_up(rng, "columns")
+    weight = rng.uniform(0.5, 1.5, noise.shape) / NOISE**2
+    weight[3, 5] = 0.0  # a missing reading
+    found, there = solved(rows, noise, weight)
+    left = noise - readings(rows, found.values)
+    shares, mismatch = _mismatches(rows, weight, left, there, by)
+    without = weight.copy()
+    without[(7, slice(None)) if by == 0 else (slice(None), 7)] = 0.0
+    other, apart = solved(rows, noise, without)
+    ring = slice(-ERRORS, None)
+    grown = (apart.variance - there.variance)[ring]
+    assert_allclose(shares[7, ring], grown / apart.variance[ring], rtol=1e-6)
+    moved = (found.values - other.values)[ring]
+    assert_allclose(mismatch[7, ring], moved**2 / grown, rtol=1e-6)
+
+
+def test_readings_far_above_their_noise_have_errors_all_the_same(rng):
+    """What one cluster alone knows is lost in rounding beside it."""
+    rows, noise = made_up(rng, "columns")
+    noise *= 1e-8
+    weight = np.full(noise.shape, 1 / np.mean(noise**2))
+    found, there = solved(rows, noise, weight)
+    sigma = widened(rows, weight, noise - readings(rows, found.values), there)
+    assert (sigma < 20 * found.sigma).all()

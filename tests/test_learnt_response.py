@@ -1,0 +1,95 @@
+"""What an orbit response leaves known of a machine's small errors; with AT as the machine."""
+
+import numpy as np
+import pytest
+from conftest import SMALL
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.challenge import make, read_case, read_truth
+from tmlattice.challenge.case import read_set
+from tmlattice.challenge.run import diagnose_case
+from tmlattice.cli.diagnose import _not_used
+from tmlattice.diagnosis.twin import known_document, known_of, read_known
+from tmlattice.effects import background_rms
+from tmlattice.errors import TmlatticeError
+from tmlattice.files import write_json
+from tmlattice.lattice import save_ring
+from tmlattice.machine import draw_background
+from tmlattice.machine.response import simulate_response
+
+USUAL = background_rms({"all": None})
+SEED = 12
+
+
+@pytest.fixture(scope="module")
+def monday(small_ring):
+    """The diagnosis of a response of a machine with everything a little wrong."""
+    measured = simulate_response(
+        small_ring, background=USUAL, machine_seed=SEED, seed=1, progress=False
+    ).measured
+    return diagnose(small_ring, measured)
+
+
+@pytest.fixture(scope="module")
+def known(monday):
+    return known_of(monday)
+
+
+def test_what_a_response_leaves_open_holds(small_ring, monday, known):
+    """Skew gradients that were fitted, and held for certain, made pulls of 5 along what is known
+    best: they stand for rolls of quadrupoles and for orbits in sextupoles."""
+    truth = {(c.effect, c.element): c.amount for c in draw_background(small_ring, USUAL, SEED)}
+    inside = {(c.effect, c.element): c.amount for c in monday.causes
+              if not c.effect.startswith(("monitor", "corrector"))}  # fmt: skip
+    there = np.array([inside.get(h, 0.0) for h in known.hypotheses])  # the ring as found has it
+    left = np.array([truth.get(h, 0.0) for h in known.hypotheses]) - there - known.amounts
+    assert 0.85 < np.sqrt(np.mean((left / known.errors) ** 2)) < 1.15  # some 800 errors
+    along = known.seen @ (left / known.rms) / np.sqrt(1 - known.share)
+    assert len(along) > 150
+    assert 0.8 < np.sqrt(np.mean(along**2)) < 1.25
+
+
+def test_first_turns_are_sharper_after_a_response(small_ring, monday, known):
+    fault = Cause("quadrupole_gradient", "QF::5", 0.02)
+    turns = simulate(
+        small_ring, [fault], background=USUAL, machine_seed=SEED, seed=2, shots=4
+    ).measurement()
+    alone = diagnose(small_ring, turns)
+    (found,) = diagnose(monday.as_found, turns, known=known).findings
+    assert (found.effect, found.element) == (fault.effect, fault.element)
+    assert abs(found.amount - fault.amount) < 4 * found.amount_sigma
+    assert all(found.amount_sigma < 0.7 * one.amount_sigma for one in alone.findings
+               if one.effect == fault.effect)  # fmt: skip
+    sound = simulate(small_ring, background=USUAL, machine_seed=SEED, seed=3, shots=4)
+    assert not diagnose(monday.as_found, sound.measurement(), known=known).findings
+
+
+def test_it_is_read_back(monday, known, tmp_path):
+    save_ring(monday.as_found, tmp_path / "twin.json")
+    beside = tmp_path / "twin.json.known.json"
+    write_json(beside, known_document(known, tmp_path / "twin.json"))
+    again = read_known(beside, monday.as_found)
+    assert again.hypotheses == known.hypotheses
+    assert again.errors == pytest.approx(known.errors, rel=1e-3)  # directions in single precision
+
+
+def test_a_response_says_that_it_does_not_start_from_what_is_known(tmp_path):
+    assert not _not_used(str(tmp_path / "twin.json"))
+    (tmp_path / "twin.json.known.json").write_text("{}")
+    (said,) = _not_used(str(tmp_path / "twin.json"))
+    assert "is not used" in said
+    assert "--reference" in said
+
+
+def test_a_challenge_whose_machine_was_learnt(tmp_path):
+    some = {"lattice": str(SMALL), "effects": ["quadrupole_gradient"], "amount": 0.02, "seed": 101}
+    make("B", 1, folder=tmp_path, learnt=True, progress=False, **some)
+    assert read_set(tmp_path)["learnt"] is True
+    case = read_case(tmp_path, "0000")
+    assert case.learnt.response.shape[0] == 17
+    (cause,) = read_truth(tmp_path, "0000").causes
+    (found,) = diagnose_case(case)["findings"]
+    assert (found["effect"], found["element"]) == (cause.effect, cause.element)
+    for wrong in ({"tier": "A"}, {"tier": "B", "reference": True}, {"tier": "B", "told": True}):
+        with pytest.raises(TmlatticeError, match="leave --learnt out"):
+            make(cases=1, folder=tmp_path / "other", learnt=True, progress=False, **wrong, **some)

@@ -1,0 +1,149 @@
+"""Errors of a fit whose readings share what the model lacks: by column, or by monitor.
+
+A posterior takes readings for independent. But what the model lacks of a corrector's column is
+often a wave that all of its readings have, and what it lacks at a monitor stays there in all
+columns: so many readings then tell as much as few. Each cluster of readings (those of one column,
+or of one monitor) is therefore taken out of the normal equations by itself, and its number held
+against what all others say (a jackknife, exact for linear least squares: Bell and McCaffrey, Survey
+Methodology 28 (2002) 169). By the model the mismatch of each is one standard deviation; by how much
+it is more, the errors are.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+ALONE = 0.75
+"""Share of what is known of a number from which a cluster is not held against the others: they know
+too little of it. The cluster is then taken for as far off as it is elsewhere."""
+
+MOST = 64
+"""Columns, and monitors, that are taken out, drawn at random where there are more: what is sought
+is how much they contradict one another in the mean."""
+
+LEAST = 1e-11
+"""What others know of a number beside a cluster, at least, as a share."""
+
+
+class Rows(NamedTuple):
+    """What readings do for each parameter, as `normal.normal_equations` has it.
+
+    Attributes:
+        plane: in which each column is read, [column].
+        by_monitor, by_column: of each reading's own number, [column, monitor].
+        by_ring: [error, column, monitor].
+    """
+
+    plane: Indices
+    by_monitor: Array
+    by_column: Array
+    by_ring: Array
+
+    def times(self, column: Indices, monitor: Indices, other: Array) -> Array:
+        """Those of some readings times [parameter, any], [reading, any]."""
+        columns, monitors = self.by_monitor.shape
+        ring = 2 * monitors + columns
+        out = self.by_ring[:, column, monitor].T @ other[ring:]
+        gain, own = self.by_monitor[column, monitor], self.by_column[column, monitor]
+        out += gain[:, None] * other[2 * monitor + self.plane[column]]
+        out += own[:, None] * other[2 * monitors + column]
+        return np.asarray(out)
+
+
+class Found(NamedTuple):
+    """A linear fit, and quantities that are linear in its parameters.
+
+    Attributes:
+        matrix: of the normal equations, without priors, [parameter, parameter].
+        covariance: of the parameters, [parameter, parameter].
+        along: covariance of parameters and quantities, [parameter, quantity].
+        variance: of the quantities, [quantity].
+    """
+
+    matrix: Array
+    covariance: Array
+    along: Array
+    variance: Array
+
+    @classmethod
+    def of(cls, matrix: Array, covariance: Array) -> "Found":
+        """Of the parameters themselves."""
+        return cls(matrix, covariance, covariance, np.diag(covariance))
+
+
+def widened(rows: Rows, weight: Array, residual: Array, found: Found) -> Array:
+    """Errors of a fit's quantities, widened where clusters of readings contradict one another.
+
+    Where readings are independent they are the posterior's: up to some per cent that chance adds.
+
+    Args:
+        rows: of all readings.
+        weight: 1 / variance, 0 where missing, [column, monitor].
+        residual: what the fit leaves, [column, monitor].
+        found: the fit.
+
+    Returns:
+        Standard deviations, [quantity].
+    """
+    # what the readings' noise makes of the variance; the rest is the prior's
+    told = (found.along * (found.matrix @ found.along)).sum(axis=0)
+    more = np.zeros_like(told)
+    for by in (0, 1):
+        shares, mismatch = _mismatches(rows, weight, residual, found, by)
+        size = np.maximum(shares.sum(axis=0), 1e-300)
+        more += np.maximum((shares * mismatch).sum(axis=0) / size - 1, 0)
+    return np.asarray(np.sqrt(np.maximum(found.variance + told * more, 0)))
+
+
+def _clusters(weight: Array, by: int) -> Iterator[tuple[Indices, Indices]]:
+    """Columns and monitors of the readings of one column (0), or of one monitor (1), each."""
+    read = np.flatnonzero(weight.any(axis=1 - by))
+    if len(read) > MOST:
+        read = np.sort(np.random.default_rng(0).permutation(read)[:MOST])
+    for own in read:
+        seen = np.flatnonzero(weight[own] if by == 0 else weight[:, own])
+        alike = np.full(len(seen), own)
+        yield (alike, seen) if by == 0 else (seen, alike)
+
+
+def _mismatches(
+    rows: Rows, weight: Array, residual: Array, found: Found, by: int
+) -> tuple[Array, Array]:
+    """Of each cluster its share of what is known of every quantity, and the square of what it says
+    beside all others over what is expected of that, [cluster, quantity]."""
+    known = found.variance > 0
+    shares, mismatch = [], []
+    for column, monitor in _clusters(weight, by):
+        root = np.sqrt(weight[column, monitor])[:, None]
+        Y = along = root * rows.times(column, monitor, found.covariance)
+        if found.along is not found.covariance:
+            Y = root * rows.times(column, monitor, found.along)
+        inside = root * rows.times(column, monitor, along.T)
+        left = root[:, 0] * residual[column, monitor]
+        solved = _apart((inside + inside.T) / 2, np.column_stack([Y, left]))
+        moved = Y.T @ solved[:, -1]
+        grown = np.maximum((Y * solved[:, :-1]).sum(axis=0), 1e-300)  # of the variance without it
+        whole = np.where(known, found.variance + grown, 1.0)
+        share = np.where(known, grown / whole, 0.0)
+        own = moved**2 / grown
+        judged = np.where(share < ALONE, share, 0.0)
+        elsewhere = float(judged @ own) / max(float(judged.sum()), 1e-300)
+        shares.append(share)
+        mismatch.append(np.where(share < ALONE, own, elsewhere))
+    return np.array(shares), np.array(mismatch)
+
+
+def _apart(inside: Array, right: Array) -> Array:
+    """(1 - inside)^-1 right; what a cluster knows alone is limited to what can be told from 1."""
+    matrix = (1 + LEAST) * np.eye(len(inside)) - inside
+    try:
+        return np.asarray(cho_solve(cho_factor(matrix), right))
+    except np.linalg.LinAlgError:  # lost in rounding: readings far above their noise
+        size, vectors = np.linalg.eigh(matrix)
+        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, LEAST)[:, None]))
