@@ -15,7 +15,7 @@ from scipy import stats
 
 from tmlattice import cache, load_ring
 from tmlattice.inference import chi2
-from tmlattice.lattice import stored
+from tmlattice.lattice import stored, write_ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import element_map, ring_maps
 
@@ -148,6 +148,14 @@ def test_a_kept_ring_is_the_ring_that_was_read(kept):
         assert made.monitors == found.monitors
         for a, b in zip(made.closing.coefficients, found.closing.coefficients, strict=True):
             assert np.array_equal(a, b)
+
+
+def test_a_kept_ring_is_written_as_the_ring_that_was_read(kept, tmp_path):
+    texts = []
+    for name in ("read.py", "kept.py"):
+        assert write_ring(load_ring(kept), tmp_path / name) == ()
+        texts.append((tmp_path / name).read_text())
+    assert texts[0] == texts[1]
 
 
 def test_a_change_of_a_kept_ring_gets_its_own_maps(kept):

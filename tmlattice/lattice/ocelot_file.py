@@ -142,7 +142,7 @@ def _name_places(places: list[Any], variables: dict[str, Any]) -> tuple[Element,
     for variable in sorted(variables, reverse=True):  # so that the lowest-sorting one stays
         by_object[id(variables[variable])] = variable
     families = [
-        by_object.get(id(source), source_kind(source))
+        by_object.get(id(source), source_kind(source, str(source.id)))
         if source.id is None or _GENERATED.fullmatch(str(source.id))
         else str(source.id)
         for source in places

@@ -41,8 +41,8 @@ def corrector_pair(family: str, length: float, x: float = 0.0, y: float = 0.0) -
     return [half, *pair, half]
 
 
-def source_kind(source: Any) -> Kind:
-    """What an OCELOT element is; a matrix element with "wig" in its id is a wiggler."""
+def source_kind(source: Any, name: str) -> Kind:
+    """What an OCELOT element of this name is; a matrix with "wig" in its name is a wiggler."""
     from tmlattice.lattice.ocelot import elements as e
 
     kinds: list[tuple[Any, Kind]] = [
@@ -66,7 +66,7 @@ def source_kind(source: Any) -> Kind:
     if type(source).__name__ == "CombinedMultipole":
         return _strongest(source)
     if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
-        return "wiggler" if "wig" in str(source.id).casefold() else "matrix"
+        return "wiggler" if "wig" in name.casefold() else "matrix"
     return "drift" if source.l else "marker"
 
 
@@ -116,7 +116,7 @@ def place_elements(
     for source in known.values():
         _check(source)
     if kinds is None:
-        by_source = {key: source_kind(source) for key, source in known.items()}
+        by_source = {key: source_kind(source, str(source.id)) for key, source in known.items()}
         kinds = [by_source[id(source)] for source in sources]
     placed = []
     start = 0.0

@@ -115,7 +115,7 @@ def _matrix(element: Element, errors: Errors) -> Element:
     entrance = _thin(errors.entrance_k1l, 0.0, errors.entrance)
     middle = _thin(errors.k1l, errors.k1sl, errors.middle)
     if type(element.source).__name__ == "Marker":
-        source = elements.Matrix(l=0.0, eid=element.source.id)
+        source = elements.Matrix(l=0.0, eid=element.family)
         source.r = middle @ entrance
         return replace(element, kind="matrix", source=source)
     source = copy.deepcopy(element.source)

@@ -60,7 +60,8 @@ def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
         told.append("the energy is that of an electron as fast as the ring's particles")
     if combined:
         told.append("magnets of several fields are tmlattice's own, which the file imports")
-    other = sum(element.kind != source_kind(element.source) for element in ring.elements)
+    # by the name that the file has: a source that comes from the cache has none
+    other = sum(e.kind != source_kind(e.source, e.family) for e in ring.elements)
     if other:
         told.append(f"OCELOT's classes do not tell the kind of {other} elements")
     return tuple(told)
