@@ -107,10 +107,18 @@ def ring(name, files, data, place, options):
         every.append(_diagnosed(lattice, folder, seed, None if every else options.pictures, name))
         print(_as_it_comes(name, seed, every[-1]), flush=True)
     row["seeds"] = [
-        one if "error" in one else one["steps"][-1] | {"amounts": one.pop("amounts")}
+        one
+        if "error" in one
+        else one["steps"][-1]
+        | {"amounts": one.pop("amounts"), "kept": _kept(one), "refused": one["refused"]}
         for one in every
     ]
     return row | every[0]
+
+
+def _kept(found):
+    """Families in the order in which they came in."""
+    return list(dict.fromkeys(step["effect"] for step in found["steps"] if step["effect"]))
 
 
 def _as_it_comes(name, seed, found):
@@ -120,7 +128,8 @@ def _as_it_comes(name, seed, found):
     last = found["steps"][-1]
     refused = ", ".join(step["effect"] for step in found["refused"])
     return (f"{name}, seed {seed}: {_figures(last)}, chi² {last['chi2']:.1f}, {found['verdict']}, "
-            f"{found['seconds']:.0f} s; refused: {refused or 'nothing'}")  # fmt: skip
+            f"{found['seconds']:.0f} s; kept: {', '.join(_kept(found))}; "
+            f"refused: {refused or 'nothing'}")  # fmt: skip
 
 
 def _figures(step):

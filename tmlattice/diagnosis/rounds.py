@@ -158,7 +158,9 @@ def linear(state: State, block: int) -> Linear:
             basis = np.zeros((end, own.basis.shape[1]))
             basis[where[family.variable]] = own.basis
             known = state.groups.get(own.name, own)
-            groups.append(replace(own, basis=basis, rms=known.rms, each=known.each))
+            groups.append(
+                replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms)
+            )
     for one in (one for one in state.apart if one.block == block and one.variable in where):
         basis = np.zeros((end, 1))
         basis[where[one.variable], 0] = one.members
@@ -413,8 +415,9 @@ def _good_monitors(state: State) -> Flags:
         gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
         count = np.maximum(seen.sum(axis=0), 1)
         rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
-        rms[(seen.sum(axis=0) == 0) | (gain < 0.2)] = np.inf  # reversed, until gains come in
-        typical = np.median(rms)
+        rms[gain < 0.2] = np.inf  # reversed, until gains come in
+        read_at_all = seen.any(axis=0)  # what was never read says nothing of the other plane
+        typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
         if np.isfinite(typical):  # else the fit is astray, not half of the monitors
-            ratio = np.maximum(ratio, rms / typical)
+            ratio = np.maximum(ratio, np.where(read_at_all, rms / typical, 0.0))
     return np.asarray(ratio <= BAD)

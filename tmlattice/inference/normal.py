@@ -142,9 +142,8 @@ def solve(
         found = prior * cho_solve(factor, prior * b)
         covariance = dpotri(factor[0], lower=1)[0]
         if turn < rounds:
-            squares = found**2 + np.diag(covariance) * prior**2
-            parts = np.split(squares, edges)
-            groups = tuple(g.learn(own) for g, own in zip(groups, parts, strict=True))
+            parts = np.split(found**2, edges), np.split(np.diag(covariance), edges)
+            groups = tuple(g.learn(own, left) for g, own, left in zip(groups, *parts, strict=True))
     covariance = np.tril(covariance) + np.tril(covariance, -1).T
     spread = basis * prior
     sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))

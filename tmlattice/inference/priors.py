@@ -99,6 +99,10 @@ EVEN = AmountPrior()
 
 SMALLEST = 1e-9
 """A prior's rms does not fall below."""
+GUESSED = 2.0
+"""rms of the logarithm of a scale about its first guess: a factor of seven."""
+BOLD = 1.5
+"""Largest step of that logarithm."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,7 @@ class Group:
             parameters alone would teach falls to nothing where the data leave them to the prior,
             and would say that they are known to be zero; 0: none.
         each: prior rms of every parameter, as last found; None: `rms`.
+        first: rms that was guessed; None: `rms`.
     """
 
     name: str
@@ -126,6 +131,12 @@ class Group:
     most: float = np.inf
     usual: float = 0.0
     each: Array | None = None
+    first: float | None = None
+
+    @property
+    def guess(self) -> float:
+        """The rms that was guessed."""
+        return self.rms if self.first is None else self.first
 
     @property
     def scale(self) -> Array:
@@ -136,14 +147,25 @@ class Group:
         """By which a parameter of this expected square counts: 1 for Gauss, less in the tails."""
         return rms**2 * Student(rms, self.freedom).precision(np.sqrt(squares))
 
-    def learn(self, squares: Array) -> "Group":
-        """One step of EM from the expected squares of the parameters."""
+    def learn(self, squares: Array, left: Array) -> "Group":
+        """A scale that is likelier: a step of Fisher's scoring in its logarithm.
+
+        EM's own step is as short as what the data say of a parameter is little: a scale that began
+        too small stays there for a hundred rounds, and everything beside it makes up for it. Where
+        the data say nothing the scale stays near its first guess.
+
+        Args:
+            squares: of the likeliest parameters.
+            left: share of each one's prior variance that the data leave.
+        """
         if not len(squares):
             return replace(self, each=squares)
-        rms = self.rms
+        now, rms = self.scale, self.rms
         if not self.fixed:
-            for _ in range(20):
-                total = float(np.sum(self.share(squares, rms) * squares)) + self.usual**2
-                rms = max(float(np.sqrt(total / (len(squares) + (self.usual > 0)))), SMALLEST)
-        each = rms / np.sqrt(self.share(squares, rms))
-        return replace(self, rms=rms, each=np.minimum(each, self.most))
+            known = float(np.sum(1 - left)) + (self.usual > 0)
+            shown = float(np.sum(squares / now**2)) + (self.usual / rms) ** 2
+            own = float(np.log(rms / self.guess)) / GUESSED**2
+            step = (shown - known - own) / (2 * known + GUESSED**-2)
+            rms = max(rms * float(np.exp(np.clip(step, -BOLD, BOLD))), SMALLEST)
+        each = rms / np.sqrt(self.share(squares + left * now**2, rms))
+        return replace(self, rms=rms, each=np.minimum(each, self.most), first=self.guess)
