@@ -154,7 +154,7 @@ class CorrectorCalibration(_Columns):
         kinds = families([*data.measured.correctors, "\0"])[1]
         return [
             Group(self.name, np.eye(self.size(data)), 0.02, TAILS),
-            Group(f"{self.name} of families", kinds, 0.05, usual=0.05),
+            Group(f"{self.name} of families", kinds, 0.05),
         ]
 
     def rows(self, at: Predicted, values: Array) -> Array:

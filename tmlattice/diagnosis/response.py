@@ -214,10 +214,18 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
         )
     else:
         said += _understated(data)
-    if measured.rf is None or measured.rf.orbit is None:
+    rf = data.measured.rf
+    if rf is None or rf.orbit is None:
+        copied = measured.rf is not None and measured.rf.orbit is not None
+        why = (
+            "the RF step's orbit repeats to the last digit, is a model's and no measurement, and "
+            "is left out"
+            if copied
+            else "there is no RF step"
+        )
         said.append(
-            "there is no RF step: dispersion is not known, and only what is usual tells the scale "
-            "of all correctors from that of all monitors"
+            f"{why}: dispersion is not known, and only what is usual tells the scale of all "
+            "correctors from that of all monitors"
         )
     for plane in (p for p in "xy" if p not in measured.planes):
         said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")

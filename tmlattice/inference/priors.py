@@ -116,9 +116,6 @@ class Group:
         freedom: degree of freedom of Student's distribution; infinite: Gauss'.
         fixed: the scale stays.
         most: largest prior rms that physics allows one parameter.
-        usual: rms of one parameter more that learning has in mind: a scale that one or two
-            parameters alone would teach falls to nothing where the data leave them to the prior,
-            and would say that they are known to be zero; 0: none.
         each: prior rms of every parameter, as last found; None: `rms`.
         first: rms that was guessed; None: `rms`.
     """
@@ -129,7 +126,6 @@ class Group:
     freedom: float = np.inf
     fixed: bool = False
     most: float = np.inf
-    usual: float = 0.0
     each: Array | None = None
     first: float | None = None
 
@@ -162,10 +158,11 @@ class Group:
             return replace(self, each=squares)
         now, rms = self.scale, self.rms
         if not self.fixed:
-            known = float(np.sum(1 - left)) + (self.usual > 0)
-            shown = float(np.sum(squares / now**2)) + (self.usual / rms) ** 2
+            known = float(np.sum(1 - left))
+            shown = float(np.sum(squares / now**2))
             own = float(np.log(rms / self.guess)) / GUESSED**2
             step = (shown - known - own) / (2 * known + GUESSED**-2)
-            rms = max(rms * float(np.exp(np.clip(step, -BOLD, BOLD))), SMALLEST)
+            rms = rms * float(np.exp(np.clip(step, -BOLD, BOLD)))
+            rms = min(max(rms, SMALLEST), self.most)
         each = rms / np.sqrt(self.share(squares + left * now**2, rms))
         return replace(self, rms=rms, each=np.minimum(each, self.most), first=self.guess)

@@ -23,6 +23,7 @@ from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_noise import learnt_noise
+from tmlattice.observe.response_rf import computed
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -86,8 +87,9 @@ class ResponseData:
 def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
     """What was measured, as the ring has it.
 
-    Without an RF step its column is empty, and only priors tell the correctors' scale from the
-    monitors'. Noise that nobody states is learnt, see `response_noise`.
+    Without an RF step, or with an orbit of it that no monitor read (`response_rf`), its column is
+    empty, and only priors tell the correctors' scale from the monitors'. Noise that nobody states
+    is learnt, see `response_noise`.
 
     Raises:
         MeasurementError: no noise, and too few readings to learn it.
@@ -97,6 +99,11 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
     known = {ring[name].name: name for name in measured.monitors}
     measured = measured.select(monitors=[known[name] for name in names if name in known])
     rf = measured.rf
+    if rf is not None and rf.orbit is not None:
+        in_x = [p == "x" for p in measured.planes]
+        if computed(rf.orbit[:, 0], measured.response[in_x, :, 0]):
+            rf = replace(rf, orbit=None)
+            measured = replace(measured, rf=rf)
     if rf is None or rf.orbit is None or rf.step == 0:
         step, orbit = NO_RF, np.full((len(measured.monitors), 2), np.nan)
     else:

@@ -1,0 +1,40 @@
+"""Whether an RF's orbit was read by monitors, or is what a model has for it.
+
+A file of a response without a measured dispersion may carry the design's in its place: in a ring of
+equal cells it repeats from cell to cell, to the last digit, where readings have noise.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SAME = 1e-9
+"""Of the largest reading: what is nearer to another is the same number, computed twice."""
+FEW, ENOUGH = 0.5, 0.75
+"""Share of numbers that differ, at most, of what was computed; and at least of the correctors'
+orbits, which are read with the same digits."""
+LEAST = 6
+"""Monitors that it takes to say so."""
+
+
+def computed(orbit: Array, response: Array) -> bool:
+    """Whether the numbers of an RF's orbit repeat as no readings do.
+
+    Args:
+        orbit: in x, m, [monitor], NaN where nothing was read.
+        response: of the correctors that kick in x, m, [column, monitor].
+    """
+    columns = [_differ(own) for own in response]
+    if np.isfinite(orbit).sum() < LEAST or not columns:
+        return False
+    return _differ(orbit) <= FEW and bool(np.median(columns) >= ENOUGH)
+
+
+def _differ(read: Array) -> float:
+    """Share of numbers that differ from all others."""
+    there = np.sort(read[np.isfinite(read)])
+    if not len(there):
+        return 0.0
+    apart = np.diff(there) > SAME * np.abs(there).max()
+    return float(1 + apart.sum()) / len(there)
