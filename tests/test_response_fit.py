@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tmlattice.diagnosis import dense, rounds
+from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.rounds import _good_monitors, linear, one_round
 from tmlattice.diagnosis.state import allow, begin
@@ -138,6 +139,58 @@ def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
         Group("calibration", np.eye(2)[:, 1:], 0.05),
     ]
     assert 0.015 < solve(there, groups, rounds=60).sigma[1] < 0.03
+
+
+def test_a_scale_that_fell_is_found_again(rng):
+    """Each of 40 numbers is known no better than they are large: from a hundredth of that, whither
+    the scale had fallen while another family was missing, EM stood still."""
+    truth = 0.01 * rng.standard_normal(40)
+    there = Normal(1e4 * np.eye(40), 1e4 * truth + 1e2 * rng.standard_normal(40))
+    found = [
+        solve(there, [Group("ring", np.eye(40), rms, first=0.01)], rounds=12).groups[0].rms
+        for rms in (1e-4, 0.01, 0.3)
+    ]
+    assert_allclose(found, 0.01, rtol=0.4)
+    assert_allclose(found, found[1], rtol=0.15)
+
+
+def test_what_is_not_read_in_one_plane_is_not_bad_in_the_other(rng):
+    """Siam: five monitors without y were left out altogether, with their good readings of x."""
+    model, plane = rng.standard_normal((12, 9)), np.arange(12) % 2
+    orbits = model + 1e-3 * rng.standard_normal((12, 9))
+    orbits[plane == 1, 4] = np.nan
+    data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
+    state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
+    assert _good_monitors(state).all()
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_gains_come_in_with_any_seed(small_ring, seed):
+    """Gains of 10 % and gradients of 1 % in readings that tell little of each: nothing was kept
+    with most seeds, for the gains' size had fallen to nothing before the gradients came in."""
+    rng = np.random.default_rng(5)
+    causes = [
+        Cause("quadrupole_gradient", own.name, 0.01 * float(rng.standard_normal()))
+        for own in small_ring.elements
+        if own.kind == "quadrupole"
+    ]
+    causes += [
+        Cause(f"monitor_gain_{plane}", own.name, 0.1 * float(rng.standard_normal()))
+        for own in small_ring.monitors
+        for plane in "xy"
+    ]
+    measured = simulate_response(
+        small_ring, causes, kick=1e-5, noise=4e-6, rf_step=-3000.0, engine="ocelot",
+        progress=False, seed=3,
+    ).measured  # fmt: skip
+    data = response_data(small_ring, measured)
+    fit = dense.fit_steps(data, split_columns(data, 0.2, np.random.default_rng(seed)), STEPS[:3])
+    assert {step.effect.split(",")[0] for step in fit.steps[1:]} == {
+        "monitor_gain_x", "quadrupole_gradient"
+    }  # fmt: skip
+    first, last = fit.steps[0], fit.steps[-1]
+    assert last.dispersion_rms < 0.7 * first.dispersion_rms
+    assert last.heldout_chi2_per_dof < first.heldout_chi2_per_dof
 
 
 def test_a_round_follows_a_bent_valley(small_ring, monkeypatch):

@@ -68,6 +68,22 @@ def test_noise_that_is_stated_too_low_is_told(small_ring, clean):
     assert not assumed_of(clean, response_data(small_ring, clean))
 
 
+def test_an_rf_orbit_that_no_monitor_read_is_left_out(small_ring, clean):
+    """Siam: the file has the design's dispersion, cell by cell the same to twelve digits."""
+    orbit = clean.rf.orbit.copy()
+    orbit[:, 0] = 1e-4 * np.array([1.0, np.pi, np.sqrt(2)])[np.arange(len(orbit)) % 3]
+    copied = replace(clean, rf=replace(clean.rf, orbit=orbit))
+    data = response_data(small_ring, copied)
+    assert np.isnan(data.orbits[-1]).all()
+    (said,) = assumed_of(copied, data)
+    assert "no measurement" in said
+    assert np.isfinite(response_data(small_ring, clean).orbits[-1]).all()
+    coarse = replace(  # so are all readings, written down with few digits
+        copied, response=np.round(clean.response, 5), rf=replace(clean.rf, orbit=np.round(orbit, 5))
+    )
+    assert np.isfinite(response_data(small_ring, coarse).orbits[-1]).all()
+
+
 def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
     """Pohang: two columns seemed displaced by 1.2 and 1.3 m; 1.68 m lie between them."""
     state = fitted(small_ring, clean)

@@ -158,9 +158,7 @@ def linear(state: State, block: int) -> Linear:
             basis = np.zeros((end, own.basis.shape[1]))
             basis[where[family.variable]] = own.basis
             known = state.groups.get(own.name, own)
-            groups.append(
-                replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms)
-            )
+            groups.append(replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms))
     for one in (one for one in state.apart if one.block == block and one.variable in where):
         basis = np.zeros((end, 1))
         basis[where[one.variable], 0] = one.members
