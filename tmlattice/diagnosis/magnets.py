@@ -47,19 +47,34 @@ def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[t
 
 def straights(ring: Ring) -> list[Element]:
     """Of every long way without a magnet the marker that is nearest to its middle, or the longest
-    drift where no marker stands."""
-    found, within, begin = list[Element](), list[Element](), 0.0
+    drift where no marker stands.
+
+    A way beside a wiggler that the lattice has as bends to and fro has none: the wiggler's own
+    focusing is a number already, and two beside it would pull against it.
+    """
+    found, ways = list[Element](), list[Element]()
+    within, bends, begin = list[Element](), list[float](), 0.0
     for element in ring.elements:
         if not element.is_magnet or element.kind in ("hcorrector", "vcorrector"):
             within.append(element)
             continue
         end = element.s - element.length / 2
         if end - begin > STRAIGHT:
-            found += _middle(within, (begin + end) / 2)
+            ways += _middle(within, (begin + end) / 2)
         within, begin = [], element.s + element.length / 2
+        if element.kind == "bend":
+            bends.append(element.angle)
+            continue
+        found += _outside(ways, bends)
+        ways, bends = [], []
     if ring.length - begin > STRAIGHT:
-        found += _middle(within, (begin + ring.length) / 2)
-    return found
+        ways += _middle(within, (begin + ring.length) / 2)
+    return found + _outside(ways, bends)
+
+
+def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
+    """Ways among these bends, which no other magnet parts, but of a wiggler's."""
+    return [] if bends and min(bends) < 0 < max(bends) else list(ways)
 
 
 def _middle(within: Sequence[Element], middle: float) -> list[Element]:
