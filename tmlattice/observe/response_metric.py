@@ -49,7 +49,7 @@ class ResponseMetric(SteadyMetric):
         whole = self.rows([hypotheses[int(i)] for i in rest])
         here = _Here(self.point.view, self.problem.used, self.problem.sigma)
         some = here.read_all([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
-        places = np.array([self.point.view.monitor(hypotheses[i][1]) for i in of_monitors])
+        places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
         used, row = self.problem.used, self._numbered()
         measured = np.flatnonzero(used.any(axis=(0, 2)))
         count = max(ROOM // max(len(hypotheses) * used[:, 0].size, 1), 1)
