@@ -1,6 +1,7 @@
 """What an orbit response leaves known of a machine's small errors; with AT as the machine."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from tmlattice.challenge.run import diagnose_case
 from tmlattice.cli.diagnose import _not_used
 from tmlattice.diagnosis.twin import known_document, known_of, read_known
 from tmlattice.effects import background_rms
-from tmlattice.errors import TmlatticeError, UnstableRingError
+from tmlattice.errors import MeasurementError, TmlatticeError, UnstableRingError
 from tmlattice.files import write_json
 from tmlattice.lattice import save_ring
 from tmlattice.machine import draw_background
@@ -74,6 +75,11 @@ def test_it_is_read_back(monday, known, tmp_path):
     again = read_known(beside, monday.as_found)
     assert again.hypotheses == known.hypotheses
     assert again.errors == pytest.approx(known.errors, rel=1e-3)  # directions in single precision
+    assert again.seen @ again.seen.T == pytest.approx(np.eye(len(again.seen)), abs=1e-12)
+    halved = replace(known, seen=known.seen / 2)
+    write_json(beside, known_document(halved, tmp_path / "twin.json"))
+    with pytest.raises(MeasurementError, match="its directions are damaged"):
+        read_known(beside, monday.as_found)
 
 
 def test_a_response_says_that_it_does_not_start_from_what_is_known(tmp_path):
