@@ -1,17 +1,21 @@
 """What an orbit response leaves known of a machine's small errors; with AT as the machine."""
 
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import SMALL
 
-from tmlattice import Cause, diagnose, simulate
+from tmlattice import Cause, diagnose, load_ring, simulate
 from tmlattice.challenge import make, read_case, read_truth
 from tmlattice.challenge.case import read_set
+from tmlattice.challenge.make import evenly
 from tmlattice.challenge.run import diagnose_case
 from tmlattice.cli.diagnose import _not_used
 from tmlattice.diagnosis.twin import known_document, known_of, read_known
 from tmlattice.effects import background_rms
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import MeasurementError, TmlatticeError, UnstableRingError
 from tmlattice.files import write_json
 from tmlattice.lattice import save_ring
 from tmlattice.machine import draw_background
@@ -71,6 +75,11 @@ def test_it_is_read_back(monday, known, tmp_path):
     again = read_known(beside, monday.as_found)
     assert again.hypotheses == known.hypotheses
     assert again.errors == pytest.approx(known.errors, rel=1e-3)  # directions in single precision
+    assert again.seen @ again.seen.T == pytest.approx(np.eye(len(again.seen)), abs=1e-12)
+    halved = replace(known, seen=known.seen / 2)
+    write_json(beside, known_document(halved, tmp_path / "twin.json"))
+    with pytest.raises(MeasurementError, match="its directions are damaged"):
+        read_known(beside, monday.as_found)
 
 
 def test_a_response_says_that_it_does_not_start_from_what_is_known(tmp_path):
@@ -93,3 +102,31 @@ def test_a_challenge_whose_machine_was_learnt(tmp_path):
     for wrong in ({"tier": "A"}, {"tier": "B", "reference": True}, {"tier": "B", "told": True}):
         with pytest.raises(TmlatticeError, match="leave --learnt out"):
             make(cases=1, folder=tmp_path / "other", learnt=True, progress=False, **wrong, **some)
+
+
+def test_a_learnt_response_may_step_some_correctors(small_ring, tmp_path, monkeypatch):
+    some = {"lattice": str(SMALL), "effects": ["quadrupole_gradient"], "amount": 0.02, "seed": 101}
+    make("B", 1, folder=tmp_path, learnt=True, correctors=6, progress=False, **some)
+    assert read_set(tmp_path)["correctors"] == 6
+    response = read_case(tmp_path, "0000").learnt
+    assert response.correctors == tuple(evenly(small_ring, 6))
+    # one plane has one corrector
+    assert sorted(response.planes) == ["x", "y", "y", "y", "y", "y"]
+    with pytest.raises(TmlatticeError, match="17 correctors, no 18"):
+        evenly(small_ring, 18)
+    assert len(set(evenly(small_ring, 17))) == 17
+    with pytest.raises(TmlatticeError, match="say --learnt too"):
+        make("B", 1, folder=tmp_path / "other", correctors=6, progress=False, **some)
+
+    def lost(*_, **__):
+        raise UnstableRingError("no closed orbit")
+
+    monkeypatch.setattr(sys.modules["tmlattice.challenge.make"], "measure", lost)
+    make("B", 1, folder=tmp_path / "lost", learnt=True, progress=False, **some)
+    assert read_case(tmp_path / "lost", "0000").learnt is None
+
+
+def test_planes_have_as_many_correctors_each():
+    ring = load_ring("petra3")
+    kinds = [ring[name].kind for name in evenly(ring, 20)]
+    assert kinds.count("hcorrector") == kinds.count("vcorrector") == 10

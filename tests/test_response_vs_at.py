@@ -14,6 +14,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.effects import CATALOGUE, RingEffect, apply
 from tmlattice.errors import EffectError, MeasurementError, UnknownNameError
+from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.observe.predict import predict
 
@@ -209,3 +210,16 @@ def test_the_rf_s_finite_step_in_maps_already_made(small_ring):
         ResponseModel(small_ring, frequency=1.5 * step).readings - whole[1].readings, atol=1e-15,
     )  # fmt: skip
     assert np.abs(model.rf_change(step) - model.rf_response() * step).max() > 1e-8
+
+
+def test_unset_orbit_is_found_once(small_ring, monkeypatch):
+    """Every step of a response found it again: half of the time."""
+    calls = []
+    found = at_orbit.stored
+    monkeypatch.setattr(at_orbit, "stored", lambda turn: calls.append(turn) or found(turn))
+    engine = AtEngine(small_ring, [Cause("quadrupole_offset_x", "QF::5", 1e-4)])
+    one, two = (engine.closed_orbits([{"v6": {"kick": kick}}]) for kick in (1e-5, 2e-5))
+    assert len(calls) == 1
+    fresh = AtEngine(small_ring, [Cause("quadrupole_offset_x", "QF::5", 1e-4)])
+    assert_allclose(fresh.closed_orbits([{"v6": {"kick": 2e-5}}]), two, atol=0)
+    assert np.abs(one - two).max() > 1e-6

@@ -38,7 +38,7 @@ from tmlattice.effects import (
     monitors_with,
     names,
 )
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
 from tmlattice.lattice.load import contents
@@ -72,6 +72,7 @@ def make(
     lattice: str = "petra3",
     reference: bool = False,
     learnt: bool = False,
+    correctors: int | None = None,
     shots: int = 4,
     effects: Sequence[str] | None = None,
     amount: float | None = None,
@@ -94,7 +95,8 @@ def make(
         lattice: what `load_ring` takes.
         reference: tier B, with a measurement from before the fault.
         learnt: tier B, with an orbit response from before the fault, from whose diagnosis that of
-            the case starts.
+            the case starts. A machine that stores no beam has none, and is diagnosed without.
+        correctors: that response steps so many, evenly along the ring; None: all of them.
         shots: of first turns and kicks of a stored beam; of the fit, two more are held out.
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a signal to noise that is drawn.
@@ -115,6 +117,8 @@ def make(
         raise TmlatticeError(f"no tier '{tier}'; there are {', '.join(TIERS)}")
     kinds = _kinds(tier, kinds)
     _check(tier, kinds, reference, learnt, told, bool(background))
+    if correctors is not None and not learnt:
+        raise TmlatticeError("correctors are those of a learnt response; say --learnt too")
     everywhere = background or ({"all": None} if tier in ("B", "P") else {})
     rms = background_rms(everywhere) if everywhere else {}
     chosen = names(effects)
@@ -136,6 +140,8 @@ def make(
         public["told"] = told
     if learnt:
         public[LEARNT] = True
+    if correctors is not None:
+        public["correctors"] = correctors
     if kinds:
         public["kinds"] = list(kinds)
     _begin(folder, public, seed)
@@ -158,7 +164,7 @@ def make(
             )  # fmt: skip
             case, truth = drawn.make(name)
             if learnt:
-                case = replace(case, parts={**case.parts, LEARNT: _response_before(drawn)})
+                case = _learnt_before(case, drawn, correctors)
             lost = drawn.draw
         write_case(folder, case, truth)
         unreachable.update(effect for effect, _, _ in lost.unreachable)
@@ -186,10 +192,39 @@ def _check(
         raise TmlatticeError("an orbit response says those sizes by itself; leave --told out")
 
 
-def _response_before(drawn: "CaseDraw") -> AnyMeasurement:
-    """The orbit response of a case's machine without the fault, in usual noise."""
-    own = {"background": drawn.background, "machine_seed": drawn.seed, "seed": drawn.seed + 2}
-    return measure("orbit_response", drawn.ring, (), 1.0, drawn.fit_shots, **own)
+def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Case:
+    """With the orbit response of its machine without the fault, in usual noise; as it is where that
+    machine stores no beam."""
+    own: dict[str, Any] = {"machine_seed": drawn.seed, "seed": drawn.seed + 2}
+    if correctors is not None:
+        own["correctors"] = evenly(drawn.ring, correctors)
+    try:
+        response = measure(
+            "orbit_response", drawn.ring, (), 1.0, drawn.fit_shots, background=drawn.background,
+            **own,
+        )  # fmt: skip
+    except UnstableRingError:
+        return case
+    return replace(case, parts={**case.parts, LEARNT: response})
+
+
+def evenly(ring: Ring, count: int) -> list[str]:
+    """So many correctors of a ring, evenly along it in each plane, half of each where there are.
+
+    Raises:
+        TmlatticeError: the ring has fewer.
+    """
+    planes = [[e.name for e in ring.elements if e.kind == kind]
+              for kind in ("hcorrector", "vcorrector")]  # fmt: skip
+    first, second = (len(own) for own in planes)
+    if count > first + second:
+        raise TmlatticeError(f"'{ring.name}' has {first + second} correctors, no {count}")
+    share = min(max(count - count // 2, count - second), first)
+    chosen = {
+        own[i * len(own) // some]
+        for own, some in zip(planes, (share, count - share), strict=True) for i in range(some)
+    }  # fmt: skip
+    return [e.name for e in ring.elements if e.name in chosen]
 
 
 def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:

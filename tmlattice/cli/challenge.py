@@ -70,6 +70,11 @@ def _cluster_options(function: Any) -> Any:
     help="Tier B: the diagnosis starts from an orbit response of the machine before the fault.",
 )
 @click.option(
+    "--correctors",
+    type=click.IntRange(5),
+    help="With --learnt: the response steps so many, evenly along the ring; else all.",
+)
+@click.option(
     "--kind",
     "kinds",
     multiple=True,

@@ -42,7 +42,7 @@ from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled, rare
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
-from tmlattice.inference.among import MOST, Among, Known, Learnt, small_errors_of
+from tmlattice.inference.among import MOST, Known, Learnt, small_errors_of
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome, fit
 from tmlattice.inference.problem import Hypothesis
@@ -344,9 +344,6 @@ def _told(
     warnings = [*told, *spikes(parts, problem, found), *said, *too_large(stages)]
     repaired = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
-    learnt = None
-    if isinstance(found.problem, Among):
-        learnt = found.problem.learnt(found.fit if causes else found.before)
     return Diagnosis(
         verdict=verdict,
         findings=tuple(
@@ -372,7 +369,7 @@ def _told(
         errors=tuple(errors.tolist()),
         priors={} if small is None else dict(small.sizes),
         prior_errors={} if small is None else dict(small.errors),
-        view=JointView(found, views, learnt),
+        view=JointView(found, views),
     )
 
 

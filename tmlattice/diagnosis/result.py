@@ -16,7 +16,6 @@ from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.among import Known
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
@@ -221,12 +220,10 @@ class JointView:
     Attributes:
         explanation: the search.
         parts: the measurements.
-        known: of the small errors, beyond what was found; None: there are none.
     """
 
     explanation: Explanation
     parts: tuple[PartView, ...]
-    known: Known | None = None
 
 
 @dataclass(frozen=True, repr=False)

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.result import Diagnosis, JointView, ResponseView
 from tmlattice.effects import Cause, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.inference.among import Known, small_errors_of
+from tmlattice.inference.among import Among, Known
 from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.posterior import posterior
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
@@ -30,11 +31,12 @@ Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
-READINGS_TIMES_ERRORS = 5 * 10**7
-"""Up to which the covariance of all small errors is taken from a response: two minutes, 4 GB."""
 HARDLY = 0.3
 """Relative error of a family's size from which on the usual one is not made smaller: a response
 sees kicks by the orbit in the sextupoles alone, of which it is not linear."""
+
+ROUNDED = 1e-4
+"""Of the products of directions: single precision rounds them by 1e-6."""
 
 FORMAT = "tmlattice-known"
 BESIDE = ".known.json"
@@ -50,26 +52,25 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
     """What a diagnosis knows beside the ring as found; None: nothing of small errors.
 
     The small errors with their covariance. Of an orbit response they are linear about its dense
-    fit; where there are too many readings for that, each error of the fit has its own standard
-    deviation, its correlations left out: what neighbours know together is known less well than it
-    is.
+    fit; where that leaves no stored beam, each error of the fit has its own standard deviation,
+    its correlations left out: what neighbours know together is known less well than it is.
     """
     view = diagnosis.view
     if isinstance(view, JointView):
-        beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
-        if view.known is None:
+        found, causes = view.explanation, diagnosis.causes
+        if not isinstance(found.problem, Among):
             return None
-        causes = (*view.known.causes, *beside)
-        return Known(**{**vars(view.known), "causes": causes})
+        known = found.problem.learnt(found.fit if causes else found.before)
+        beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
+        return replace(known, causes=(*known.causes, *beside))
     if not isinstance(view, ResponseView) or not diagnosis.steps:
         return None
     usual = background_rms({"all": None})
     everywhere = [(name, place) for name in usual for place in find(name).places(diagnosis.ring)]
-    if view.data.size * len(everywhere) <= READINGS_TIMES_ERRORS:
-        try:
-            return _together(diagnosis, view, usual, everywhere)
-        except UnstableRingError:  # too far from its likeliest small errors for what is linear
-            log.info("no covariance of the small errors", exc_info=True)
+    try:
+        return _together(diagnosis, view, usual, everywhere)
+    except UnstableRingError:  # too far from its likeliest small errors for what is linear
+        log.info("no covariance of the small errors", exc_info=True)
     return _each_alone(diagnosis, usual, everywhere)
 
 
@@ -102,14 +103,12 @@ def _together(
         fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),
     )
     start = np.array([fitted.get(h, 0.0) for h in everywhere])
-    first = small_errors_of(problem, Known.usual(everywhere, usual), problem.first, about=start)
+    first = posterior(problem, Known.usual(everywhere, usual), about=start)
     sizes = {
         name: size if first.errors[name] < HARDLY else max(size, usual[name])
         for name, size in first.sizes.items()
     }
-    known = Known.usual(everywhere, sizes)
-    learnt = small_errors_of(problem, known, problem.first, learn=False, about=start)
-    known = learnt.problem.learnt(learnt.before)
+    known = posterior(problem, Known.usual(everywhere, sizes), learn=False, about=start).known
     inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the ring as found has them
     return replace(
         known,
@@ -218,7 +217,7 @@ def _directions(path: Path, seen: Mapping[str, Any], errors: int) -> Array:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew") from None
     if len(seen["share"]) != count or not np.isfinite(rows).all() or count > errors:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew")
-    if not count:
-        return rows
-    left, _, right = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(left @ right)
+    gram = rows @ rows.T
+    if np.abs(gram - np.eye(count)).max(initial=0.0) > ROUNDED:
+        raise MeasurementError(f"{path}: its directions are damaged; write it anew")
+    return np.asarray(1.5 * rows - 0.5 * gram @ rows)  # Newton's step: what is left is the square

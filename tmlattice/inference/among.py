@@ -86,6 +86,22 @@ class Known:
         return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
                           .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
 
+    def since(self, amounts: Array, share: Array, seen: Array) -> "Known":
+        """With more readings.
+
+        Args:
+            amounts: the likeliest now, [error].
+            share: of the variance that was left, what is known now, [direction].
+            seen: of which directions, in the coordinates of `mixed`, [direction, error].
+        """
+        if len(self.share):  # back to coordinates of the first rms
+            left = np.eye(len(amounts)) - (seen.T * share) @ seen
+            whole = self.mixed(self.mixed(left).T)
+            share, directions = np.linalg.eigh(np.eye(len(amounts)) - whole)
+            seen = directions.T
+        big = share > LEAST
+        return replace(self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], BEST))
+
     @property
     def errors(self) -> Array:
         """Standard deviation of each, [error]."""
@@ -249,17 +265,9 @@ class Among(Blurred):
     def learnt(self, explained: Fit) -> Known:
         """What is known of the small errors since, beside an explanation."""
         seen = explained.projection.out(self.white(self.rows))
-        values, vectors = np.linalg.eigh(seen @ seen.T)
-        big = values > LEAST
-        # back from the coordinates of what was known to those of the first rms
-        left = np.eye(len(values)) - (vectors[:, big] * values[big]) @ vectors[:, big].T
-        whole = self.known.mixed(self.known.mixed(left).T)
-        share, directions = np.linalg.eigh(np.eye(len(values)) - whole)
+        share, directions = np.linalg.eigh(seen @ seen.T)
         big = share > LEAST
-        return replace(
-            self.known, amounts=self.estimate(explained.clean), seen=directions[:, big].T,
-            share=np.minimum(share[big], BEST),
-        )  # fmt: skip
+        return self.known.since(self.estimate(explained.clean), share[big], directions[:, big].T)
 
 
 class _BlurredMetric(Metric):
@@ -320,33 +328,22 @@ def small_errors_of(
         UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
             causes.
     """
-    names = list(dict.fromkeys(name for name, _ in known.hypotheses))
-    belongs = np.array([names.index(name) for name, _ in known.hypotheses])
+    names, belongs = families_of(known)
     amounts = stored = known.amounts if about is None else about
     evidence, errors, opened = 0.0, dict[str, float](), None
     for turn in range(ROUNDS):
-        for _ in range(HALVES):
-            own = zip(known.hypotheses, amounts.tolist(), strict=True)
-            there = [Cause(*h, a) for h, a in own if a]
-            inner = replace(problem, fixed=(*problem.fixed, *there))
-            alone = settled(inner, causes, nuisances)
-            if alone.projection is not None or not turn:
-                break
-            amounts = (amounts + stored) / 2  # too far for what is linear
-        if alone.projection is None:
-            raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
+        inner, alone, amounts = near(problem, known, amounts, stored, causes, nuisances)
+        assert alone.projection is not None
         stored = amounts
         slopes = _signatures(inner, alone, known.hypotheses)
-        on = [find(n).chain(a) for (n, _), a in zip(known.hypotheses, amounts, strict=True)]
-        slopes *= np.array(on)[:, None]
+        slopes *= chains(known, amounts)[:, None]
         shift = (amounts - known.amounts) @ slopes
         spread = known.mixed(known.rms[:, None] * slopes)
         if learn:
             moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
-            found = _sizes(
-                moved, alone.projection, inner.as_rows(spread.reshape(-1, *inner.valid.shape)),
-                belongs, len(names),
-            )  # fmt: skip
+            keep = kept(len(moved))
+            rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
+            found = sizes_of(moved[keep], alone.projection.matrix()[keep], rows[:, keep], belongs)
             evidence = found.log_evidence if turn == 0 else evidence
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
@@ -385,21 +382,69 @@ def _signatures(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]
     return out
 
 
-def _sizes(
-    residual: Array,
-    projection: Projection,
-    rows: Array,
-    belongs: NDArray[np.int64],
-    families: int,
-) -> Sizes:
-    """Sizes from as many rows as it takes, taken evenly, nuisances projected out."""
-    directions = projection.matrix()
-    keep = np.arange(len(residual))
-    keep = keep[:: max(-(-len(keep) // ROWS), 1)]
-    launch = directions[keep]
-    launch = launch[:, np.abs(launch).max(axis=0) > 0]
+def families_of(known: Known) -> tuple[list[str], NDArray[np.int64]]:
+    """Effects that have a size, and of which each error is, [error]."""
+    names = list(dict.fromkeys(name for name, _ in known.hypotheses))
+    return names, np.array([names.index(name) for name, _ in known.hypotheses])
+
+
+def near(
+    problem: Problem,
+    known: Known,
+    amounts: Array,
+    stored: Array,
+    causes: Sequence[Cause],
+    nuisances: Array,
+) -> tuple[Problem, Point, Array]:
+    """The problem with small errors in it as near to some amounts as a beam is stored, the point
+    of the causes there, and those amounts.
+
+    Args:
+        problem, causes, nuisances, known: see `small_errors_of`.
+        amounts: wanted, [error].
+        stored: amounts at which there is a beam; the same ones: that is not known.
+
+    Raises:
+        UnstableRingError: there is none near enough.
+    """
+    first = amounts is stored
+    for _ in range(HALVES):
+        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+        there = [Cause(*h, a) for h, a in own if a]
+        inner = replace(problem, fixed=(*problem.fixed, *there))
+        alone = settled(inner, causes, nuisances)
+        if alone.projection is not None:
+            return inner, alone, amounts
+        if first:
+            break
+        amounts = (amounts + stored) / 2  # too far for what is linear
+    raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
+
+
+def chains(known: Known, amounts: Array) -> Array:
+    """d readings / d amount over signatures, of each, see `Effect.chain`."""
+    own = zip(known.hypotheses, amounts, strict=True)
+    return np.array([find(name).chain(amount) for (name, _), amount in own])
+
+
+def kept(count: int) -> NDArray[np.int64]:
+    """Rows from which sizes are learnt: drawn once and for all, so that planes and monitors, which
+    come in turns, all have their share."""
+    if count <= ROWS:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, ROWS, replace=False))
+
+
+def sizes_of(residual: Array, directions: Array, rows: Array, belongs: NDArray[np.int64]) -> Sizes:
+    """Sizes from some rows.
+
+    Args:
+        residual: what is left, [row].
+        directions: of the nuisances, [row, coordinate].
+        rows: what errors of size 1 make, [error, row].
+        belongs: family of each error, [error].
+    """
+    launch = directions[:, np.abs(directions).max(axis=0) > 0]
     size = np.linalg.norm(launch, axis=0)
-    basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(keep), 0))
-    return learn_sizes(
-        residual[keep], basis, [rows[belongs == k][:, keep] for k in range(families)]
-    )
+    basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(residual), 0))
+    return learn_sizes(residual, basis, [rows[belongs == k] for k in range(belongs.max() + 1)])

@@ -4,7 +4,7 @@ A scan needs no signature itself, only its square and its products with data. A 
 says what the signatures are (`rows`), and may know quicker ways for some of them (`quick`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +78,20 @@ class Metric:
             whole = np.einsum("hr,hr->h", rows, rows)
             found.put(part, whole, self.projection.inside(rows), rows @ data.T)
         return found
+
+    def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
+        """Every signature, some rows of all hypotheses at a time; here all rows at once.
+
+        Yields:
+            Which rows, [row], and the signatures there, [hypothesis, row].
+        """
+        some = [
+            self.rows(hypotheses[start : start + self.chunk])
+            for start in range(0, len(hypotheses), self.chunk)
+        ]
+        if some:
+            rows = np.concatenate(some)
+            yield np.arange(rows.shape[1]), rows
 
     def free_kicks(self, places: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
         """Information of a free kick at places, and its product with data.

@@ -221,7 +221,7 @@ class AtEngine:
             LatticeError, UnknownNameError: see `track`.
             UnstableRingError: no closed orbit within reach.
         """
-        start, solve = at_orbit.stored(functools.partial(self._pass, self._line))
+        start, solve = self._stored
         readings = np.empty((len(settings), len(self._monitors), 2))
         for orbits, changed, frequency in self._groups(settings):
             line = self._set(changed)
@@ -229,6 +229,11 @@ class AtEngine:
             turn = functools.partial(self._pass, line)
             readings[orbits] = at_orbit.settle(turn, start, solve, late)[1]
         return readings
+
+    @functools.cached_property
+    def _stored(self) -> tuple[Array, Array]:
+        """The unset ring's closed orbit, and its Jacobian: from it every setting's is found."""
+        return at_orbit.stored(functools.partial(self._pass, self._line))
 
     def stored_line(self, settings: Settings) -> tuple[list[Any], list[Any], float]:
         """The line with the settings of one shot: without RF; with it, where a beam that stays

@@ -6,7 +6,7 @@ over the data that are taken once; its square is summed up reading by reading, e
 weight. An error of a monitor is in that monitor's readings alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from tmlattice.beam.response_squares import squares
 from tmlattice.effects import ReadingEffect, RingEffect, find
 from tmlattice.inference.metric import Hypothesis, Indices, Products
 from tmlattice.observe.orbit_response import Predicted
-from tmlattice.observe.steady import SteadyMetric
+from tmlattice.observe.steady import ROOM, SteadyMetric
 
 Array = NDArray[np.float64]
 
@@ -40,6 +40,42 @@ class ResponseMetric(SteadyMetric):
             self._of_monitors(hypotheses, of_monitors, data, found)
         return np.concatenate([on_ring, of_monitors])
 
+    def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
+        """Some monitors at a time, from the factors of all errors of the ring."""
+        kinds = [find(name) for name, _ in hypotheses]
+        on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
+        of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
+        rest = np.setdiff1d(np.arange(len(kinds)), [*on_ring, *of_monitors])
+        whole = self.rows([hypotheses[int(i)] for i in rest])
+        here = _Here(self.point.view, self.problem.used, self.problem.sigma)
+        some = here.read_all([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
+        places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
+        used, row = self.problem.used, self._numbered()
+        measured = np.flatnonzero(used.any(axis=(0, 2)))
+        count = max(ROOM // max(len(hypotheses) * used[:, 0].size, 1), 1)
+        for start in range(0, len(measured), count):
+            group = measured[start : start + count]
+            out = []
+            for at in group:
+                there = used[:, at]
+                own = np.zeros((len(hypotheses), np.count_nonzero(there)))
+                if some is not None:
+                    own[on_ring] = here.at(int(at), some)[:, there]
+                for i in of_monitors[places == at]:
+                    slope = self.point.view.monitor_slope(hypotheses[int(i)][0], int(at))
+                    own[i] = (slope / self.problem.sigma[at])[there]
+                own[rest] = whole[:, row[:, at][there]]
+                out.append(own)
+            rows = [row[:, at][used[:, at]] for at in group]
+            yield np.concatenate(rows), np.concatenate(out, axis=1)
+
+    def _numbered(self) -> Indices:
+        """The row of each reading that is used, of the readings' shape."""
+        used = self.problem.used
+        row = np.zeros(used.shape, dtype=np.intp)
+        row[used] = np.arange(np.count_nonzero(used))
+        return row
+
     def _on_ring(
         self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
     ) -> None:
@@ -56,8 +92,7 @@ class ResponseMetric(SteadyMetric):
         self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
     ) -> None:
         """Monitor by monitor: of each the errors have its rows in common."""
-        used, row = self.problem.used, np.zeros(self.problem.used.shape, dtype=np.intp)
-        row[used] = np.arange(np.count_nonzero(used))
+        used, row = self.problem.used, self._numbered()
         places = np.array([self.point.view.monitor(hypotheses[i][1]) for i in which])
         for at in np.unique(places[places >= 0]):
             own = which[places == at]
@@ -135,6 +170,25 @@ class _Here:
             np.stack([getattr(change, name) for change in changes]) for name in ("before", "behind")
         )
         return _Stack(seen, before, behind)
+
+    def read_all(self, hypotheses: Sequence[Hypothesis]) -> _Stack:
+        """Of errors of the ring, some at a time."""
+        factors = self.slopes.factors(hypotheses)
+        parts = [
+            self.read([next(factors) for _ in hypotheses[start : start + AT_ONCE]])
+            for start in range(0, len(hypotheses), AT_ONCE)
+        ]
+        return _Stack(*(np.concatenate([getattr(part, name) for part in parts])
+                        for name in ("seen", "before", "behind")))  # fmt: skip
+
+    def at(self, monitor: int, some: _Stack) -> Array:
+        """Signatures in the readings of one monitor, [error, column, 2]."""
+        slopes, late = self.slopes, (monitor >= self.first)[:, None]
+        launch = slopes.start + late * slopes.pulled
+        orbit = some.seen[:, monitor] @ launch.T  # [error, 2, column]
+        change = np.where(late, some.before + some.behind, some.before)
+        moved = np.swapaxes(orbit, 1, 2) + change @ self.readings[monitor].T
+        return np.asarray(moved * self.scale[:, None])
 
     def sums(self, data: Array) -> _Stack:
         """Of data [data, row]."""

@@ -1,0 +1,152 @@
+"""What readings leave known of small errors, from sums over rows: the same as with all signatures
+written out."""
+
+import tracemalloc
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause, simulate
+from tmlattice.diagnosis.prepare import prepare
+from tmlattice.effects import background_rms, find
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference import among
+from tmlattice.inference import posterior as module
+from tmlattice.inference.among import ROWS, Known, kept, small_errors_of
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.metric import Metric
+from tmlattice.inference.posterior import posterior
+from tmlattice.inference.whitening import Projection
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe import response_metric
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.response_problem import Response
+
+USUAL = background_rms({"all": None})
+PIECE = 200_000
+"""Numbers of signatures at a time: two or three monitors of the small ring."""
+
+
+@pytest.fixture(scope="module")
+def response(small_ring):
+    """Six columns and the RF's, one reading missing, one monitor not used."""
+    correctors = [e.name for e in small_ring.elements if e.kind.endswith("corrector")][::3]
+    measured = simulate_response(
+        small_ring, background=USUAL, machine_seed=5, seed=1, correctors=correctors, progress=False
+    ).measured
+    data = response_data(small_ring, measured)
+    used = np.isfinite(data.orbits)
+    used[2, 7, 1], used[:, 11] = False, False
+    return Response(base=Predicted(data, Errors.none(data)).bend(), used=used, places={})
+
+
+@pytest.fixture(scope="module")
+def everywhere(small_ring):
+    return [(name, place) for name in USUAL for place in find(name).places(small_ring)]
+
+
+def covariance(known):
+    inside = np.eye(len(known.rms)) - (known.seen.T * known.share) @ known.seen
+    return known.rms[:, None] * inside * known.rms
+
+
+def same(one, other, tolerance):
+    sigma = other.errors
+    assert_allclose((one.amounts - other.amounts) / sigma, 0, atol=tolerance)
+    off = (covariance(one) - covariance(other)) / sigma / sigma[:, None]
+    assert np.abs(off).max() < tolerance
+
+
+def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
+    monkeypatch.setattr(response_metric, "ROOM", PIECE)
+    point = response.at((Cause("monitor_roll", "end_1", 0.02),), response.first)
+    some = [*everywhere[::3], ("energy_spread", None), ("skew_gradient", "QF::5")]
+    metric = response.metric(point)
+    rows, seen = metric.rows(some), []
+    for which, piece in metric.pieces(some):
+        assert piece.size <= PIECE
+        assert_allclose(piece, rows[:, which], rtol=1e-9, atol=1e-10 * np.abs(rows).max())
+        seen += which.tolist()
+    assert sorted(seen) == list(range(rows.shape[1]))
+    assert len(seen) > 2
+
+
+def test_sums_leave_known_what_all_signatures_do(response, everywhere, monkeypatch):
+    monkeypatch.setattr(response_metric, "ROOM", PIECE)
+    usual = Known.usual(everywhere, USUAL)
+    direct = small_errors_of(response, usual, response.first)
+    summed = posterior(response, usual)
+    assert summed.sizes == pytest.approx(direct.sizes, rel=1e-8)
+    assert summed.errors == pytest.approx(direct.errors, rel=1e-8)
+    known = direct.problem.learnt(direct.before)
+    same(summed.known, known, 1e-8)
+    # and once more, from what is known
+    again = small_errors_of(response, known, response.first, learn=False)
+    twice = posterior(response, known, learn=False)
+    same(twice.known, again.problem.learnt(again.before), 1e-7)
+
+
+def test_nuisances_are_projected_out(small_ring, everywhere):
+    """First turns have a launch each; linear about the same launches, which the two ways settle
+    each in its own noise."""
+    measured = simulate(small_ring, background=USUAL, machine_seed=5, shots=3, seed=3).measurement()
+    turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
+    usual = Known.usual(everywhere, USUAL)
+    direct = small_errors_of(turns, usual, turns.first, learn=False)
+    summed = posterior(turns, usual, learn=False).known
+    known = direct.problem.learnt(direct.before)
+    assert_allclose(summed.errors, known.errors, rtol=0.02)
+    assert_allclose((summed.amounts - known.amounts) / known.errors, 0, atol=0.1)
+
+
+def test_memory_does_not_grow_with_readings():
+    """Errors times errors, and one piece: never errors times readings, here 160 MB."""
+    count, readings, size = 100, 200_000, 2000
+    rng = np.random.default_rng(1)
+    residual = rng.standard_normal(readings)
+
+    class Many(Metric):
+        def pieces(self, hypotheses):
+            for start in range(0, readings, size):
+                yield np.arange(start, start + size), _drawn(start)
+
+    def _drawn(start):
+        return np.random.default_rng(start).standard_normal((count, size))
+
+    projection = Projection(np.zeros((1, readings, 0)))
+    problem = SimpleNamespace(
+        everywhere=lambda: SimpleNamespace(metric=lambda point: Many(projection))
+    )
+    known = Known.usual([("dipole_field", str(i)) for i in range(count)], {"dipole_field": 1.0})
+    point = SimpleNamespace(residual=residual, projection=projection)
+    tracemalloc.start()
+    sums = module.summed(problem, point, known, np.zeros(count), np.array([3, size + 7]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6
+    starts = range(0, readings, size)
+    inner = sum(_drawn(start) @ residual[start : start + size] for start in starts)
+    assert_allclose(sums.inner, inner, rtol=1e-9, atol=1e-6)
+    assert_allclose(np.diag(sums.gram), sum((_drawn(start) ** 2).sum(axis=1) for start in starts))
+    assert_allclose(sums.some, np.stack([_drawn(0)[:, 3], _drawn(size)[:, 7]], axis=1))
+
+
+def test_too_large_small_errors_are_a_sentence(response, everywhere, monkeypatch):
+    def lost(*_):
+        return replace(response.at((), response.first), projection=None, lost="no orbit")
+
+    monkeypatch.setattr(among, "settled", lost)
+    with pytest.raises(UnstableRingError, match="no orbit with the small errors"):
+        posterior(response, Known.usual(everywhere, USUAL))
+
+
+def test_rows_for_sizes_have_both_planes():
+    """Every second row was one plane of all monitors: the other had no say in any size."""
+    for count in (2 * ROWS, 4 * ROWS - 3, 12 * ROWS):
+        rows = kept(count)
+        assert len(rows) == ROWS == len(set(rows.tolist()))
+        assert 0.4 < np.mean(rows % 2) < 0.6
+    assert_allclose(kept(ROWS), np.arange(ROWS))
