@@ -7,6 +7,7 @@ numbers are not kicks but patterns: those combinations of bends' kicks that focu
 >>> families = orbit_families(ring, model)
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -104,7 +105,9 @@ def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
     kinds: tuple[Any, ...] = (HorizontalOrbit, VerticalOrbit)
     for plane, kind in enumerate(kinds):
         kicks = np.array([abs(magnets[i].angle) for i in bends]) * find(kind.effect).background
-        moved = _orbits(model, bends, kicks, strong, plane)
+        exits = np.array(strong) + 1
+        moved = orbits_of_kicks(model, bends, exits, model.tangents[exits][:, 2 * plane], plane)
+        moved = moved * kicks
         focused = moved * np.array([[magnets[i].k2 * magnets[i].length] for i in strong])
         _, size, patterns = np.linalg.svd(focused, full_matrices=False)
         kept = patterns[size > LEAST * size[0]] * find(kind.effect).background
@@ -112,14 +115,21 @@ def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
     return found
 
 
-def _orbits(
-    model: ResponseModel, sources: list[int], kicks: Array, at: list[int], plane: int
+def orbits_of_kicks(
+    model: ResponseModel, sources: Sequence[int], exits: NDArray[np.int64], rows: Array, plane: int
 ) -> Array:
-    """Closed orbit behind some magnets by a kick behind each of others, m, [magnet, source]."""
-    kick = np.zeros((len(sources), model.dimension))
-    kick[:, 2 * plane + 1] = kicks
-    pulled = np.einsum("kij,kj->ki", model.inverse[np.array(sources) + 1], kick)
+    """Closed orbit by a kick of 1 rad behind each of some magnets, m, [place, source].
+
+    Args:
+        model: of the ring.
+        sources: magnets.
+        exits: of how many magnets each place is behind, [place].
+        rows: d orbit / d state there, [place, n].
+        plane: of the kicks.
+    """
+    behind = np.array(sources) + 1
+    kick = np.zeros((len(behind), model.dimension))
+    kick[:, 2 * plane + 1] = 1.0
+    pulled = np.einsum("kij,kj->ki", model.inverse[behind], kick)
     start = pulled @ model.closing.T
-    rows = model.tangents[np.array(at) + 1][:, 2 * plane]
-    behind = np.array(at)[:, None] >= np.array(sources)
-    return np.asarray(rows @ start.T + behind * (rows @ pulled.T))
+    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ pulled.T))

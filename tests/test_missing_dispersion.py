@@ -1,0 +1,83 @@
+"""Dispersion that no gradient makes: kicks of the closed orbit, of which a beam of more energy
+lacks a share. The referee is AT, in which displaced quadrupoles are displaced."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.hypotheses import HYPOTHESES
+from tmlattice.diagnosis.missing import weigh
+from tmlattice.diagnosis.state import begin
+from tmlattice.effects import Cause
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import response_data, split_columns
+
+STEP = -2000.0
+"""Hz."""
+
+
+def simulated(ring, causes, **how):
+    """A response with an RF step."""
+    return simulate_response(ring, causes, rf_step=STEP, progress=False, **how).measured
+
+
+def state_of(ring, measured, fit):
+    data = response_data(ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    return fit_steps(data, split).state if fit else begin(data, split)
+
+
+@pytest.fixture(scope="module")
+def plain(small_ring):
+    """Without sextupoles, in which an orbit would make gradients."""
+    places = [i for i, e in enumerate(small_ring.elements) if e.kind == "sextupole"]
+    return small_ring.with_elements({i: small_ring.elements[i].changed(k2=0.0) for i in places})
+
+
+@pytest.fixture(scope="module")
+def beside(plain):
+    """What quadrupoles that are displaced by 0.2 mm rms add to the RF's orbit of AT, m."""
+    rng = np.random.default_rng(7)
+    quadrupoles = [e.name for e in plain.elements if e.kind == "quadrupole"]
+    causes = [Cause("quadrupole_offset_x", name, 2e-4 * rng.standard_normal())
+              for name in quadrupoles]  # fmt: skip
+    with_them, without = (
+        simulated(plain, own, correctors=["v3"], noise=0.0).rf.orbit[:, 0] for own in (causes, [])
+    )
+    return with_them - without
+
+
+def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, beside):
+    state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
+    patterns = HYPOTHESES["dispersion"](state).patterns
+    assert not patterns[:, :-1].any()
+    assert len(patterns) < len(beside) / 2
+    amounts = np.linalg.lstsq(patterns[:, -1].T, beside, rcond=None)[0]
+    left = beside - amounts @ patterns[:, -1]
+    assert np.std(beside) > 2e-6
+    assert np.std(left) < 0.02 * np.std(beside)  # to first order in the energy, kicks at the ends
+    # gradients of 0.36 1/m and an orbit of 1.9 mm
+    assert 1e-4 < np.sqrt(np.mean(amounts**2)) < 2e-3
+
+
+def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, beside):
+    measured = simulated(
+        small_ring, [Cause("quadrupole_gradient", "QF::3", 5e-3)], kick=1e-5, noise=2e-8,
+        engine="ocelot", seed=3,
+    )  # fmt: skip
+    said = []
+    for share in (0.0, 1.0):
+        orbit = measured.rf.orbit + share * np.stack([beside, 0 * beside], axis=1)
+        own = replace(measured, rf=replace(measured.rf, orbit=orbit))
+        said += weigh(state_of(small_ring, own, True), ["dispersion"])[1:]
+    assert said[0].evidence < 0
+    assert said[1].evidence > 10
+    assert said[0].amount < 5e-5 < said[1].amount < 1e-3
+
+
+def test_without_the_rf_nothing_is_said_of_it(small_ring):
+    measured = simulated(small_ring, [], kick=1e-5, noise=2e-8, engine="ocelot")
+    state = state_of(small_ring, replace(measured, rf=None), False)
+    assert HYPOTHESES["dispersion"](state) is None
