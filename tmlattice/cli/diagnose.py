@@ -206,7 +206,7 @@ def diagnose(
             if said:
                 source["assumed_of_files"] = said
             _write(result, source, folder, extra, progress)
-            written = _write_rings(result, lattice_out, repaired_out)
+            written = _write_rings(result, lattice_out, repaired_out, progress)
             if folder and reading:
                 _write_weights(reading, folder)
     if not quiet:
@@ -278,7 +278,10 @@ def _write(
 
 
 def _write_rings(
-    result: "Diagnosis", lattice_out: Path | None, repaired_out: Path | None
+    result: "Diagnosis",
+    lattice_out: Path | None,
+    repaired_out: Path | None,
+    progress: Callable[[str], Any],
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
     from tmlattice.diagnosis.twin import known_beside, known_document, known_of
@@ -290,19 +293,20 @@ def _write_rings(
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
         written[str(lattice_out)] = write_ring(result.as_found, lattice_out)
-        beside, known = calibration_beside(lattice_out), known_of(result)
+        beside = calibration_beside(lattice_out)
         if result.calibration or result.by_steps:
             write_calibration(beside, result.calibration)
             written[str(beside)] = ()
         else:  # that of the ring which stood there
             beside.unlink(missing_ok=True)
         beside = known_beside(lattice_out)
-        if known is not None and lattice_out.is_file():
+        beside.unlink(missing_ok=True)  # that of the ring which stood there
+        progress("what is left known")  # minutes, of a large response
+        known = known_of(result) if lattice_out.is_file() else None
+        if known is not None:
             with output_file(beside) as temporary:
                 write_json(temporary, known_document(known, lattice_out))
             written[str(beside)] = ()
-        else:
-            beside.unlink(missing_ok=True)
     if repaired_out:
         ring, by_hand = result.repair()
         told = write_ring(ring, repaired_out)

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
+PRODUCTS = 2e12
+"""Readings times errors squared up to which the covariance of all small errors is taken from a
+response: some six minutes of processor (`docs/results/together.md`)."""
 HARDLY = 0.3
 """Relative error of a family's size from which on the usual one is not made smaller: a response
 sees kicks by the orbit in the sextupoles alone, of which it is not linear."""
@@ -52,8 +55,9 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
     """What a diagnosis knows beside the ring as found; None: nothing of small errors.
 
     The small errors with their covariance. Of an orbit response they are linear about its dense
-    fit; where that leaves no stored beam, each error of the fit has its own standard deviation,
-    its correlations left out: what neighbours know together is known less well than it is.
+    fit; where that leaves no stored beam, or takes too long, each error of the fit has its own
+    standard deviation, its correlations left out: what neighbours know together is known less
+    well than it is.
     """
     view = diagnosis.view
     if isinstance(view, JointView):
@@ -67,10 +71,11 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
         return None
     usual = background_rms({"all": None})
     everywhere = [(name, place) for name in usual for place in find(name).places(diagnosis.ring)]
-    try:
-        return _together(diagnosis, view, usual, everywhere)
-    except UnstableRingError:  # too far from its likeliest small errors for what is linear
-        log.info("no covariance of the small errors", exc_info=True)
+    if view.data.size * len(everywhere) ** 2 <= PRODUCTS:
+        try:
+            return _together(diagnosis, view, usual, everywhere)
+        except UnstableRingError:  # too far from its likeliest small errors for what is linear
+            log.info("no covariance of the small errors", exc_info=True)
     return _each_alone(diagnosis, usual, everywhere)
 
 
