@@ -196,13 +196,11 @@ def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Cas
     """With the orbit response of its machine without the fault, in usual noise; as it is where that
     machine stores no beam."""
     own: dict[str, Any] = {"machine_seed": drawn.seed, "seed": drawn.seed + 2}
+    own["background"] = drawn.background
     if correctors is not None:
         own["correctors"] = evenly(drawn.ring, correctors)
     try:
-        response = measure(
-            "orbit_response", drawn.ring, (), 1.0, drawn.fit_shots, background=drawn.background,
-            **own,
-        )  # fmt: skip
+        response = measure("orbit_response", drawn.ring, (), 1.0, drawn.fit_shots, **own)
     except UnstableRingError:
         return case
     return replace(case, parts={**case.parts, LEARNT: response})
