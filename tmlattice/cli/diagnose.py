@@ -302,8 +302,7 @@ def _write_rings(
         beside = known_beside(lattice_out)
         beside.unlink(missing_ok=True)  # that of the ring which stood there
         progress("what is left known")  # minutes, of a large response
-        known = known_of(result) if lattice_out.is_file() else None
-        if known is not None:
+        if lattice_out.is_file() and (known := known_of(result)) is not None:
             with output_file(beside) as temporary:
                 write_json(temporary, known_document(known, lattice_out))
             written[str(beside)] = ()
