@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 
 from tmlattice.diagnosis.dense import fit_steps
+from tmlattice.diagnosis.dispersion import HorizontalKicks, VerticalKicks, dispersion_by_kicks
+from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
 
 STEP = -2000.0
 """Hz."""
+WITHOUT = [step for step in STEPS if not isinstance(step.families[0], HorizontalKicks)]
 
 
 def simulated(ring, causes, **how):
@@ -26,7 +30,7 @@ def simulated(ring, causes, **how):
 def state_of(ring, measured, fit):
     data = response_data(ring, measured)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    return fit_steps(data, split).state if fit else begin(data, split)
+    return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +66,48 @@ def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, bes
     assert 1e-4 < np.sqrt(np.mean(amounts**2)) < 2e-3
 
 
-def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, beside):
-    measured = simulated(
-        small_ring, [Cause("quadrupole_gradient", "QF::3", 5e-3)], kick=1e-5, noise=2e-8,
-        engine="ocelot", seed=3,
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def measured(small_ring, beside):
+    """Gradients that scatter, without kicks and with them."""
+    rng = np.random.default_rng(5)
+    causes = [Cause("quadrupole_gradient", e.name, 5e-3 * rng.standard_normal())
+              for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
+    plain = simulated(small_ring, causes, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
+    more = plain.rf.orbit + np.stack([beside, 0 * beside], axis=1)
+    return causes, plain, replace(plain, rf=replace(plain.rf, orbit=more))
+
+
+def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, measured):
+    causes, plain, kicked = measured
+    amounts = {cause.element: cause.amount for cause in causes}
+    missed, said = [], []
+    for own, steps in ((plain, STEPS), (kicked, STEPS), (kicked, WITHOUT)):
+        data = response_data(small_ring, own)
+        fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        true = [amounts[name] for name in QuadrupoleGradient().places(data)]
+        missed.append(np.std(fit.state.values["gradient"] - true))
+        said.append(len(list(dispersion_by_kicks(fit.state.values, data))))
+    assert said == [0, 1, 0]
+    assert missed[1] < 2 * missed[0]
+    assert missed[2] > 2 * missed[1]
+
+
+def test_patterns_are_read_as_they_were_put(small_ring, measured, rng):
+    """Beside an energy spread too, which changes the RF's orbit by its own."""
+    data = response_data(small_ring, measured[1])
+    for family in (HorizontalKicks(), VerticalKicks()):
+        spread = replace(Errors.none(data), spread=1.0)
+        values = 1e-4 * rng.standard_normal(family.size(data))
+        before, after = (Predicted(data, own) for own in (spread, family.put(spread, values, data)))
+        rows = np.tensordot(values, family.rows(before, values), 1)
+        moved = data.pick(after.read - before.read, family.block)
+        assert np.abs(rows).max() > 1e-8
+        assert moved == pytest.approx(rows, abs=1e-9 * np.abs(rows).max())
+
+
+def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, measured):
     said = []
-    for share in (0.0, 1.0):
-        orbit = measured.rf.orbit + share * np.stack([beside, 0 * beside], axis=1)
-        own = replace(measured, rf=replace(measured.rf, orbit=orbit))
+    for own in measured[1:]:
         said += weigh(state_of(small_ring, own, True), ["dispersion"])[1:]
     assert said[0].evidence < 0
     assert said[1].evidence > 10

@@ -323,7 +323,7 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
         loose = np.flatnonzero(posterior.sigma[there.where[family.variable]] > 0.5 * own[0].scale)
         causes = family.told(state.at.errors, state.values[family.variable],
                              np.zeros(family.size(state.data)), state.data)  # fmt: skip
-        names = [causes[i][0].element or "" for i in loose]
+        names = [causes[i][0].element or "" for i in loose] if causes else []
         if names:
             said.append(
                 f"{len(names)} gradients that the prior holds more than the data: "

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.dispersion import HorizontalKicks, VerticalKicks
 from tmlattice.diagnosis.family import TAILS, Family, Told
 from tmlattice.diagnosis.fields import (
     BendGradient,
@@ -259,6 +260,8 @@ STEPS = (
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
+    Trial((HorizontalKicks(),), 2, 0),
+    Trial((VerticalKicks(),), 0, 2),
 )
 """What is tried, one after another. Skew gradients move the tunes to second order, which the
 gradients then take back."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.diagnosis.dispersion import patterns_of_kicks
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import families
-from tmlattice.diagnosis.orbit_modes import orbits_of_kicks
 from tmlattice.diagnosis.state import State
 from tmlattice.effects import apply
 from tmlattice.observe.orbit_response import DELTA
@@ -23,10 +23,6 @@ Array = NDArray[np.float64]
 BEND_GRADIENT = 1e-4
 """1/m2, of the differences."""
 MILLIMETRE = 1e-3
-KICKING = ("bend", "quadrupole", "hcorrector")
-"""Magnets that a closed orbit has its kicks of."""
-UNSEEN = 3e-3
-"""Share of the strongest pattern of kicks that a weaker one may be left out with."""
 WAVES = 4
 """Of the leading closed orbits of random kicks in a plane."""
 
@@ -184,19 +180,14 @@ def _energy_offset(state: State) -> Hypothesis:
 
 
 def _dispersion(state: State) -> Hypothesis | None:
-    """Whatever kicks the beam on its closed orbit kicks it less where the RF has raised its energy.
-    The orbit hardly tells these kicks, for they were made to cancel in it. One looks like another,
-    so the amounts are those of patterns, as large as independent kicks are."""
-    if not np.isfinite(state.data.pick(state.data.orbits)[-1]).any():
+    """See `dispersion`, in the fit's optics; one amount a pattern."""
+    if state.allows("horizontal kicks"):
+        return None  # they are in the fit
+    patterns = patterns_of_kicks(state.at, 0)
+    if not len(patterns):
         return None
-    model = state.at.model
-    sources = [i for i, e in enumerate(model.ring.magnets) if e.kind in KICKING]
-    orbits = orbits_of_kicks(model, sources, model.maps.at, model.reading_slopes[:, 0], 0)
-    shapes, size, _ = np.linalg.svd(orbits[state.data.at], full_matrices=False)
-    kept = size > UNSEEN * size[0]
-    lacking = -state.data.kicks[-1] * model.rf_start[5]  # of every kick
-    rows = np.zeros((int(kept.sum()), *state.data.shape))
-    rows[:, -1] = lacking * (shapes[:, kept] * size[kept]).T * state.at.gain(0)[-1]
+    rows = np.zeros((len(patterns), *state.data.shape))
+    rows[:, -1] = patterns * state.at.gain(0)[-1]
     return Hypothesis("dispersion that no gradient makes (kicks)", "rad", "< 1e-3", rows, most=1e-3)
 
 

@@ -64,7 +64,8 @@ def left_open(state: State) -> LeftOpen:
             for number, moves in moved:
                 for hypothesis, share in moves.items():
                     amounts[hypothesis] = share * number + amounts.get(hypothesis, 0.0)
-        blocks.append(amounts)
+        if amounts:
+            blocks.append(amounts)
     usual = background_rms(dict.fromkeys(ORBITS))
     unseen = [(name, place) for name in ORBITS for place in find(name).places(state.data.ring)]
     blocks += [{h: np.eye(len(unseen))[i] * usual[h[0]] for i, h in enumerate(unseen)}]

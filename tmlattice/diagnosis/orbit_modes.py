@@ -7,7 +7,6 @@ numbers are not kicks but patterns: those combinations of bends' kicks that focu
 >>> families = orbit_families(ring, model)
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.family import Family, Told
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
@@ -113,23 +113,3 @@ def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
         kept = patterns[size > LEAST * size[0]] * find(kind.effect).background
         found.append(kind(tuple(magnets[i].name for i in bends), kept))
     return found
-
-
-def orbits_of_kicks(
-    model: ResponseModel, sources: Sequence[int], exits: NDArray[np.int64], rows: Array, plane: int
-) -> Array:
-    """Closed orbit by a kick of 1 rad behind each of some magnets, m, [place, source].
-
-    Args:
-        model: of the ring.
-        sources: magnets.
-        exits: of how many magnets each place is behind, [place].
-        rows: d orbit / d state there, [place, n].
-        plane: of the kicks.
-    """
-    behind = np.array(sources) + 1
-    kick = np.zeros((len(behind), model.dimension))
-    kick[:, 2 * plane + 1] = 1.0
-    pulled = np.einsum("kij,kj->ki", model.inverse[behind], kick)
-    start = pulled @ model.closing.T
-    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ pulled.T))

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import DenseFit, fit_chi2, fit_steps, told
+from tmlattice.diagnosis.dispersion import dispersion_by_kicks
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swap_of, swapped
 from tmlattice.diagnosis.exchanged import told as told_exchanged
@@ -373,7 +374,7 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    return (*said, *odd_readings(fit.state))
+    return (*said, *dispersion_by_kicks(fit.state.values, fit.state.data), *odd_readings(fit.state))
 
 
 def _misfit(fit: DenseFit, read: Array) -> Misfit:

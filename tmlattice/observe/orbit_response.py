@@ -180,6 +180,7 @@ class Errors:
         calibration, roll: of the columns, 0 for the RF, [column].
         ring: causes in the ring.
         spread: mean square energy deviation, in units of `DELTA` squared.
+        dispersion: what the RF's orbit has of kicks, see `beam.kicks`, m, [monitor, 2].
     """
 
     monitors: Array
@@ -187,6 +188,7 @@ class Errors:
     roll: Array
     ring: tuple[Cause, ...] = ()
     spread: float = 0.0
+    dispersion: Array | float = 0.0
 
     @classmethod
     def none(cls, data: ResponseData) -> "Errors":
@@ -253,6 +255,7 @@ class Predicted:
         data = self.data
         steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
         whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
+        whole[-1] += self.errors.dispersion
         return np.asarray(whole + self.bent)
 
     def bend(self) -> "Predicted":

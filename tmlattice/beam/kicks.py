@@ -1,0 +1,60 @@
+"""What the closed orbit's own kicks do: the orbit that they make, and the dispersion.
+
+Whatever kicks a stored beam (errors of bends, displaced quadrupoles, correctors that put its orbit
+straight) kicks it less where its energy is higher, by the share of the energy. The orbit hardly
+tells these kicks, for they were made to cancel in it; the dispersion does, and no gradient makes
+what they add to it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.lattice import Ring
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+KICKING = ({"bend", "quadrupole", "hcorrector"}, {"bend", "quadrupole", "vcorrector"})
+"""Magnets that a closed orbit has its kicks of, in x and in y."""
+
+
+def kicking(ring: Ring, plane: int) -> Indices:
+    """The magnets that kick in a plane, as their places among the ring's magnets."""
+    return np.array([i for i, e in enumerate(ring.magnets) if e.kind in KICKING[plane]], dtype=int)
+
+
+def orbits_of_kicks(
+    model: ResponseModel, sources: Sequence[int] | Indices, exits: Indices, rows: Array, plane: int
+) -> Array:
+    """Closed orbit by a kick of 1 rad behind each of some magnets, m, [place, source].
+
+    Args:
+        model: of the ring.
+        sources: magnets.
+        exits: of how many magnets each place is behind, [place].
+        rows: d orbit / d state there, [place, n].
+        plane: of the kicks.
+    """
+    behind = np.asarray(sources) + 1
+    kick = np.zeros((len(behind), model.dimension))
+    kick[:, 2 * plane + 1] = 1.0
+    pulled = np.einsum("kij,kj->ki", model.inverse[behind], kick)
+    start = pulled @ model.closing.T
+    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ pulled.T))
+
+
+def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
+    """What a step of the RF adds to the orbit at the monitors by a kick of 1 rad behind each magnet
+    that kicks in a plane, m, [monitor, source].
+
+    Args:
+        model: of the ring, six coordinates.
+        step: relative, of the frequency.
+        plane: 0 or 1.
+    """
+    sources = kicking(model.ring, plane)
+    orbits = orbits_of_kicks(model, sources, model.maps.at, model.reading_slopes[:, plane], plane)
+    return np.asarray(-step * model.rf_start[5] * orbits)
