@@ -27,6 +27,12 @@ def simulated(ring, causes, **how):
     return simulate_response(ring, causes, rf_step=STEP, progress=False, **how).measured
 
 
+def with_orbit(measured, more):
+    """More of the RF's orbit, in x."""
+    orbit = measured.rf.orbit + np.stack([more, 0 * more], axis=1)
+    return replace(measured, rf=replace(measured.rf, orbit=orbit))
+
+
 def state_of(ring, measured, fit):
     data = response_data(ring, measured)
     split = split_columns(data, 0.2, np.random.default_rng(1))
@@ -73,8 +79,7 @@ def measured(small_ring, beside):
     causes = [Cause("quadrupole_gradient", e.name, 5e-3 * rng.standard_normal())
               for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
     plain = simulated(small_ring, causes, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
-    more = plain.rf.orbit + np.stack([beside, 0 * beside], axis=1)
-    return causes, plain, replace(plain, rf=replace(plain.rf, orbit=more))
+    return causes, plain, with_orbit(plain, beside)
 
 
 def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, measured):
@@ -105,9 +110,11 @@ def test_patterns_are_read_as_they_were_put(small_ring, measured, rng):
         assert moved == pytest.approx(rows, abs=1e-9 * np.abs(rows).max())
 
 
-def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, measured):
+def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, beside):
+    one = [Cause("quadrupole_gradient", "QF::3", 5e-3)]
+    measured = simulated(small_ring, one, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
     said = []
-    for own in measured[1:]:
+    for own in (measured, with_orbit(measured, beside)):
         said += weigh(state_of(small_ring, own, True), ["dispersion"])[1:]
     assert said[0].evidence < 0
     assert said[1].evidence > 10

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import lsq_linear
 
 from tmlattice.diagnosis import dense, rounds
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.fields import QuadrupoleGradient
+from tmlattice.diagnosis.dense import one_by_one
+from tmlattice.diagnosis.families import STEPS, Trial
+from tmlattice.diagnosis.fields import FocusingChange, QuadrupoleGradient, VerticalFocusing
 from tmlattice.diagnosis.rounds import _good_monitors, linear, one_round
 from tmlattice.diagnosis.state import allow, begin
 from tmlattice.effects import Cause
@@ -208,6 +210,46 @@ def test_a_round_follows_a_bent_valley(small_ring, monkeypatch):
     plain = one_round(state, 0, there, bold=10.0)
     assert plain.after > plain.before
     assert far.after < 0.6 * far.before
+
+
+def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):
+    """Two that pull against one another: to hold the one that went too low is not enough."""
+    size = 8
+    jacobian = rng.standard_normal((30, size)) + 3 * rng.standard_normal((30, 1))
+    data = jacobian @ np.where(np.arange(size) % 2, 0.5, -0.5) + 0.1 * rng.standard_normal(30)
+    lowest = np.where(np.arange(size) < 5, 0.0, -np.inf)
+    start, none = np.zeros(size), np.zeros((0, 0))
+    normal = Normal(jacobian.T @ jacobian, jacobian.T @ data)
+    group = Group("all", np.eye(size), 1.0, fixed=True)
+    there = rounds.Linear(
+        normal, start, np.full(size, 1e9), none, none, none, {}, (group,), {}, lowest
+    )
+    found = rounds._within(there, 1.0).values
+    referee = lsq_linear(
+        np.vstack([jacobian, np.eye(size)]), np.append(data, np.zeros(size)), (lowest, np.inf),
+        method="bvls",
+    ).x  # fmt: skip
+    held = referee <= lowest
+    assert 0 < held.sum() < 5
+    assert_allclose(found[held], 0.0, atol=1e-12)
+    assert_allclose(found, referee, atol=1e-6)
+
+
+def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
+    """PETRA III: -0.010 1/m in a straight without a device, and a quadrupole beside it +7 %."""
+    amounts = []
+    for true, family in (
+        (-0.01, VerticalFocusing()), (-0.01, FocusingChange()), (0.01, VerticalFocusing())
+    ):  # fmt: skip
+        measured = simulate_response(
+            small_ring, [Cause("vertical_focusing", "d::95", true)], kick=1e-5, noise=2e-8,
+            engine="ocelot", progress=False,
+        ).measured  # fmt: skip
+        data = response_data(small_ring, measured)
+        split = split_columns(data, 0.2, np.random.default_rng(1))
+        *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], Trial((family,), 2, 0)])
+        amounts.append(state.values["device"][family.places(data).index("d::95")])
+    assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)
 
 
 def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):

@@ -46,7 +46,8 @@ def drawn(family, data, rng):
     values = RMS[family] * rng.standard_normal(family.size(data))
     if family.per == "column":
         values[-1] = 0.0  # of the RF
-    return family.bounded(values + (RMS[family] if family.size(data) == 1 else 0))
+    values = values + (RMS[family] if family.size(data) == 1 else 0)
+    return np.maximum(values, family.lowest(data))
 
 
 @pytest.mark.parametrize("family", RMS, ids=lambda family: family.name)

@@ -19,6 +19,7 @@ from tmlattice.diagnosis.fields import (
     BendGradient,
     EdgeFocusing,
     FamilyGradient,
+    FocusingChange,
     OtherGradient,
     QuadrupoleGradient,
     SkewGradient,
@@ -215,9 +216,9 @@ class EnergySpread(Family):
         scale = (1 + at.errors.calibration)[:, None, None]
         return np.asarray((at.gain(0) * at.data.pick(at.curved * scale))[None])
 
-    def bounded(self, values: Array) -> Array:
+    def lowest(self, data: ResponseData) -> Array | float:
         """A square is not negative."""
-        return np.maximum(values, 0.0)
+        return 0.0
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """As it stands."""
@@ -269,7 +270,7 @@ gradients then take back."""
 CHANGES = (
     Trial((CorrectorCalibration(),), 3, 0),
     Trial((MonitorGain(),), 2, 0),
-    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), VerticalFocusing()), 4, 0),
+    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()), 4, 0),
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),

@@ -75,6 +75,6 @@ class Family(ABC):
         """Parameters, for people."""
         return self.size(data)
 
-    def bounded(self, values: Array) -> Array:
-        """Values that can be."""
-        return values
+    def lowest(self, data: ResponseData) -> Array | float:
+        """The least that each number can be; any can be zero."""
+        return -np.inf

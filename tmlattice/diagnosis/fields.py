@@ -193,6 +193,20 @@ class VerticalFocusing(_Thin):
         """Of each."""
         return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
 
+    def lowest(self, data: ResponseData) -> Array | float:
+        """A device focuses, whatever its field; only one that the design has may have too little of
+        it. What else would focus here pulls against the quadrupoles beside it."""
+        kinds = [data.ring[place].kind for place in self.places(data)]
+        return np.where([kind == "wiggler" for kind in kinds], -np.inf, 0.0)
+
+
+class FocusingChange(VerticalFocusing):
+    """A device that was opened focuses less."""
+
+    def lowest(self, data: ResponseData) -> Array | float:
+        """Of any sign."""
+        return -np.inf
+
 
 class EdgeFocusing(_Thin):
     """Vertical focusing of dipoles, by their edges and fringe fields: one number a type."""

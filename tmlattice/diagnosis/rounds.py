@@ -49,6 +49,8 @@ CORRECTED, CORRECTS = 6, 1e-3
 """How often a round corrects its step by what the readings say where it led, with the slopes of its
 start; and what share of the cost that has to gain to be repeated. Numbers that pull against one
 another go far in a valley that is narrow and bent: a step along its tangent leads up its wall."""
+HELD = 4
+"""How often numbers that would be lower than they can be are held, and the rest solved again."""
 STILL = 0.05
 """Share of what is trusted by which the ring moves, in the mean, before rows are taken anew."""
 
@@ -83,7 +85,8 @@ def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
 class Linear(NamedTuple):
     """The readings of one block where the fit stands.
 
-    Parameters are those of the monitors, x and y of each; of the columns; and of the ring.
+    Parameters are those of the monitors, x and y of each; of the columns; and of the ring. One that
+    is as low as it can be, and that the readings would have lower, stays: no prior moves it.
     """
 
     normal: Normal
@@ -95,6 +98,7 @@ class Linear(NamedTuple):
     where: Mapping[str, slice]
     groups: tuple[Group, ...]
     kept: Mapping[str, Kept]
+    lowest: Array
 
 
 def weight(state: State, block: int) -> Array:
@@ -153,10 +157,16 @@ def linear(state: State, block: int) -> Linear:
         rows["column"], by_ring,
     )  # fmt: skip
     groups = []
+    lowest = np.full(end, -np.inf)
+    for family in families:
+        lowest[where[family.variable]] = family.lowest(data)
+    begin = np.concatenate(start)
+    free = (begin > lowest) | (normal.vector > 0)
     for family in families:
         for own in family.groups(data):
             basis = np.zeros((end, own.basis.shape[1]))
             basis[where[family.variable]] = own.basis
+            basis[~free] = 0.0
             known = state.groups.get(own.name, own)
             groups.append(replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms))
     for one in (one for one in state.apart if one.block == block and one.variable in where):
@@ -164,8 +174,8 @@ def linear(state: State, block: int) -> Linear:
         basis[where[one.variable], 0] = one.members
         groups.append(Group(one.name, basis, one.wide, fixed=True))
     return Linear(
-        normal, np.concatenate(start), np.concatenate(trust), rows["monitor"], rows["column"],
-        by_ring, where, tuple(groups), kept,
+        normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], by_ring, where,
+        tuple(groups), kept, lowest,
     )  # fmt: skip
 
 
@@ -209,8 +219,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         there: `linear` of that block where it stands.
         bold: factor of every trusted change: small where the last rounds went astray.
     """
-    found = solve(there.normal, there.groups, there.start, bold * there.trust, rounds=EACH)
-    family = {f.variable: f for f in state.families}
+    found = _within(there, bold)
     groups = {group.name: group for group in found.groups}
     learnt = replace(state, groups={**state.groups, **groups})
     weights = weight(state, block)
@@ -225,7 +234,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
 
     best, aim = Moved(learnt, cost(state), np.inf), found.values
     for _ in range(CORRECTED + 1):
-        values = {name: family[name].bounded(aim[at]) for name, at in there.where.items()}
+        values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
         then = learnt.moved({**state.values, **values})
         try:
             after = cost(then)
@@ -247,6 +256,19 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         if further @ there.normal.matrix @ further < CORRECTS * after:
             break  # as straight as the step took it for
     return best
+
+
+def _within(there: Linear, bold: float) -> Posterior:
+    """The step, those that it would make lower than they can be left where they are lowest."""
+    groups, trust = there.groups, bold * there.trust
+    for _ in range(HELD):
+        found = solve(there.normal, groups, there.start, trust, rounds=EACH)
+        low = found.values < there.lowest
+        if not low.any():
+            break
+        rest = ~low[:, None]
+        groups = tuple(replace(group, basis=group.basis * rest) for group in groups)
+    return found
 
 
 def _pull(state: State, block: int, there: Linear, weighted: Array) -> Array:
