@@ -6,8 +6,9 @@ are the rms of held-out correctors, in plane, in the other plane (with a roll of
 that was weighed) and of the RF's orbit, in micrometres: of the lattice and of the result; beside
 them what the experts' own LOCO fit leaves of all the data that it was fitted to (its last model,
 in the file). Then the steps, kept and refused. `--iteration first` takes the model as it was
-before that fit; `--seed N` another split, `--seeds N` that many of them; `--json FILE` writes the
-table, `--pictures FOLDER` a picture a ring: what is left before and after, and the gradients.
+before that fit; `--seed N` another split, `--seeds N` that many of them; `--families` seeks no
+single faults among small errors, which takes most of the time; `--json FILE` writes the table,
+`--pictures FOLDER` a picture a ring: what is left before and after, and the gradients.
 
 Of several seeds each is told as it comes, and at the end of each ring the median and the worst, and
 by how much what was found scatters between them, in units of its stated errors: 0.5 is right where
@@ -31,6 +32,7 @@ import numpy as np
 
 import tmlattice
 from tmlattice import read_measurement
+from tmlattice.diagnosis import response
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.plots.response import plot_gradients, plot_left
@@ -266,9 +268,12 @@ def main():
     parser.add_argument("--iteration", default="last", choices=["first", "last"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--families", action="store_true")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
+    if options.families:
+        response.LARGE = 0
     if not os.environ.get("TMLATTICE_DATA"):
         sys.exit("TMLATTICE_DATA names no folder of measured data")
     data = Path(os.environ["TMLATTICE_DATA"])

@@ -295,7 +295,7 @@ class Predicted:
         """Orbit changes by a corrector's roll, m/rad, [column, monitor, 2]; 0 for the RF."""
         data, names = self.data, self.data.measured.correctors
         turned = [Cause("corrector_roll", name, TURN) for name in names]
-        model = ResponseModel(apply(self.model.ring, turned)).response(names)[:, data.at]
+        model = self.model.changed_to(apply(self.model.ring, turned)).response(names)[:, data.at]
         flat = self.model.response(names)[:, data.at]
         out = np.zeros_like(data.orbits)
         slope = (model - flat * np.cos(TURN)) / np.sin(TURN)
