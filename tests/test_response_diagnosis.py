@@ -184,6 +184,24 @@ def test_readings_that_resemble_nothing_are_named_and_left_out(small_ring, measu
     assert found.steps[-1].heldout_rms_in_plane < 0.3 * found.steps[0].heldout_rms_in_plane
 
 
+def test_a_monitor_that_reads_wrongly_of_the_other_plane_alone_is_set_aside(
+    small_ring, measured, rng
+):
+    """PETRA III's bpm_ol_75 reads of horizontal correctors, beside x, 38 µm in y that nobody else
+    sees."""
+    wrong = np.zeros(measured.response.shape)
+    across = np.array([plane == "y" for plane in measured.planes])
+    wrong[across, 6, 0] = 40 * np.median(measured.noise) * rng.standard_normal(across.sum())
+    states = []
+    for more in (0.0, 1.0):
+        own = replace(measured, response=measured.response + more * wrong)
+        data = response_data(small_ring, own)
+        split = split_columns(data, 0.2, np.random.default_rng(1))
+        states.append(fit_steps(data, split).state)
+    assert states[0].good.all()
+    assert np.flatnonzero(~states[1].good).tolist() == [6]
+
+
 def test_vertical_focusing_of_the_dipoles_edges_is_found(small_ring):
     """LNLS: without it the gap stays at 2.5 µm where the noise is 0.3; with it 0.5."""
     bends = [e.name for e in small_ring.elements if e.kind == "bend"]

@@ -11,8 +11,9 @@ from tmlattice.diagnosis import dense, rounds
 from tmlattice.diagnosis.dense import one_by_one
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.fields import FocusingChange, QuadrupoleGradient, VerticalFocusing
-from tmlattice.diagnosis.rounds import _good_monitors, linear, one_round
+from tmlattice.diagnosis.rounds import linear, one_round
 from tmlattice.diagnosis.state import allow, begin
+from tmlattice.diagnosis.weights import good_monitors
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Normal, normal_equations, solve
@@ -128,7 +129,7 @@ def test_monitors_are_bad_against_the_others_and_not_all_at_once(rng, astray):
     data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
     state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
     expected = np.full(9, True) if astray else np.arange(9) != 4
-    assert (_good_monitors(state) == expected).all()
+    assert (good_monitors(state) == expected).all()
 
 
 def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
@@ -163,7 +164,7 @@ def test_what_is_not_read_in_one_plane_is_not_bad_in_the_other(rng):
     orbits[plane == 1, 4] = np.nan
     data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
     state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
-    assert _good_monitors(state).all()
+    assert good_monitors(state).all()
 
 
 @pytest.mark.parametrize("seed", [0, 3])

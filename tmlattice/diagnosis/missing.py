@@ -21,8 +21,9 @@ from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
-from tmlattice.diagnosis.rounds import linear, weight
+from tmlattice.diagnosis.rounds import linear
 from tmlattice.diagnosis.state import State, rms_of
+from tmlattice.diagnosis.weights import weight
 
 Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array

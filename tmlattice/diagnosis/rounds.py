@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import Family
-from tmlattice.diagnosis.independent import independent
-from tmlattice.diagnosis.odd_readings import shares
 from tmlattice.diagnosis.state import Kept, State
+from tmlattice.diagnosis.weights import counts, look, weight
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Normal, Posterior, normal_equations, solve
 from tmlattice.inference.priors import Group
@@ -25,15 +24,6 @@ Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
-BAD = 5.0
-"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
-FEW = 4
-"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
-TYPICAL = 10.0
-"""The median misfit of all columns counts as so many readings of each one's own."""
-DISPERSION = "quadrupole_gradient"
-"""The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
-times what all others are, and would make the monitors' gains what fits it."""
 ROUNDS = 12
 """Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
 GAIN = 3e-3
@@ -99,28 +89,6 @@ class Linear(NamedTuple):
     groups: tuple[Group, ...]
     kept: Mapping[str, Kept]
     lowest: Array
-
-
-def weight(state: State, block: int) -> Array:
-    """1 / variance of the readings that are fitted, [column, monitor]."""
-    data, split = state.data, state.split
-    use = np.isfinite(data.pick(data.orbits, block)) & state.good
-    use[:-1] &= state.fitted[:-1, None]
-    use[-1] &= split.half[-1]
-    if state.exploring:
-        use[-1] &= ~split.inner_rf
-    variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
-    counts = _counts(state, block)
-    if state.share is not None:
-        counts = counts * state.share[block]
-    return np.where(use, counts / variance, 0.0)
-
-
-def _counts(state: State, block: int) -> Array:
-    """As how many readings each one counts, [column, 1]."""
-    plane = state.data.plane_of(block)
-    own = np.ones(len(plane)) if state.independent is None else state.independent[block, plane]
-    return np.asarray(own[:, None])
 
 
 def linear(state: State, block: int) -> Linear:
@@ -379,65 +347,9 @@ def log_evidence(state: State, good: Flags, shares: Array | None = None) -> floa
         weights = weight(state, block)
         use = weights > 0
         left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-        counts = np.broadcast_to(_counts(state, block), use.shape)[use]
-        total += 0.5 * float(counts @ np.log(weights[use] / counts) - np.sum(weights * left**2))
+        count = np.broadcast_to(counts(state, block), use.shape)[use]
+        total += 0.5 * float(count @ np.log(weights[use] / count) - np.sum(weights * left**2))
         if state.of_block(block):
             there = linear(state, block)
             total += linear_evidence(there)[0]
     return total
-
-
-def look(state: State, block: int) -> State:
-    """What the model lacks now; and the monitors that are bad, their own gains apart."""
-    data = state.data
-    use = weight(state, block) > 0
-    left = np.where(use, data.pick(state.at.left, block), np.nan)
-    if state.share is not None:
-        state = replace(state, share=shares(state, block, left[:-1]))
-    typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
-    noise = float(np.median(data.noise))
-    counts = 1.0 if state.share is None else state.share[block]
-    shared = TYPICAL * typical**2 + np.nansum(counts * left**2, axis=1)
-    squares = shared / (TYPICAL + use.sum(axis=1))
-    if state.allows(DISPERSION):
-        squares[-1] = typical**2  # it is one column among many, and counts like any
-    lacking = state.lacking.copy()
-    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
-    good = state.good if block else _good_monitors(state)
-    return _independent(replace(state, lacking=lacking, good=good), block, left)
-
-
-def _independent(state: State, block: int, left: Array) -> State:
-    """With the share of independent readings, where that is looked at: not before there are
-    gradients, for all that they make is waves."""
-    if state.independent is None or not state.allows(DISPERSION):
-        return state
-    own, shares, noise = state.independent.copy(), state.share, state.data.noise_of(block)
-    read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
-    for p in (0, 1):
-        rows = state.data.plane_of(block)[:-1] == p
-        own[block, p] = independent(read[rows], noise[:-1][rows])
-    return replace(state, independent=own)
-
-
-def _good_monitors(state: State) -> Flags:
-    data = state.data
-    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
-    ratio = np.zeros(data.shape[1])
-    for p in (0, 1):
-        rows = state.fitted & (data.plane == p)
-        if rows.sum() < FEW:
-            continue
-        u, d = read[rows], orbits[rows]
-        seen = np.isfinite(d)
-        d = np.where(seen, d, 0)
-        u = np.where(seen, u, 0)
-        gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
-        count = np.maximum(seen.sum(axis=0), 1)
-        rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
-        rms[gain < 0.2] = np.inf  # reversed, until gains come in
-        read_at_all = seen.any(axis=0)  # what was never read says nothing of the other plane
-        typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
-        if np.isfinite(typical):  # else the fit is astray, not half of the monitors
-            ratio = np.maximum(ratio, np.where(read_at_all, rms / typical, 0.0))
-    return np.asarray(ratio <= BAD)

@@ -8,8 +8,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.rounds import Linear, weight
+from tmlattice.diagnosis.rounds import Linear
 from tmlattice.diagnosis.state import Apart, State
+from tmlattice.diagnosis.weights import weight
 from tmlattice.inference.clusters import Found, Rows, widened
 from tmlattice.inference.normal import Posterior
 

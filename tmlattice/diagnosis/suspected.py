@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.fields import QuadrupoleGradient, SkewGradient
-from tmlattice.diagnosis.rounds import Linear, linear, weight
+from tmlattice.diagnosis.rounds import Linear, linear
 from tmlattice.diagnosis.small_errors import sizes_in
 from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.weights import weight
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group

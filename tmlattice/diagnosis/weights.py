@@ -1,0 +1,127 @@
+"""For how much each reading of a dense fit counts: what the model lacks, and monitors that are bad.
+
+>>> state = look(state, 0)
+>>> weight(state, 0)                               # 1 / variance, [column, monitor]
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.independent import independent
+from tmlattice.diagnosis.odd_readings import shares
+from tmlattice.diagnosis.state import State
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+BAD = 5.0
+"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+FEW = 4
+"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+TYPICAL = 10.0
+"""The median misfit of all columns counts as so many readings of each one's own."""
+DISPERSION = "quadrupole_gradient"
+"""The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
+times what all others are, and would make the monitors' gains what fits it."""
+COUPLING = "skew_gradient"
+"""The family that makes the other plane's readings what they are."""
+
+
+def weight(state: State, block: int) -> Array:
+    """1 / variance of the readings that are fitted, [column, monitor]."""
+    data, split = state.data, state.split
+    use = np.isfinite(data.pick(data.orbits, block)) & state.good
+    use[:-1] &= state.fitted[:-1, None]
+    use[-1] &= split.half[-1]
+    if state.exploring:
+        use[-1] &= ~split.inner_rf
+    variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
+    count = counts(state, block)
+    if state.share is not None:
+        count = count * state.share[block]
+    return np.where(use, count / variance, 0.0)
+
+
+def counts(state: State, block: int) -> Array:
+    """As how many readings each one counts, [column, 1]."""
+    plane = state.data.plane_of(block)
+    own = np.ones(len(plane)) if state.independent is None else state.independent[block, plane]
+    return np.asarray(own[:, None])
+
+
+def look(state: State, block: int) -> State:
+    """What the model lacks now; and the monitors that are bad, their own gains apart."""
+    data = state.data
+    use = weight(state, block) > 0
+    left = np.where(use, data.pick(state.at.left, block), np.nan)
+    if state.share is not None:
+        state = replace(state, share=shares(state, block, left[:-1]))
+    typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
+    noise = float(np.median(data.noise))
+    share = 1.0 if state.share is None else state.share[block]
+    shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
+    squares = shared / (TYPICAL + use.sum(axis=1))
+    if state.allows(DISPERSION):
+        squares[-1] = typical**2  # it is one column among many, and counts like any
+    lacking = state.lacking.copy()
+    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
+    good = state.good & _good_across(state) if block else good_monitors(state)
+    return _independent(replace(state, lacking=lacking, good=good), block, left)
+
+
+def _independent(state: State, block: int, left: Array) -> State:
+    """With the share of independent readings, where that is looked at: not before there are
+    gradients, for all that they make is waves."""
+    if state.independent is None or not state.allows(DISPERSION):
+        return state
+    own, shares, noise = state.independent.copy(), state.share, state.data.noise_of(block)
+    read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
+    for p in (0, 1):
+        rows = state.data.plane_of(block)[:-1] == p
+        own[block, p] = independent(read[rows], noise[:-1][rows])
+    return replace(state, independent=own)
+
+
+def good_monitors(state: State) -> Flags:
+    """Those that read, in the plane that is kicked, what the others make likely, [monitor]."""
+    data = state.data
+    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
+    ratio = np.zeros(data.shape[1])
+    for p in (0, 1):
+        rows = state.fitted & (data.plane == p)
+        if rows.sum() < FEW:
+            continue
+        u, d = read[rows], orbits[rows]
+        seen = np.isfinite(d)
+        d = np.where(seen, d, 0)
+        u = np.where(seen, u, 0)
+        gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
+        count = np.maximum(seen.sum(axis=0), 1)
+        rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
+        rms[gain < 0.2] = np.inf  # reversed, until gains come in
+        read_at_all = seen.any(axis=0)  # what was never read says nothing of the other plane
+        typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
+        if np.isfinite(typical):  # else the fit is astray, not half of the monitors
+            ratio = np.maximum(ratio, np.where(read_at_all, rms / typical, 0.0))
+    return np.asarray(ratio <= BAD)
+
+
+def _good_across(state: State) -> Flags:
+    """Those that read in the other plane what is usual, once skew gradients and rolls say what that
+    is."""
+    good = np.ones(state.data.shape[1], dtype=bool)
+    if not state.allows(COUPLING):
+        return good
+    left = state.data.pick(state.at.left, 1)
+    for p in (0, 1):
+        rows = state.fitted & (state.data.plane == p)
+        if rows.sum() < FEW:
+            continue
+        squares, count = np.nansum(left[rows] ** 2, axis=0), np.isfinite(left[rows]).sum(axis=0)
+        rms = np.sqrt(squares / np.maximum(count, 1))
+        usual = rms[(count > 0) & state.good]
+        if len(usual):
+            good &= rms <= BAD * np.median(usual)
+    return good
