@@ -440,7 +440,8 @@ def test_a_wiggler_that_focuses_is_fitted_and_has_its_amount(small_ring):
         engine="ocelot", progress=False, seed=4,
     ).measured  # fmt: skip
     rows = weigh(fitted(small_ring, measured))
-    assert next(r for r in rows if r.effect == "none").heldout_rms_in_plane < 1.3e-9
+    # the noise, and what only a straight that defocuses would make of the wiggler's other plane
+    assert next(r for r in rows if r.effect == "none").heldout_rms_in_plane < 2e-9
     (own,) = (row for row in rows if row.effect == "gradients of damping wigglers")
     assert own.amount == pytest.approx(2e-4, abs=3 * own.amount_sigma)
     assert own.amount > 5 * own.amount_sigma
@@ -525,7 +526,7 @@ def test_command(tmp_path, measured, result):
 def test_predict_reproduces_the_held_out_figure_with_an_energy_spread(tmp_path, small_ring):
     spread = Cause("energy_spread", None, 2.5e-3)
     measured = simulate_response(
-        small_ring, [*CAUSES, spread], kick=1e-5, noise=2e-9, engine="ocelot", progress=False,
+        small_ring, [*CAUSES, spread], kick=1e-5, noise=2e-8, engine="ocelot", progress=False,
         seed=3,
     ).measured  # fmt: skip
     write_measurement(tmp_path / "m", measured)
