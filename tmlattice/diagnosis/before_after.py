@@ -62,6 +62,8 @@ STRAY = 3e-5
 """1/m: as well a gradient beside the quadrupoles comes back: the orbit in a sextupole moves."""
 USUAL = 1e-2
 """Prior rms of a change: relative, or of integrated gradients in 1/m."""
+ANY = 6.0
+"""rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets from which a change of all of them is told though none stands out."""
 ALONE = 2.0
@@ -127,7 +129,9 @@ def diagnose_change(
         kept = [name for name in before.monitors if name not in bad]
         said.append(f"monitors left out, bad in the reference: {', '.join(bad)}")
         first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
-        errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
+        errors = fitted.at.errors
+        dispersion = np.broadcast_to(errors.dispersion, (len(fitted.good), 2))[fitted.good]
+        errors = replace(errors, monitors=errors.monitors[fitted.good], dispersion=dispersion)
     else:
         errors = fitted.at.errors
     there, change = response_change(first, errors, second)
@@ -220,7 +224,7 @@ def _fit_change(
     data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
 ) -> DenseFit:
     """All that may have changed, with the noise that the two measurements have."""
-    design = replace(begin(data, split), exploring=False)
+    design = replace(begin(data, split), exploring=False, guessed=ANY)
     before = score(design, split.held)
     steps = [Step.scored("reference", 0, before)]
     state = design

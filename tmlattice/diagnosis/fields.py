@@ -4,6 +4,7 @@ A magnet that stands in pieces is one number of a family.
 """
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -186,7 +187,10 @@ class VerticalFocusing(_Thin):
         return f"{self.effect} in straights"
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        devices = [*magnets(ring, ("wiggler",)), *((e,) for e in straights(ring))]
+        return self._devices(ring, straights(ring))
+
+    def _devices(self, ring: Ring, ways: Sequence[Element]) -> list[tuple[Element, ...]]:
+        devices = [*magnets(ring, ("wiggler",)), *((e,) for e in ways)]
         return sorted(devices, key=lambda own: own[0].s)
 
     def groups(self, data: ResponseData) -> list[Group]:
@@ -201,7 +205,11 @@ class VerticalFocusing(_Thin):
 
 
 class FocusingChange(VerticalFocusing):
-    """A device that was opened focuses less."""
+    """A device that was opened focuses less, and one that the lattice has as bends has no other
+    number here."""
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return self._devices(ring, straights(ring, beside=True))
 
     def lowest(self, data: ResponseData) -> Array | float:
         """Of any sign."""

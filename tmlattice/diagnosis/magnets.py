@@ -45,12 +45,16 @@ def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[t
     return list(found.values())
 
 
-def straights(ring: Ring) -> list[Element]:
+def straights(ring: Ring, beside: bool = False) -> list[Element]:
     """Of every long way without a magnet the marker that is nearest to its middle, or the longest
     drift where no marker stands.
 
     A way beside a wiggler that the lattice has as bends to and fro has none: the wiggler's own
     focusing is a number already, and two beside it would pull against it.
+
+    Args:
+        ring: the ring.
+        beside: ways beside such a wiggler too.
     """
     found, ways = list[Element](), list[Element]()
     within, bends, begin = list[Element](), list[float](), 0.0
@@ -65,11 +69,11 @@ def straights(ring: Ring) -> list[Element]:
         if element.kind == "bend":
             bends.append(element.angle)
             continue
-        found += _outside(ways, bends)
+        found += ways if beside else _outside(ways, bends)
         ways, bends = [], []
     if ring.length - begin > STRAIGHT:
         ways += _middle(within, (begin + ring.length) / 2)
-    return found + _outside(ways, bends)
+    return found + (ways if beside else _outside(ways, bends))
 
 
 def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:

@@ -136,7 +136,10 @@ def linear(state: State, block: int) -> Linear:
             basis[where[family.variable]] = own.basis
             basis[~free] = 0.0
             known = state.groups.get(own.name, own)
-            groups.append(replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms))
+            groups.append(
+                replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms,
+                        guessed=state.guessed)
+            )  # fmt: skip
     for one in (one for one in state.apart if one.block == block and one.variable in where):
         basis = np.zeros((end, 1))
         basis[where[one.variable], 0] = one.members

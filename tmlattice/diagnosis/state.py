@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import Family
-from tmlattice.inference.priors import Group
+from tmlattice.inference.priors import GUESSED, Group
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
 
 Array = NDArray[np.float64]
@@ -79,6 +79,7 @@ class State:
         kept: rows of the ring's variables, that stand until the ring has moved.
         share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
         apart: numbers that are wrong alone.
+        guessed: rms of the logarithm of a family's size about its first guess.
         independent: share of the readings that tell something of their own, see `independent`,
             [block, plane that is read]; None: all are taken to.
     """
@@ -96,6 +97,7 @@ class State:
     share: Array | None = None
     apart: tuple[Apart, ...] = ()
     independent: Array | None = None
+    guessed: float = GUESSED
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

@@ -118,6 +118,7 @@ class Group:
         most: largest prior rms that physics allows one parameter.
         each: prior rms of every parameter, as last found; None: `rms`.
         first: rms that was guessed; None: `rms`.
+        guessed: rms of the logarithm of the scale about that.
     """
 
     name: str
@@ -128,6 +129,7 @@ class Group:
     most: float = np.inf
     each: Array | None = None
     first: float | None = None
+    guessed: float = GUESSED
 
     @property
     def guess(self) -> float:
@@ -160,8 +162,8 @@ class Group:
         if not self.fixed:
             known = float(np.sum(1 - left))
             shown = float(np.sum(squares / now**2))
-            own = float(np.log(rms / self.guess)) / GUESSED**2
-            step = (shown - known - own) / (2 * known + GUESSED**-2)
+            own = float(np.log(rms / self.guess)) / self.guessed**2
+            step = (shown - known - own) / (2 * known + self.guessed**-2)
             rms = rms * float(np.exp(np.clip(step, -BOLD, BOLD)))
             rms = min(max(rms, SMALLEST), self.most)
         each = rms / np.sqrt(self.share(squares + left * now**2, rms))
