@@ -93,15 +93,9 @@ def good_monitors(state: State) -> Flags:
         rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
-        u, d = read[rows], orbits[rows]
-        seen = np.isfinite(d)
-        d = np.where(seen, d, 0)
-        u = np.where(seen, u, 0)
-        gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
-        count = np.maximum(seen.sum(axis=0), 1)
-        rms = np.sqrt(((d - gain * u) ** 2).sum(axis=0) / count)
+        rms, gain, count = _beside_own_gain(read[rows], orbits[rows])
         rms[gain < 0.2] = np.inf  # reversed, until gains come in
-        read_at_all = seen.any(axis=0)  # what was never read says nothing of the other plane
+        read_at_all = count > 0  # what was never read says nothing of the other plane
         typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
         if np.isfinite(typical):  # else the fit is astray, not half of the monitors
             ratio = np.maximum(ratio, np.where(read_at_all, rms / typical, 0.0))
@@ -109,19 +103,33 @@ def good_monitors(state: State) -> Flags:
 
 
 def _good_across(state: State) -> Flags:
-    """Those that read in the other plane what is usual, once skew gradients and rolls say what that
-    is."""
-    good = np.ones(state.data.shape[1], dtype=bool)
+    """Those that read in the other plane what is usual, their own gains apart, once skew gradients
+    and rolls say what that is."""
+    data = state.data
+    good = np.ones(data.shape[1], dtype=bool)
     if not state.allows(COUPLING):
         return good
-    left = state.data.pick(state.at.left, 1)
+    read, orbits = data.pick(state.at.read, 1), data.pick(data.orbits, 1)
     for p in (0, 1):
-        rows = state.fitted & (state.data.plane == p)
+        rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
-        squares, count = np.nansum(left[rows] ** 2, axis=0), np.isfinite(left[rows]).sum(axis=0)
-        rms = np.sqrt(squares / np.maximum(count, 1))
+        rms, _, count = _beside_own_gain(read[rows], orbits[rows])
         usual = rms[(count > 0) & state.good]
         if len(usual):
             good &= rms <= BAD * np.median(usual)
     return good
+
+
+def _beside_own_gain(read: Array, orbits: Array) -> tuple[Array, Array, Array]:
+    """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
+    and of how many readings, [monitor].
+
+    Args:
+        read, orbits: by the model and measured, m, [column, monitor].
+    """
+    seen = np.isfinite(orbits)
+    u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
+    gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
+    count = seen.sum(axis=0)
+    return np.sqrt(((d - gain * u) ** 2).sum(axis=0) / np.maximum(count, 1)), gain, count
