@@ -129,9 +129,7 @@ def diagnose_change(
         kept = [name for name in before.monitors if name not in bad]
         said.append(f"monitors left out, bad in the reference: {', '.join(bad)}")
         first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
-        errors = fitted.at.errors
-        dispersion = np.broadcast_to(errors.dispersion, (len(fitted.good), 2))[fitted.good]
-        errors = replace(errors, monitors=errors.monitors[fitted.good], dispersion=dispersion)
+        errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     else:
         errors = fitted.at.errors
     there, change = response_change(first, errors, second)

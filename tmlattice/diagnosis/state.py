@@ -79,9 +79,9 @@ class State:
         kept: rows of the ring's variables, that stand until the ring has moved.
         share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
         apart: numbers that are wrong alone.
-        guessed: rms of the logarithm of a family's size about its first guess.
         independent: share of the readings that tell something of their own, see `independent`,
             [block, plane that is read]; None: all are taken to.
+        guessed: rms of the logarithm of a family's size about its first guess.
     """
 
     data: ResponseData
