@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from tmlattice.diagnosis.dense import fit_steps
-from tmlattice.diagnosis.dispersion import HorizontalKicks, VerticalKicks, dispersion_by_kicks
+from tmlattice.diagnosis.dispersion import (
+    HorizontalKicks,
+    VerticalKicks,
+    dispersion_by_kicks,
+    patterns_of_kicks,
+)
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.hypotheses import HYPOTHESES
@@ -46,17 +51,23 @@ def plain(small_ring):
     return small_ring.with_elements({i: small_ring.elements[i].changed(k2=0.0) for i in places})
 
 
-@pytest.fixture(scope="module")
-def beside(plain):
+def displaced(plain, plane):
     """What quadrupoles that are displaced by 0.2 mm rms add to the RF's orbit of AT, m."""
     rng = np.random.default_rng(7)
     quadrupoles = [e.name for e in plain.elements if e.kind == "quadrupole"]
-    causes = [Cause("quadrupole_offset_x", name, 2e-4 * rng.standard_normal())
+    causes = [Cause(f"quadrupole_offset_{'xy'[plane]}", name, 2e-4 * rng.standard_normal())
               for name in quadrupoles]  # fmt: skip
     with_them, without = (
-        simulated(plain, own, correctors=["v3"], noise=0.0).rf.orbit[:, 0] for own in (causes, [])
+        simulated(plain, own, correctors=["v3"], noise=0.0).rf.orbit[:, plane]
+        for own in (causes, [])
     )
     return with_them - without
+
+
+@pytest.fixture(scope="module")
+def beside(plain):
+    """In x."""
+    return displaced(plain, 0)
 
 
 def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, beside):
@@ -70,6 +81,18 @@ def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, bes
     assert np.std(left) < 0.02 * np.std(beside)  # to first order in the energy, kicks at the ends
     # gradients of 0.36 1/m and an orbit of 1.9 mm
     assert 1e-4 < np.sqrt(np.mean(amounts**2)) < 2e-3
+
+
+def test_vertical_patterns_make_what_is_displaced_in_y_in_at(plain):
+    state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
+    across, along = (patterns_of_kicks(state.at, plane) for plane in (1, 0))
+    more = displaced(plain, 1)
+    left = [
+        np.std(more - np.linalg.lstsq(own.T, more, rcond=None)[0] @ own)
+        for own in (across, along[: len(across)])
+    ]
+    assert np.std(more) > 1e-7
+    assert left[0] < 0.02 * np.std(more) < 0.3 * left[1]  # the other plane's leave more
 
 
 @pytest.fixture(scope="module")
