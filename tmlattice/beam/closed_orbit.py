@@ -198,10 +198,7 @@ class ResponseModel:
                 )
             planes.append(CORRECTORS[element.kind])
         layer = self.layers.layer_of[place] if len(place) else np.empty(0, dtype=np.int64)
-        n = self.dimension
-        kick, slope = np.empty((len(place), n)), np.empty((len(place), n, n))
-        for row, (i, k) in enumerate(zip(place, layer, strict=True)):
-            kick[row], slope[row] = self._kick(int(i), int(k))
+        kick, slope = self._kicks(place, layer)
         pulled = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
         return Columns(
             names=tuple(ring.elements[i].name for i in place),
@@ -285,13 +282,22 @@ class ResponseModel:
         up, down = (self.at_frequency(self.frequency + side * step / 2) for side in (1, -1))
         return up.readings - down.readings
 
-    def _kick(self, place: int, layer: int) -> tuple[Array, Array]:
-        """The corrector's kick at its layer's exit, and how it depends on the state there."""
-        slope = self._map_slope(self.ring.elements[place])
-        w0, w1, w2 = slope.after(self.layers.way(layer)).reduced()
+    def _kicks(self, place: Indices, layer: Indices) -> tuple[Array, Array]:
+        """Correctors' kicks at their layers' exits, [column, n], and how they depend on the state
+        at the entrances, [column, n, n]; the maps are the same on every orbit."""
+        memory, key = self.layers.memory, ("kicks", place.tobytes())
+        if key not in memory:
+            n = self.dimension
+            W0, W1 = np.zeros((len(place), n)), np.zeros((len(place), n, n))
+            W2 = np.zeros((len(place), n, n * (n + 1) // 2))
+            for row, (i, k) in enumerate(zip(place, layer, strict=True)):
+                slope = self._map_slope(self.ring.elements[i])
+                W0[row], W1[row], W2[row] = slope.after(self.layers.way(int(k))).reduced()
+            memory[key] = W0, W1, second_derivatives(W2)
+        W0, W1, curved = memory[key]
         x = self.path[layer]
-        bent = second_derivatives(w2[None])[0] @ x
-        return w0 + (w1 + bent / 2) @ x, w1 + bent
+        bent = np.einsum("caij,cj->cai", curved, x)
+        return W0 + np.einsum("cai,ci->ca", W1 + bent / 2, x), W1 + bent
 
     def _map_slope(self, corrector: Element) -> Quadratic:
         """d map / d kick; equal correctors share it."""

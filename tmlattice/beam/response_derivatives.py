@@ -29,6 +29,7 @@ from tmlattice.maps.quadratic import Quadratic, difference
 from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Hypothesis = tuple[str, str | None]
 
 STILL = 1e-12
@@ -113,6 +114,30 @@ class ResponseSlopes:
         behind = np.hstack([self.pulled, change.behind]) @ seen
         there = np.arange(shape[1]) >= self.first[:, None]
         return np.asarray(out.reshape(shape) + there[:, :, None] * behind.reshape(shape))
+
+    def picked(
+        self, hypotheses: Sequence[Hypothesis], at: Indices, plane: Indices
+    ) -> Iterator[Array]:
+        """The derivative by each hypothesis, as `whole`, of some readings alone, [column, monitor].
+
+        Args:
+            hypotheses: see `factors`.
+            at: which monitors.
+            plane: that each column is read in, the RF's last, [column].
+        """
+        parts = []
+        for p in (0, 1):
+            rows = np.flatnonzero(plane == p)
+            there = (at >= self.first[rows, None]).astype(float)
+            parts.append((p, rows, there, self.readings[at, p]))
+        out = np.empty((len(plane), len(at)))
+        for change in self.factors(hypotheses):
+            for p, rows, there, readings in parts:
+                seen = np.hstack([change.seen[at, p], readings]).T
+                behind = np.hstack([self.pulled[rows], change.behind[rows]]) @ seen
+                out[rows] = np.hstack([self.start[rows], change.before[rows]]) @ seen
+                out[rows] += there * behind
+            yield out
 
     def factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
         """The derivative by each hypothesis.

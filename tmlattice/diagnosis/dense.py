@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis import torn_steps
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.judges import Chi2, Score, against, inner, lost, score
@@ -111,6 +112,7 @@ class DenseFit:
         steps: those kept; the first is the design's, the last the result's.
         refused: those that did not help, or spoilt the RF's response.
         heldout: what held-out correctors say of the design and of the result.
+        said: sentences of correctors that were left out.
     """
 
     design: State
@@ -118,6 +120,7 @@ class DenseFit:
     steps: tuple[Step, ...]
     refused: tuple[Step, ...]
     heldout: tuple[Score, Score]
+    said: tuple[str, ...] = ()
 
 
 def fit_steps(
@@ -140,12 +143,25 @@ def fit_steps(
         most: steps that are kept at most.
         progress: called with each step's name.
     """
-    design = begin(data, split)
-    before = score(design, split.held)
-    steps: dict[Trial, Step] = {}
+    design = state = begin(data, split)
+    stages: dict[Trial, State] = {}
     for trial, state in one_by_one(design, trials, progress):
-        count = sum(family.count(data) for family in trial.families)
-        steps[trial] = Step.scored(_title(trial), count, score(state, split.held))
+        stages[trial] = replace(state, kept={})
+    wrong = _torn(state)
+    if wrong.any():
+        data = torn_steps.unread(data, wrong)
+        design, state = (torn_steps.beside(own, data, wrong) for own in (design, state))
+        stages = {trial: torn_steps.beside(own, data, wrong) for trial, own in stages.items()}
+        split = state.split
+    before = score(design, split.held)
+    steps = {
+        trial: Step.scored(
+            _title(trial), sum(family.count(data) for family in trial.families),
+            score(own, split.held),
+        )
+        for trial, own in stages.items()
+    }  # fmt: skip
+    stages.clear()
     progress("all together")
     state = settle(bend(jump(replace(state, independent=np.ones((2, 2))))))
     log.info("independent readings: %s", state.independent)
@@ -165,7 +181,7 @@ def fit_steps(
     if spoilt > SPOILT:  # all together spoil what they should mend
         refused += [replace(step, kept=False) for step in steps.values()]
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
-                        (before, before))  # fmt: skip
+                        (before, before), torn_steps.said(data, wrong))  # fmt: skip
     progress("result")
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
     state = bend(jump(replace(state, exploring=False), beyond=1.0))
@@ -173,7 +189,16 @@ def fit_steps(
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
-    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after))
+    left_out = torn_steps.said(data, wrong)
+    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), left_out)
+
+
+def _torn(state: State) -> Flags:
+    """Columns to be left out, where enough are left to judge."""
+    wrong = torn_steps.torn(state)
+    split = state.split
+    enough = all((own & ~wrong).any() for own in (split.held, split.inner, state.fitted))
+    return wrong if enough else np.zeros_like(wrong)
 
 
 def one_by_one(

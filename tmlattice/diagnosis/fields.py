@@ -44,11 +44,11 @@ class _Magnets(Family):
     def rows(self, at: Predicted, values: Array) -> Array:
         shares = self.shares(at.data)
         pairs = [(self.effect, place) for pieces in shares for place in pieces]
-        gain, slopes = at.gain(self.block), at.slopes(pairs)
+        gain, slopes = at.gain(self.block), at.slopes_of(self.block, pairs)
         out = np.zeros((len(shares), *at.data.shape))
         for i, pieces in enumerate(shares):
             for share in pieces.values():
-                out[i] += share * at.data.pick(next(slopes), self.block)
+                out[i] += share * next(slopes)
             out[i] *= gain
         return out
 

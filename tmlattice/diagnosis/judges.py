@@ -91,6 +91,8 @@ def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
     for c in np.flatnonzero(judges):
         seen = np.isfinite(orbits[c]) & state.good
         near, far = seen & half[c], seen & ~half[c]
+        if not (near.any() and far.any()):
+            continue
         # all alike: what the model lacks is not the readings' noise
         kick, miss = amplitudes(straight[c][:, None], orbits[c], near, far)
         inside.append(miss)

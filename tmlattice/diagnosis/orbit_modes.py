@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 LEAST = 0.02
 """Patterns that focus by less than this share of the strongest are left to the quadrupoles."""
+TOGETHER = 32
+"""Bends whose rows are held at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +54,13 @@ class _Orbit(Family):
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """Of all bends together."""
-        out = np.zeros((len(self.patterns), *at.data.shape))
-        for share, slope in zip(
-            self.patterns.T, at.slopes([(self.effect, place) for place in self.places]), strict=True
-        ):
-            out += share[:, None, None] * at.data.pick(slope, self.block)
-        return np.asarray(out * at.gain(self.block))
+        out = np.zeros((len(self.patterns), at.data.orbits[..., 0].size))
+        for start in range(0, len(self.places), TOGETHER):
+            places = self.places[start : start + TOGETHER]
+            pairs = [(self.effect, place) for place in places]
+            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, pairs)]
+            out += self.patterns[:, start : start + TOGETHER] @ np.stack(slopes)
+        return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """As kicks of the bends."""

@@ -48,8 +48,9 @@ class _Others(Family):
     def rows(self, at: Predicted, values: Array) -> Array:
         """As the response has them."""
         out = np.empty((len(self.causes), *at.data.shape))
-        for row, slope, unit in zip(out, at.slopes(self.causes), self.units, strict=True):
-            row[:] = unit * at.data.pick(slope, self.block) * at.gain(self.block)
+        gain, slopes = at.gain(self.block), at.slopes_of(self.block, self.causes)
+        for row, slope, unit in zip(out, slopes, self.units, strict=True):
+            row[:] = unit * slope * gain
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
@@ -100,5 +101,4 @@ def with_number(state: State, cause: Hypothesis, block: int) -> State:
         apart=apart,
         families=(*families, kind((*have, cause))),
         values={**state.values, kind.variable: values},
-        kept={},
     )

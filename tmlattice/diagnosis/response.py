@@ -179,7 +179,7 @@ def _families(
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))
         elif fit is not None:
-            return fit, measured, said, swaps
+            return fit, measured, [*said, *fit.said], swaps
         fit = fit_steps(data, split, trials, most, progress)
 
 

@@ -5,7 +5,7 @@
 """
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -56,11 +56,20 @@ def _rows(state: State, family: Family) -> Kept:
     ring, gain = _ring(state), state.at.gain(family.block)
     scale = 1 + state.at.errors.calibration
     kept = state.kept.get(family.variable)
-    if kept is not None and kept.at.keys() == ring.keys():
-        moved = np.concatenate([ring[name] - kept.at[name] for name in ring])
+    if kept is not None and len(kept.rows) == len(ring[family.variable]):
+        moved = np.concatenate([_change(kept.at, ring, name) for name in {**kept.at, **ring}])
         if np.sqrt(np.mean(moved**2)) < STILL and (kept.scale != 0).all():
             return kept
     return Kept(family.rows(state.at, state.values[family.variable]), gain, scale, ring)
+
+
+def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) -> Array:
+    """Of one variable's numbers, of which either may have more: what is not there is zero."""
+    old, new = (one.get(name, np.zeros(0)) for one in (before, now))
+    change = np.zeros(max(len(old), len(new)))
+    change[: len(new)] += new
+    change[: len(old)] -= old
+    return change
 
 
 def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
@@ -255,19 +264,43 @@ def _pull(state: State, block: int, there: Linear, weighted: Array) -> Array:
 def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
     """Values that another vector leads to, from the same start with the same priors and trust."""
     whole = vector + there.normal.matrix @ there.start + there.start / trust**2
-    return np.asarray(found.spread @ (found.covariance @ (found.spread.T @ whole)))
+    return found.solved(whole)
 
 
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
     """What the priors of one variable, which add up, ask for its values."""
     if not groups:  # of numbers that a ring has none of
         return 0.0
-    spread = np.concatenate([group.basis[rows] * group.scale for group in groups], axis=1)
-    return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
+    bases = [group.basis[rows] for group in groups]
+    own = next((i for i, basis in enumerate(bases) if _of_each(basis)), None)
+    spreads = [basis * group.scale for basis, group in zip(bases, groups, strict=True)]
+    if own is None:
+        spread = np.concatenate(spreads, axis=1)
+        return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
+    # a few that are shared, each number's own takes the rest
+    each = np.diagonal(spreads.pop(own))
+    free = each > 0  # one that is held is not asked for
+    shared = np.concatenate([np.zeros((free.sum(), 0)), *(s[free] for s in spreads)], axis=1)
+    rest = values[free] / each[free]
+    shared /= each[free, None]
+    asked = np.concatenate([rest, np.zeros(shared.shape[1])])
+    both = np.concatenate([shared, np.eye(shared.shape[1])])
+    amounts = np.linalg.lstsq(both, asked, rcond=None)[0]
+    return float(np.sum((rest - shared @ amounts) ** 2) + amounts @ amounts)
+
+
+def _of_each(basis: Array) -> bool:
+    """Whether a group has one parameter for each number."""
+    rows, columns = basis.shape
+    return rows == columns and bool(np.count_nonzero(basis) == np.count_nonzero(basis.diagonal()))
 
 
 def settle(
-    state: State, blocks: Sequence[int] = (1, 0), most: int = ROUNDS, gain: float = GAIN
+    state: State,
+    blocks: Sequence[int] = (1, 0),
+    most: int = ROUNDS,
+    gain: float = GAIN,
+    possible: Callable[[State], bool] = lambda state: True,
 ) -> State:
     """Rounds until none gains any more, none of which may make things worse.
 
@@ -279,6 +312,7 @@ def settle(
         blocks: that move, in this order.
         most: rounds of each block.
         gain: share of the cost that a round has to gain for another one.
+        possible: whether a state is one that is sought; rounds end at one that is not.
     """
     bold = dict.fromkeys(blocks, 1.0)
     for turn in range(most):
@@ -304,7 +338,7 @@ def settle(
         log.info(
             "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
         )
-        if gained < gain:
+        if gained < gain or not possible(state):
             break
     return state
 

@@ -374,14 +374,25 @@ def _without(state: State, one: Apart) -> State:
 
 def _settled(state: State) -> State | None:
     """Everything, from as far as the linear model goes, or from where it is; None where no beam is
-    stored. Sizes are learnt anew: one that fell to nothing beside a fault would not grow."""
+    stored, or an amount has gone beyond what a fault can have. Sizes are learnt anew: one that fell
+    to nothing beside a fault would not grow."""
     state = replace(state, groups={})
     for begin in (_stepped, replace):
         try:
-            return settle(bend(settle(begin(state), gain=ROUGH)))
+            rough = settle(begin(state), gain=ROUGH, possible=_possible)
+            return settle(bend(rough)) if _possible(rough) else None
         except (TmlatticeError, np.linalg.LinAlgError):
             continue
     return None
+
+
+def _possible(state: State) -> bool:
+    """Whether what is wrong alone, with what its family has of it, is no more than a fault."""
+    amounts = [
+        float(state.values[one.variable] @ one.members / (one.members @ one.members))
+        for one in state.apart
+    ]
+    return all(abs(a) < BEYOND * one.wide for a, one in zip(amounts, state.apart, strict=True))
 
 
 def _stepped(state: State) -> State:

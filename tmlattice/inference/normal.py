@@ -9,12 +9,14 @@ Parameters have priors in groups, see `inference.priors.Group`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.blas import dsyrk
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dpotri, dtrtri
+from scipy.sparse import csr_array
 
 from tmlattice.inference.priors import Group
 
@@ -93,19 +95,44 @@ class Posterior:
 
     Attributes:
         values: of the base parameters, [parameter].
-        sigma: their posterior errors.
-        covariance: of the groups' parameters, in units of their priors, [p, p].
-        spread: of the base parameters: basis times prior rms, [parameter, p].
         groups: with the scales that they have learnt.
-        occam: log of the share of the priors that the data leave, 0 where they say nothing.
+        basis: of all groups, [parameter, p].
+        prior: rms of their parameters that the values are solved with, [p].
+        factor: lower triangle L of the normal equations in these units, L L^T, [p, p].
     """
 
     values: Array
-    sigma: Array
-    covariance: Array
-    spread: Array
     groups: tuple[Group, ...]
-    occam: float
+    basis: csr_array
+    prior: Array
+    factor: Array
+
+    @property
+    def occam(self) -> float:
+        """Log of the share of the priors that the data leave, 0 where they say nothing."""
+        return -float(np.log(np.diag(self.factor)).sum())
+
+    @cached_property
+    def spread(self) -> Array:
+        """Of the base parameters: basis times prior rms, [parameter, p]."""
+        return np.asarray(self.basis.toarray() * self.prior)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of the groups' parameters, in units of their priors, [p, p]."""
+        lower = dpotri(self.factor, lower=1)[0]
+        return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+
+    @property
+    def sigma(self) -> Array:
+        """Posterior errors of the base parameters, [parameter]."""
+        square = ((self.spread @ self.covariance) * self.spread).sum(axis=1)
+        return np.asarray(np.sqrt(np.maximum(square, 0)))
+
+    def solved(self, vector: Array) -> Array:
+        """Values with another right side of the normal equations, [parameter]."""
+        right = self.prior * (self.basis.T @ vector)
+        return np.asarray(self.basis @ (self.prior * cho_solve((self.factor, True), right)))
 
 
 def solve(
@@ -127,25 +154,23 @@ def solve(
     """
     known = np.zeros(len(normal.vector)) if start is None else start
     groups = tuple(groups)
-    basis = np.concatenate([g.basis for g in groups], axis=1)
+    basis = csr_array(np.concatenate([g.basis for g in groups], axis=1))  # a few numbers a column
     edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
     base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
-    A = basis.T @ base @ basis
+    A = basis.T @ (basis.T @ base).T
     b = basis.T @ (normal.vector + base @ known)
     for turn in range(max(rounds, 1)):
         prior = np.concatenate([g.scale for g in groups])
         # in units of the priors, so that the matrix is well scaled
-        scaled = A * np.outer(prior, prior)
+        scaled = A * prior
+        scaled *= prior[:, None]
         # above the rounding of sums over all readings
         scaled[np.diag_indices(len(A))] += 1 + ROUNDING * np.diag(scaled)
-        factor = cho_factor(scaled, lower=True)
-        found = prior * cho_solve(factor, prior * b)
-        covariance = dpotri(factor[0], lower=1)[0]
+        factor = cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
+        found = prior * cho_solve((factor, True), prior * b)
         if turn < rounds:
-            parts = np.split(found**2, edges), np.split(np.diag(covariance), edges)
+            half = dtrtri(factor, lower=1)[0]
+            left = np.einsum("ij,ij->j", half, half)  # the diagonal of the covariance
+            parts = np.split(found**2, edges), np.split(left, edges)
             groups = tuple(g.learn(own, left) for g, own, left in zip(groups, *parts, strict=True))
-    covariance = np.tril(covariance) + np.tril(covariance, -1).T
-    spread = basis * prior
-    sigma = np.sqrt(np.maximum(((spread @ covariance) * spread).sum(axis=1), 0))
-    occam = -float(np.log(np.diag(factor[0])).sum())
-    return Posterior(basis @ found, sigma, covariance, spread, groups, occam)
+    return Posterior(basis @ found, groups, basis, prior, factor)

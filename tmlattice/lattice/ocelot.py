@@ -128,11 +128,13 @@ def _import() -> None:
 with contextlib.redirect_stdout(io.StringIO()):
     _import()
     from ocelot.cpbd import elements
+    from ocelot.cpbd.elements.magnet import Magnet
     from ocelot.cpbd.elements.optic_element import OpticElement
+    from ocelot.cpbd.high_order import t_nnn
     from ocelot.cpbd.r_matrix import rot_mtx
     from ocelot.cpbd.transformations.second_order import SecondTM
     from ocelot.cpbd.transformations.transformation import TMTypes
 
 logging.getLogger("ocelot").setLevel(logging.ERROR)
 
-__all__ = ["OpticElement", "SecondTM", "TMTypes", "elements", "rot_mtx"]
+__all__ = ["Magnet", "OpticElement", "SecondTM", "TMTypes", "elements", "rot_mtx", "t_nnn"]

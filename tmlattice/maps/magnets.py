@@ -138,7 +138,7 @@ class RingMaps:
 
 
 KNOWN = 20_000
-"""Maps that are remembered, some 40 MB: more than a large ring has different elements."""
+"""Maps, and layers, that are remembered, some 40 MB: more than a large ring has different ones."""
 
 
 class LayerMaps:
@@ -203,13 +203,18 @@ class LayerMaps:
         key = self.physics(element)
         known = self._known.get(key)
         if known is None:
-            if len(self._known) > KNOWN:  # a fit asks for ever new amounts
-                self._known.clear()
-                self._kept.clear()
+            self._forget(self._known)
             known = self._known[key] = quadratic_map(element, self.ring.map_energy, self.dimension)
             if isinstance(key[0], int):  # an id: its source must not be freed
                 self._kept.append(element.source)
         return known
+
+    def _forget(self, known: Mapping[Hashable, Any]) -> None:
+        """A fit asks for ever new amounts: all that is known by an id goes with what it is of."""
+        if len(known) > KNOWN:
+            for memory in (self._known, self._layers, self._equal):
+                memory.clear()
+            self._kept.clear()
 
     def first_element(self, k: int) -> int:
         """The place in `ring.elements` of the first element of layer k."""
@@ -243,6 +248,7 @@ class LayerMaps:
             return self._composed([replaced.get(first + i, e) for i, e in enumerate(own)])
         physics = tuple((self.physics(e), e.kind == "monitor") for e in own)
         if physics not in self._layers:
+            self._forget(self._layers)
             self._layers[physics] = self._composed(own)
         return self._layers[physics]
 

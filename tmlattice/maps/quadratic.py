@@ -4,6 +4,7 @@ OCELOT gives an element as a sequence of parts (three for a bend: entrance edge,
 each x -> B + R x + x^T T x. The parts are composed to second order.
 """
 
+import cmath
 import copy
 import functools
 from collections.abc import Hashable, Iterable
@@ -63,11 +64,15 @@ def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
         step: of the whole.
     """
     signs, maps = zip(*ends, strict=True)
-    B, R = (
-        np.tensordot(signs, np.stack([getattr(m, name) for m in maps]), 1) / step for name in "BR"
-    )
-    bent = [sign * m.T for sign, m in zip(signs, maps, strict=True) if m.T is not None]
-    return Quadratic(B, R, sum(bent) / step if bent else None)
+
+    def total(arrays: Iterable[Array | None]) -> Array | None:
+        given = [sign * own for sign, own in zip(signs, arrays, strict=True) if own is not None]
+        return functools.reduce(np.add, given) / step if given else None
+
+    B, R = total(m.B for m in maps), total(m.R for m in maps)
+    assert B is not None
+    assert R is not None
+    return Quadratic(B, R, total(m.T for m in maps))
 
 
 FAINT = 3e-4
@@ -90,9 +95,11 @@ def identity(n: int) -> Quadratic:
 Part = tuple[Array, Array, Array]
 
 ASKED = 5_000
-"""Elements' parts that are remembered, some 20 MB: a scan asks for each in many hypotheses."""
+"""Elements' parts, and halves, that are remembered, some 20 MB: a scan asks for each in many
+hypotheses."""
 
 _asked: dict[Hashable, list[Part]] = {}
+_halved: dict[Hashable, tuple["Quadratic", "Quadratic"]] = {}
 
 
 def parts_of(element: Element, energy: float, split: bool) -> list[Part]:
@@ -128,17 +135,35 @@ def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
         atom.k2 = 0.0
     if supported is None or SecondTM in supported:
         try:
-            second = [SecondTM.from_element(atom, *part).get_params(energy) for part in parts]
+            second = [_body(atom, energy, *part) for part in parts]
             if faint:
-                for params, (where, length) in zip(second, parts, strict=True):
+                for i, (where, length) in enumerate(parts):
                     if where is TMTypes.MAIN:
-                        params.T = params.T + _sextupole(source, length, energy)
-            return [(p.B.ravel(), *_tilted(p.R, p.T, p.tilt)) for p in second]
+                        B, R, T, tilt = second[i]
+                        second[i] = B, R, T + _sextupole(source, length, energy), tilt
+            return [(B, *_tilted(R, T, tilt)) for B, R, T, tilt in second]
         except (AttributeError, NotImplementedError):
             pass  # it has no second order: a linear element
     zero = np.zeros((6, 6, 6))
     linear = zip(source.B(energy), source.R(energy), strict=True)
     return [(B.ravel(), R, zero) for B, R in linear]
+
+
+def _body(
+    atom: Any, energy: float, where: Any, length: float | None
+) -> tuple[Array, Array, Array, float]:
+    """B, R, T and tilt of one part; for a magnet's body at its place they are what OCELOT's own
+    call gives, but for a loop in Python over what offsets of zero feed down."""
+    from tmlattice.lattice.ocelot import Magnet, SecondTM, TMTypes, t_nnn
+
+    usual = getattr(type(atom), "create_second_order_main_params", None)
+    whole = Magnet.create_second_order_main_params
+    if where is not TMTypes.MAIN or usual is not whole or atom.dx or atom.dy:
+        own = SecondTM.from_element(atom, where, length).get_params(energy)
+        return own.B.ravel(), own.R, own.T, own.tilt
+    bent = 0.0 if atom.l == 0 else atom.angle / atom.l
+    T = t_nnn(atom.l if length is None else length, bent, atom.k1, atom.k2, energy)
+    return np.zeros(6), atom.create_first_order_main_params(energy, length).R, T, atom.tilt
 
 
 def _sextupole(bend: Any, length: float | None, energy: float) -> Array:
@@ -175,13 +200,16 @@ def physics_of(element: Element) -> Hashable:
         return element.data
     source = element.source
     values = vars(source.element)
-    physics = tuple(values[k] for k in values if k not in ("id", "color", "params"))
-    if not values.get("params") and all(isinstance(v, _NUMBERS) for v in physics):
+    physics = tuple([values[k] for k in values if k not in _FOR_PEOPLE])
+    numbers = _PLAIN.issuperset(map(type, physics)) or all(isinstance(v, _NUMBERS) for v in physics)
+    if numbers and not values.get("params"):
         return (type(source), physics)
     return id(source)  # it holds more than numbers: a matrix, a field map
 
 
 _NUMBERS = (int, float, type(None))
+_PLAIN = frozenset(_NUMBERS)
+_FOR_PEOPLE = frozenset(("id", "color", "params"))
 
 
 def of_ocelot(part: Part, n: int) -> Quadratic:
@@ -204,7 +232,7 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
     if errors == NO_ERRORS:
         total = composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
     else:
-        first, second = _halves(element, energy, n)
+        first, second = _kept_halves(element, energy, n)
         kick = errors.kick_x * _in_the_middle(element)
         total = composed(
             [
@@ -233,8 +261,8 @@ def _in_the_middle(element: Element) -> float:
     sin(angle / 2), and a gradient k1 in the body focuses like angle^2 / length^2."""
     if element.kind != "bend":
         return 1.0
-    half = np.emath.sqrt(element.angle**2 + element.k1 * element.length**2) / 2
-    return float(np.real(np.sinc(half / np.pi)))
+    half = cmath.sqrt(element.angle**2 + element.k1 * element.length**2) / 2
+    return (cmath.sin(half) / half).real if half else 1.0
 
 
 def _empty(element: Element) -> Element:
@@ -251,6 +279,20 @@ def composed(parts: Iterable[Quadratic | None]) -> Quadratic:
     for part in given[1:]:
         total = part.after(total)
     return total
+
+
+def _kept_halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
+    """`_halves`, which errors in the middle do not change."""
+    physics = physics_of(element)
+    if isinstance(physics, int):
+        return _halves(element, energy, n)
+    key = (physics, energy, n)
+    known = _halved.get(key)
+    if known is None:
+        if len(_halved) > ASKED:
+            _halved.clear()
+        known = _halved[key] = _halves(element, energy, n)
+    return known
 
 
 def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
@@ -287,7 +329,10 @@ def _thin(
     B[1], B[3] = kick_x, kick_y
     R[1, 0], R[3, 2] = -k1l, k1l
     R[1, 2] = R[3, 0] = k1sl
-    R[np.ix_([1, 3], [0, 2])] += np.reshape(slopes, (2, 2))
+    R[1, 0] += slopes[0]
+    R[1, 2] += slopes[1]
+    R[3, 0] += slopes[2]
+    R[3, 2] += slopes[3]
     return Quadratic(B, R, None)
 
 

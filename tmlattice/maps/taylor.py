@@ -31,11 +31,18 @@ def kronecker_exponents(n: int, degree: int) -> list[tuple[int, ...]]:
 
 def second_derivatives(W2: Array) -> Array:
     """d2 (image) / d x_i d x_j [..., m, n, n] of second-order coefficients W2 [..., m, pairs]."""
-    n = round((8 * W2.shape[-1] + 1) ** 0.5 - 1) // 2
+    pair, twice = _pair(W2.shape[-1])
+    return np.asarray(W2[..., pair] * twice)
+
+
+@functools.cache
+def _pair(count: int) -> tuple[Indices, Array]:
+    """Which of `count` pairs each entry of a symmetric matrix is, and its factor, [n, n]."""
+    n = round((8 * count + 1) ** 0.5 - 1) // 2
     i, j = np.triu_indices(n)
     pair = np.empty((n, n), dtype=np.intp)
     pair[i, j] = pair[j, i] = np.arange(len(i))
-    return np.asarray(W2[..., pair] * (1.0 + np.eye(n)))
+    return pair, 1.0 + np.eye(n)
 
 
 def symplectic_form(n: int) -> Array:

@@ -65,6 +65,11 @@ class ResponseData:
     plane: Indices
     noise: Array
 
+    @cached_property
+    def design(self) -> ResponseModel:
+        """Of the ring as it is given; UnstableRingError where it has no closed orbit."""
+        return ResponseModel(self.ring)
+
     @property
     def shape(self) -> tuple[int, int]:
         """Columns, monitors."""
@@ -244,7 +249,10 @@ class Predicted:
     @cached_property
     def model(self) -> ResponseModel:
         """Of the ring with its errors; UnstableRingError where it has no closed orbit."""
-        return ResponseModel(apply(self.data.ring, self.errors.ring))
+        design = self.data.design
+        if not self.errors.ring:
+            return design
+        return design.changed_to(apply(design.ring, self.errors.ring))
 
     def orbits(self, model: ResponseModel) -> Array:
         """Orbit changes of the steps, the RF's last, m, [column, monitor, 2].
@@ -349,12 +357,22 @@ class Predicted:
         """Of the linear response, at all of the ring's monitors."""
         return ResponseSlopes(self.model, self.data.measured.correctors)
 
+    def slopes_of(self, block: int, pairs: Sequence[Hypothesis]) -> Iterator[Array]:
+        """The same, of the plane that a block is read in, m, [column, monitor]: one array, that
+        each overwrites."""
+        data = self.data
+        scale = ((1 + self.errors.calibration) * data.kicks)[:, None]
+        for slope in self.response_slopes.picked(pairs, data.at, data.plane_of(block)):
+            yield np.multiply(slope, scale, out=slope)
+
     def rows(self, effect: str, places: Sequence[str], block: int) -> Array:
         """What the readings of a block do for each error, gains alone, [error, column, monitor]."""
         out = np.empty((len(places), *self.data.shape))
         gain = self.gain(block)
-        for i, slope in enumerate(self.slopes([(effect, place) for place in places])):
-            out[i] = self.data.pick(slope, block) * gain
+        for own, slope in zip(
+            out, self.slopes_of(block, [(effect, place) for place in places]), strict=True
+        ):
+            np.multiply(slope, gain, out=own)
         return out
 
     @cached_property
