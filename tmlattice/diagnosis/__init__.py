@@ -29,8 +29,9 @@ _OPTIONS = {
 _OWN = {name for names in _OPTIONS.values() for name in names}
 
 
-MANY = 20_000
-"""Readings from which on linear algebra is worth several threads."""
+MANY = 100_000
+"""Readings from which on linear algebra is worth several threads: numpy and scipy have a pool each,
+which wait for one another (ALS, 41,000 readings, two cores: 71 s with two threads, 51 with one)."""
 
 
 @by_name
@@ -50,7 +51,7 @@ def diagnose(
             background, and known, what an earlier diagnosis left known of the ring as it found it
             (`diagnosis.twin`; first turns take it too), see `diagnosis.joint.diagnose_together`.
 
-    Of fewer than 20,000 readings the result is the same to the bit on any number of threads: a
+    Of fewer than 100,000 readings the result is the same to the bit on any number of threads: a
     library that shares a product among them adds in another order, and is no quicker there. Of
     more it is the same to rounding.
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis import torn_steps
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.judges import Chi2, Score, against, inner, lost, score
 from tmlattice.diagnosis.odd_readings import robust
+from tmlattice.diagnosis.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
 from tmlattice.diagnosis.state import (
     State,
@@ -112,7 +112,7 @@ class DenseFit:
         steps: those kept; the first is the design's, the last the result's.
         refused: those that did not help, or spoilt the RF's response.
         heldout: what held-out correctors say of the design and of the result.
-        said: sentences of correctors that were left out.
+        said: sentences of steps that went wrong, and are left out.
     """
 
     design: State
@@ -147,24 +147,23 @@ def fit_steps(
     stages: dict[Trial, State] = {}
     for trial, state in one_by_one(design, trials, progress):
         stages[trial] = replace(state, kept={})
-    wrong = _torn(state)
-    if wrong.any():
-        data = torn_steps.unread(data, wrong)
-        design, state = (torn_steps.beside(own, data, wrong) for own in (design, state))
-        stages = {trial: torn_steps.beside(own, data, wrong) for trial, own in stages.items()}
-        split = state.split
+    odd = odd_steps(state)
+    state = beside(state, odd.unread)
+    progress("all together")
+    state = settle(bend(jump(replace(state, independent=np.ones((2, 2))))))
+    log.info("independent readings: %s", state.independent)
+    odd = odd.and_more(odd_steps(state))  # what is usual is less now
+    state, design = beside(state, odd.unread), beside(design, odd.unread)
+    split = state.split
     before = score(design, split.held)
     steps = {
         trial: Step.scored(
             _title(trial), sum(family.count(data) for family in trial.families),
-            score(own, split.held),
+            score(beside(own, odd.unread), split.held),
         )
         for trial, own in stages.items()
     }  # fmt: skip
     stages.clear()
-    progress("all together")
-    state = settle(bend(jump(replace(state, independent=np.ones((2, 2))))))
-    log.info("independent readings: %s", state.independent)
     refused: list[Step] = []
     worth, without = _worth(state, steps, progress)
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
@@ -181,7 +180,7 @@ def fit_steps(
     if spoilt > SPOILT:  # all together spoil what they should mend
         refused += [replace(step, kept=False) for step in steps.values()]
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
-                        (before, before), torn_steps.said(data, wrong))  # fmt: skip
+                        (before, before), odd.said)  # fmt: skip
     progress("result")
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
     state = bend(jump(replace(state, exploring=False), beyond=1.0))
@@ -189,16 +188,7 @@ def fit_steps(
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
-    left_out = torn_steps.said(data, wrong)
-    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), left_out)
-
-
-def _torn(state: State) -> Flags:
-    """Columns to be left out, where enough are left to judge."""
-    wrong = torn_steps.torn(state)
-    split = state.split
-    enough = all((own & ~wrong).any() for own in (split.held, split.inner, state.fitted))
-    return wrong if enough else np.zeros_like(wrong)
+    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), odd.said)
 
 
 def one_by_one(

@@ -11,14 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.findings import finding_of
-from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.state import State
-from tmlattice.effects import Cause
-from tmlattice.inference import chi2
-from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.levels import CLEAR
-from tmlattice.inference.rivals import Detection
 from tmlattice.measurement import OrbitResponse
 
 Array = NDArray[np.float64]
@@ -101,15 +94,3 @@ def planes_back(measured: OrbitResponse, monitors: Sequence[str]) -> OrbitRespon
         orbit[at] = orbit[at, ::-1]
         rf = replace(rf, orbit=orbit)
     return replace(measured, response=response, rf=rf)
-
-
-def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
-    """The finding of a monitor whose planes were put back."""
-    data = state.data
-    at = data.measured.monitors.index(name)
-    model, d = state.at.read[:, at], data.orbits[:, at]
-    as_read = np.nansum((d[:, ::-1] - model) ** 2 - (d - model) ** 2, axis=0)
-    statistic = float(np.sum(as_read / data.noise[at] ** 2))
-    cause = Cause("monitor_swap", data.ring[name].name, 1.0)
-    seen = Detection(statistic, CLEAR, min(1.0, 2 * len(data.at) * chi2.sf(statistic, 1)))
-    return finding_of(data.ring, [cause], np.ones(1), [cause], 0.0, seen, judgement.mass)

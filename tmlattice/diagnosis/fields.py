@@ -217,7 +217,11 @@ class FocusingChange(VerticalFocusing):
 
 
 class EdgeFocusing(_Thin):
-    """Vertical focusing of dipoles, by their edges and fringe fields: one number a type."""
+    """Vertical focusing of dipoles, by their edges and fringe fields: one number a type.
+
+    Both edges of a rectangular magnet focus by angle^2 / length together, and a sector's not at
+    all: hardly more than that is wrong with them, and next to nothing where angles are small.
+    """
 
     name, effect = "edge_focusing", "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
@@ -235,5 +239,13 @@ class EdgeFocusing(_Thin):
         return list(types.values())
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each type."""
-        return [Group(self.name, np.eye(self.size(data)), 1e-3)]
+        """Of each type, as a share of what the edges of a rectangular one do."""
+        ring = data.ring
+        largest = []
+        for pieces in self.shares(data):
+            bends = [own for own in self._places(ring) if own[0].name in pieces]
+            # magnet by magnet: the poles of a wiggler bend both ways
+            squares = sum(sum(e.angle for e in own) ** 2 for own in bends)
+            length = sum(e.length for own in bends for e in own)
+            largest.append(squares / length if length else 0.0)
+        return [Group(self.name, np.diag(largest), 0.1, most=1.0)]

@@ -12,8 +12,11 @@ from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.remedies import credible as credible_remedies
 from tmlattice.diagnosis.remedies import remedies_of, remedy_of
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
+from tmlattice.diagnosis.state import State
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
+from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
@@ -230,3 +233,15 @@ def sensitivity(found: Scan, judgement: Judgement) -> dict[str, float]:
             least = np.sqrt(threshold / information) ** (1 / CATALOGUE[name].power)
             amounts.setdefault(name, []).append(float(least))
     return {name: float(np.median(values)) for name, values in amounts.items()}
+
+
+def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
+    """The finding of a monitor whose planes were put back."""
+    data = state.data
+    at = data.measured.monitors.index(name)
+    model, d = state.at.read[:, at], data.orbits[:, at]
+    as_read = np.nansum((d[:, ::-1] - model) ** 2 - (d - model) ** 2, axis=0)
+    statistic = float(np.sum(as_read / data.noise[at] ** 2))
+    cause = Cause("monitor_swap", data.ring[name].name, 1.0)
+    seen = Detection(statistic, CLEAR, min(1.0, 2 * len(data.at) * chi2.sf(statistic, 1)))
+    return finding_of(data.ring, [cause], np.ones(1), [cause], 0.0, seen, judgement.mass)

@@ -104,7 +104,7 @@ def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
         there = np.isfinite(left)
         outside.append(left[far & there])
         cross.append(outside[-1] ** 2 / variance_across[c, far & there])
-        if rolls[c].any():
+        if rolls[c].any() and (near & there).any():
             rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
     judge = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
     of_rf = (orbits[-1] - straight[-1])[judge]

@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.dense import DenseFit, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.dispersion import dispersion_by_kicks
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swap_of, swapped
+from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swapped
 from tmlattice.diagnosis.exchanged import told as told_exchanged
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
-from tmlattice.diagnosis.findings import with_consequences
+from tmlattice.diagnosis.findings import swap_of, with_consequences
 from tmlattice.diagnosis.judges import Chi2, Score
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.odd_readings import odd_readings, without_gross

@@ -9,13 +9,10 @@ corrector can be learnt from that, and nobody is judged by it: found beside a fi
 gains, such a step is left out, and named.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.state import State
-from tmlattice.observe.orbit_response import Predicted, ResponseData
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -76,33 +73,3 @@ def _broken(state: State, column: int, plane: int) -> float:
 
 def _cross(a: Array, b: Array) -> Array:
     return np.asarray(a[0] * b[1] - a[1] * b[0])
-
-
-def unread(data: ResponseData, columns: Flags) -> ResponseData:
-    """As if nobody had read these columns."""
-    orbits = data.orbits.copy()
-    orbits[columns] = np.nan
-    measured = replace(data.measured, response=orbits[:-1].copy())
-    return replace(data, orbits=orbits, measured=measured)
-
-
-def beside(state: State, data: ResponseData, columns: Flags) -> State:
-    """A state of the same response, some columns of which nobody read: they are fitted nowhere, and
-    judge nothing."""
-    split = replace(
-        state.split, held=state.split.held & ~columns, inner=state.split.inner & ~columns
-    )
-    at = Predicted(data, state.at.errors, state.at.bent)
-    return replace(state, data=data, split=split, at=at)
-
-
-def said(data: ResponseData, columns: Flags) -> tuple[str, ...]:
-    """In words."""
-    if not columns.any():
-        return ()
-    names = ", ".join(data.measured.correctors[c] for c in np.flatnonzero(columns))
-    return (
-        "correctors at whose steps monitors next to one another contradict each other, as if some "
-        f"had been read before the beam had settled, left out: {names}; measure these again, and "
-        "wait longer",
-    )

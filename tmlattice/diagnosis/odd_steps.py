@@ -1,0 +1,107 @@
+"""Steps of correctors that went wrong, by what a fit leaves of them: they are not fitted, and judge
+nobody.
+
+>>> odd = odd_steps(state)
+>>> state = beside(state, odd.unread)
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.exchanged import exchanged
+from tmlattice.diagnosis.other_kicks import OtherKick, other_kicks
+from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.torn_steps import torn
+from tmlattice.observe.orbit_response import Predicted, ResponseData
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class OddSteps:
+    """What went wrong.
+
+    Attributes:
+        unread: which readings are not used, by plane that is read, [column, 2].
+        said: sentences of them.
+    """
+
+    unread: Flags
+    said: tuple[str, ...] = ()
+
+    def and_more(self, later: "OddSteps") -> "OddSteps":
+        """With those that are found once these are left out."""
+        return OddSteps(self.unread | later.unread, (*self.said, *later.said))
+
+
+def odd_steps(state: State) -> OddSteps:
+    """Those whose readings belong to no orbit, and those with another kick in them; none where too
+    few are left to fit and to judge.
+
+    Args:
+        state: with all families.
+    """
+    data, split = state.data, state.split
+    nothing = np.zeros((len(data.plane), 2), dtype=bool)
+    broken = torn(state)
+    names = data.measured.correctors
+    swapped = {name for pair in exchanged(state) for name in pair}  # to be put right, not left out
+    others = [
+        own
+        for own in other_kicks(state)
+        if not broken[own.column] and names[own.column] not in swapped
+    ]
+    unread = nothing | broken[:, None]
+    for own in others:
+        unread[own.column, own.plane] = True
+        if own.plane == data.plane[own.column]:  # its own kick is not known either
+            unread[own.column] = True
+    gone = unread.all(axis=1)
+    if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
+        return OddSteps(nothing)
+    return OddSteps(unread, (*_torn(data, broken), *_kicked(state, others)))
+
+
+def _torn(data: ResponseData, columns: Flags) -> list[str]:
+    names = [data.measured.correctors[c] for c in np.flatnonzero(columns)]
+    if not names:
+        return []
+    return [
+        "correctors at whose steps monitors next to one another contradict each other, as if some "
+        f"had been read before the beam had settled, left out: {', '.join(names)}; measure these "
+        "again, and wait longer"
+    ]
+
+
+def _kicked(state: State, others: list[OtherKick]) -> list[str]:
+    if not others:
+        return []
+    names, layers = state.data.measured.correctors, state.at.model.maps.layers
+    told = ", ".join(
+        f"{names[own.column]} ({1e6 * own.amount:+.2g} µrad in {'xy'[own.plane]}, as from "
+        f"{layers[own.layer]})"
+        for own in others
+    )
+    return [
+        "something else kicked the beam while these correctors were stepped (where is known up to "
+        f"half betatron oscillations): {told}; these readings are left out; look for a supply that "
+        "jumps, and measure them again"
+    ]
+
+
+def beside(state: State, flags: Flags) -> State:
+    """A state as if nobody had taken these readings, [column, 2]: columns that have none are fitted
+    nowhere, and judge nothing."""
+    if not flags.any():
+        return state
+    data = state.data
+    orbits = np.where(flags[:, None, :], np.nan, data.orbits)
+    measured = replace(data.measured, response=orbits[:-1].copy())
+    data = replace(data, orbits=orbits, measured=measured)
+    gone = flags.all(axis=1)
+    split = replace(state.split, held=state.split.held & ~gone, inner=state.split.inner & ~gone)
+    at = Predicted(data, state.at.errors, state.at.bent)
+    return replace(state, data=data, split=split, at=at)

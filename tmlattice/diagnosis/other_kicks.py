@@ -1,0 +1,153 @@
+"""Steps of a corrector during which something else kicked the beam.
+
+The two orbits of a step are read seconds apart. A supply that jumps in between, a feedback, or an
+injection element that pulses adds an orbit of its own: a kick at another place, which has nothing
+to do with the corrector. Such a step leaves many times what is usual, and half of the monitors tell
+where one kick has to be for the other half to agree. (PETRA III: 0.1 mrad of pkhw_wr_5, and beside
+it 3 urad in y, a kilometre away.) It teaches nothing of the ring, and would judge by what no model
+can know.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.state import State, rms_of
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+TIMES = 5.0
+"""What a step leaves, its own kick apart, over what the typical one leaves in the same plane."""
+SHARE = 0.15
+"""Of the mean square of the far monitors, left at most beside one kick elsewhere."""
+HERE = 0.5
+"""Of the same beside a jump at the corrector's own place, at most."""
+ENOUGH, COLUMNS = 12, 5
+"""Readings of a column, and columns of a plane, that it takes to say so."""
+
+
+@dataclass(frozen=True)
+class OtherKick:
+    """Something that kicked the beam while a corrector was stepped.
+
+    Attributes:
+        column: of the corrector.
+        plane: 0 for x, 1 for y.
+        layer: the magnet behind which one such kick explains most; others in the same phase of the
+            betatron oscillation explain as much.
+        amount: rad.
+    """
+
+    column: int
+    plane: int
+    layer: int
+    amount: float
+
+
+def other_kicks(state: State) -> list[OtherKick]:
+    """Those that stand out.
+
+    Args:
+        state: with gains, rolls and gradients.
+    """
+    found = []
+    for kicked in (0, 1):
+        for plane in (0, 1):
+            found += _of_planes(state, kicked, plane)
+    return found
+
+
+@dataclass(frozen=True)
+class _Column:
+    """What a column leaves in one plane, m, and the pattern of its own amplitude, [reading]."""
+
+    column: int
+    seen: Indices
+    own: Array
+    left: Array
+
+    @property
+    def rms(self) -> float:
+        """Beside its own amplitude."""
+        return rms_of([beside(self.own[:, None], self.left)])
+
+
+def beside(patterns: Array, left: Array) -> Array:
+    """What patterns [reading, pattern] leave, m."""
+    size = np.abs(patterns).max(axis=0)
+    there = patterns[:, size > 0] / size[size > 0]
+    return np.asarray(left - there @ np.linalg.lstsq(there, left, rcond=None)[0])
+
+
+def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
+    data, at = state.data, state.at
+    rows = np.flatnonzero(data.plane[:-1] == kicked)
+    if kicked != plane and not state.allows("corrector_roll"):
+        return []  # what its own roll makes of it is not known yet
+    pattern = at.seen(at.beam if kicked == plane else at.across)[..., plane]
+    found = []
+    for c in rows:
+        left = at.left[c, :, plane]
+        seen = np.flatnonzero(np.isfinite(left) & state.good)
+        if len(seen) >= ENOUGH:
+            found.append(_Column(int(c), seen, pattern[c, seen], left[seen]))
+    return found
+
+
+def _of_planes(state: State, kicked: int, plane: int) -> list[OtherKick]:
+    columns = _columns(state, kicked, plane)
+    if len(columns) < COLUMNS:
+        return []
+    data, model = state.data, state.at.model
+    sizes = np.array([one.rms for one in columns])
+    typical = max(float(np.median(sizes)), float(np.median(data.noise[:, plane])))
+    odd = [one for one, size in zip(columns, sizes, strict=True) if size > TIMES * typical]
+    if not odd:
+        return []
+    exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]
+    layers = np.arange(len(model.maps.layers))
+    kicks = orbits_of_kicks(model, layers, exits, rows, plane).T
+    kicks = kicks * state.at.errors.monitors[:, plane, plane]
+    found = []
+    for one in odd:
+        kick = _elsewhere(state, one, plane, kicks)
+        if kick is not None:
+            found.append(kick)
+    return found
+
+
+def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKick | None:
+    """The kick that explains a column, if one does; see the module.
+
+    Args:
+        state: that it is left by.
+        one: the column.
+        plane: that is read.
+        kicks: readings by a kick behind each layer, m/rad, [layer, monitor].
+    """
+    far = np.arange(len(one.seen)) % 2 == 1
+    near, patterns = ~far, kicks[:, one.seen]
+    own = one.own / max(float(np.abs(one.own).max()), 1e-300)
+    size = float(own[near] @ own[near])
+    across = patterns[:, near] - np.outer(patterns[:, near] @ own[near], own[near]) / size
+    rest = beside(own[near, None], one.left[near])
+    squares = np.maximum((across**2).sum(axis=1), 1e-300)
+    layer = int(np.argmax((across @ rest) ** 2 / squares))
+    amount = float(across[layer] @ rest / squares[layer])
+
+    def missed(more: Array) -> float:
+        both = np.column_stack([own, more])
+        amounts = np.linalg.lstsq(both[near], one.left[near], rcond=None)[0]
+        return float(np.mean((one.left - both @ amounts)[far] ** 2))
+
+    jump = state.at.jumps[one.column, one.seen, plane]
+    without = missed(np.zeros((len(own), 0)))
+    here = missed(jump[:, None] / np.abs(jump).max()) if jump.any() else without
+    beside_it = missed(patterns[layer][:, None] / np.abs(patterns[layer]).max())
+    if beside_it > SHARE * without or beside_it > HERE * here:
+        return None
+    return OtherKick(one.column, plane, layer, amount)
