@@ -89,9 +89,13 @@ def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
     if kicked != plane and not state.allows("corrector_roll"):
         return []  # what its own roll makes of it is not known yet
     pattern = at.seen(at.beam if kicked == plane else at.across)[..., plane]
+    read, orbits = at.read[..., kicked], data.orbits[..., kicked]
     found = []
     for c in rows:
-        left = at.left[c, :, plane]
+        near = np.isfinite(orbits[c]) & state.good  # what tells its kick
+        size = float(read[c, near] @ read[c, near])
+        kick = float(read[c, near] @ orbits[c, near]) / size if size else 1.0
+        left = data.orbits[c, :, plane] - kick * at.read[c, :, plane]
         seen = np.flatnonzero(np.isfinite(left) & state.good)
         if len(seen) >= ENOUGH:
             found.append(_Column(int(c), seen, pattern[c, seen], left[seen]))
@@ -132,7 +136,7 @@ def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKic
     far = np.arange(len(one.seen)) % 2 == 1
     near, patterns = ~far, kicks[:, one.seen]
     own = one.own / max(float(np.abs(one.own).max()), 1e-300)
-    size = float(own[near] @ own[near])
+    size = max(float(own[near] @ own[near]), 1e-300)
     across = patterns[:, near] - np.outer(patterns[:, near] @ own[near], own[near]) / size
     rest = beside(own[near, None], one.left[near])
     squares = np.maximum((across**2).sum(axis=1), 1e-300)
