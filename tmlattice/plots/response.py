@@ -87,6 +87,7 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
         rms = float(np.sqrt(np.nanmean(left**2)))
         ax.set_title(f"{name}: {rms:.2g} µm rms", loc="left", fontsize="medium")
         ax.set_xlabel("corrector: horizontal, then vertical")
+        ax.locator_params(integer=True)
     axes[0].set_ylabel("monitor, along the ring")
     figure.colorbar(image, ax=axes, label="measured less model [µm]")
     return figure
