@@ -19,6 +19,9 @@ from tmlattice.observe.orbit_response import Predicted, ResponseData
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+GAINS = "monitor_gain"
+"""The family of monitors' gains."""
+
 
 @dataclass(frozen=True)
 class OddSteps:
@@ -42,10 +45,13 @@ def odd_steps(state: State) -> OddSteps:
     few are left to fit and to judge.
 
     Args:
-        state: with all families.
+        state: with all families; without monitors' gains nothing is told, for these break triples
+            and leave kicks, too.
     """
     data, split = state.data, state.split
     nothing = np.zeros((len(data.plane), 2), dtype=bool)
+    if not state.allows(GAINS):
+        return OddSteps(nothing)
     broken = torn(state)
     names = data.measured.correctors
     swapped = {name for pair in exchanged(state) for name in pair}  # to be put right, not left out

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.state import State, rms_of
+from tmlattice.diagnosis.torn_steps import orbits_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -109,7 +110,13 @@ def _of_planes(state: State, kicked: int, plane: int) -> list[OtherKick]:
     data, model = state.data, state.at.model
     sizes = np.array([one.rms for one in columns])
     typical = max(float(np.median(sizes)), float(np.median(data.noise[:, plane])))
-    odd = [one for one, size in zip(columns, sizes, strict=True) if size > TIMES * typical]
+    shares = sizes / orbits_of(state, np.array([one.column for one in columns]))
+    usual = float(np.median(shares))  # a larger step leaves more
+    odd = [
+        one
+        for one, size, share in zip(columns, sizes, shares, strict=True)
+        if size > TIMES * typical and share > TIMES * usual
+    ]
     if not odd:
         return []
     exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]

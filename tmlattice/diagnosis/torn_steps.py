@@ -46,10 +46,21 @@ def torn(state: State) -> Flags:
             continue
         noise = float(np.median(data.noise[:, plane]))
         limit = max(TORN * float(np.median(broken[told])), NOISE * noise)
+        share = broken / orbits_of(state, rows)  # a larger step breaks more
         odd = told & (np.where(told, broken, 0.0) > limit)
+        odd &= np.where(told, share, 0.0) > TORN * float(np.median(share[told]))
         if odd.sum() <= MOST * told.sum():
             out[rows[odd]] = True
     return out
+
+
+def orbits_of(state: State, columns: NDArray[np.int64]) -> Array:
+    """rms of what was measured of columns in their own plane, m, at least the noise, [column]."""
+    read = state.data.pick(state.data.orbits)[columns][:, state.good]
+    noise = float(np.median(state.data.noise))
+    there = np.isfinite(read)
+    squares = np.where(there, read, 0.0) ** 2
+    return np.asarray(np.sqrt(squares.sum(axis=1) / np.maximum(there.sum(axis=1), 1) + noise**2))
 
 
 def _broken(state: State, column: int, plane: int) -> float:
