@@ -85,7 +85,7 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
         limit = limit or float(np.nanpercentile(abs(left), 98))
         image = ax.imshow(left.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
         rms = float(np.sqrt(np.nanmean(left**2)))
-        ax.set_title(f"{name}: {rms:.2g} µm rms", loc="left", fontsize="medium")
+        ax.set_title(f"{name}: {rms:.3g} µm rms", loc="left", fontsize="medium")
         ax.set_xlabel("corrector: horizontal, then vertical")
         ax.locator_params(integer=True)
     axes[0].set_ylabel("monitor, along the ring")
