@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
+from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.dense import fit_steps, told
 from tmlattice.diagnosis.exchanged import exchanged, put_right
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.odd_readings import odd_readings
+from tmlattice.diagnosis.other_kicks import other_kicks
 from tmlattice.diagnosis.response import assumed_of
 from tmlattice.diagnosis.rounds import linear
 from tmlattice.diagnosis.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import Predicted, response_data, split_columns
 
 WITH_ROLLS = {"corrector_calibration", "monitor_gain", "quadrupole_gradient", "monitor_roll",
               "corrector_roll"}  # fmt: skip
@@ -149,6 +151,14 @@ def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(smal
     assert readings[across].tolist() == [False, True]
     assert readings[inside].tolist() == [False, False]
     assert readings.sum() == 2 * len(names) - 3
+    # the kick that is told makes the orbit that was added, with its sign
+    whole = replace(fit.state, data=data, at=Predicted(data, fit.state.at.errors))
+    model, added = whole.at.model, 0.1 * measured.response[source, :, 1]
+    told = next(own for own in other_kicks(whole) if own.column == inside)
+    rows = model.reading_slopes[:, told.plane]
+    orbit = orbits_of_kicks(model, [told.layer], model.maps.at, rows, told.plane)[:, 0]
+    assert told.plane == 1
+    assert np.allclose(told.amount * orbit, added, atol=0.1 * np.abs(added).max())
     assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
 
 

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.kicks import orbits_of_kicks
-from tmlattice.diagnosis.state import State, rms_of
+from tmlattice.diagnosis.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.torn_steps import orbits_of
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
 TIMES = 5.0
@@ -74,14 +73,8 @@ class _Column:
     @property
     def rms(self) -> float:
         """Beside its own amplitude."""
-        return rms_of([beside(self.own[:, None], self.left)])
-
-
-def beside(patterns: Array, left: Array) -> Array:
-    """What patterns [reading, pattern] leave, m."""
-    size = np.abs(patterns).max(axis=0)
-    there = patterns[:, size > 0] / size[size > 0]
-    return np.asarray(left - there @ np.linalg.lstsq(there, left, rcond=None)[0])
+        every = np.ones(len(self.left), dtype=bool)
+        return rms_of([amplitudes(self.own[:, None], self.left, every, every)[1]])
 
 
 def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
@@ -145,20 +138,17 @@ def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKic
     own = one.own / max(float(np.abs(one.own).max()), 1e-300)
     size = max(float(own[near] @ own[near]), 1e-300)
     across = patterns[:, near] - np.outer(patterns[:, near] @ own[near], own[near]) / size
-    rest = beside(own[near, None], one.left[near])
+    rest = amplitudes(own[:, None], one.left, near, near)[1]
     squares = np.maximum((across**2).sum(axis=1), 1e-300)
     layer = int(np.argmax((across @ rest) ** 2 / squares))
     amount = float(across[layer] @ rest / squares[layer])
 
-    def missed(more: Array) -> float:
-        both = np.column_stack([own, more])
-        amounts = np.linalg.lstsq(both[near], one.left[near], rcond=None)[0]
-        return float(np.mean((one.left - both @ amounts)[far] ** 2))
+    def missed(*more: Array) -> float:
+        patterns = np.column_stack([own, *more])
+        return float(np.mean(amplitudes(patterns, one.left, near, far)[1] ** 2))
 
-    jump = state.at.jumps[one.column, one.seen, plane]
-    without = missed(np.zeros((len(own), 0)))
-    here = missed(jump[:, None] / np.abs(jump).max()) if jump.any() else without
-    beside_it = missed(patterns[layer][:, None] / np.abs(patterns[layer]).max())
+    without, here = missed(), missed(state.at.jumps[one.column, one.seen, plane])
+    beside_it = missed(patterns[layer])
     if beside_it > SHARE * without or beside_it > HERE * here:
         return None
     return OtherKick(one.column, plane, layer, amount)
