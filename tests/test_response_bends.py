@@ -7,7 +7,9 @@ import pytest
 
 from tmlattice.diagnosis.dense import fit_steps, told
 from tmlattice.diagnosis.families import STEPS
+from tmlattice.diagnosis.fields import EdgeFocusing
 from tmlattice.effects import Cause
+from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data, split_columns
 
@@ -62,3 +64,19 @@ def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
     data = response_data(small_ring, measured)
     fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
     assert not any(step.effect == "bend_gradient" for step in (*fit.steps, *fit.refused))
+
+
+def test_the_scale_of_edges_is_that_of_a_rectangular_magnet(small_ring):
+    """Two edges of half the angle each, each of h tan(edge): far from it no dipole's edges are off.
+    A wiggler's poles, which bend both ways, have theirs too."""
+    data = response_data(small_ring, simulate_response(small_ring, [], engine="ocelot").measured)
+    bends = [e for e in small_ring.elements if e.kind == "bend"]
+    expected = {stem(e.name): 2 * e.angle / e.length * np.tan(e.angle / 2) for e in bends}
+    other_way = {e.name for e in bends[::2]}
+    poles = tuple(
+        e.changed(angle=-e.angle) if e.name in other_way else e for e in small_ring.elements
+    )
+    for ring in (small_ring, replace(small_ring, elements=poles)):
+        (group,) = EdgeFocusing().groups(replace(data, ring=ring))
+        assert np.allclose(np.diag(group.basis), list(expected.values()), rtol=0.01)
+        assert group.most == 1.0

@@ -7,9 +7,9 @@ each x -> B + R x + x^T T x. The parts are composed to second order.
 import cmath
 import copy
 import functools
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from tmlattice.lattice.ring import NO_ERRORS, Element, Slopes
 
 Array = NDArray[np.float64]
 Weights = tuple[Array, Array, Array]
+Made = TypeVar("Made")
 
 
 @functools.cache
@@ -107,14 +108,23 @@ def parts_of(element: Element, energy: float, split: bool) -> list[Part]:
 
     With `split` the body comes as two halves, in the middle of the list.
     """
+    return _remembered(
+        _asked, element, (energy, split), lambda: parts_of_ocelot(element.source, energy, split)
+    )
+
+
+def _remembered(
+    memory: dict[Hashable, Made], element: Element, how: Hashable, made: Callable[[], Made]
+) -> Made:
+    """What was made of an element with equal physics, where that is numbers alone."""
     physics = physics_of(element)
     if isinstance(physics, int):
-        return parts_of_ocelot(element.source, energy, split)
-    known = _asked.get((physics, energy, split))
+        return made()
+    known = memory.get((physics, how))
     if known is None:
-        if len(_asked) > ASKED:
-            _asked.clear()
-        known = _asked[physics, energy, split] = parts_of_ocelot(element.source, energy, split)
+        if len(memory) > ASKED:
+            memory.clear()
+        known = memory[physics, how] = made()
     return known
 
 
@@ -232,7 +242,10 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
     if errors == NO_ERRORS:
         total = composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
     else:
-        first, second = _kept_halves(element, energy, n)
+        # which errors in the middle do not change
+        first, second = _remembered(
+            _halved, element, (energy, n), lambda: _halves(element, energy, n)
+        )
         kick = errors.kick_x * _in_the_middle(element)
         total = composed(
             [
@@ -279,20 +292,6 @@ def composed(parts: Iterable[Quadratic | None]) -> Quadratic:
     for part in given[1:]:
         total = part.after(total)
     return total
-
-
-def _kept_halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
-    """`_halves`, which errors in the middle do not change."""
-    physics = physics_of(element)
-    if isinstance(physics, int):
-        return _halves(element, energy, n)
-    key = (physics, energy, n)
-    known = _halved.get(key)
-    if known is None:
-        if len(_halved) > ASKED:
-            _halved.clear()
-        known = _halved[key] = _halves(element, energy, n)
-    return known
 
 
 def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
