@@ -154,6 +154,7 @@ def fit_steps(
     log.info("independent readings: %s", state.independent)
     odd = odd.and_more(odd_steps(state))  # what is usual is less now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
+    state, moving = _beside_jitter(state, progress)
     split = state.split
     before = score(design, split.held)
     steps = {
@@ -184,6 +185,9 @@ def fit_steps(
     progress("result")
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
     state = bend(jump(replace(state, exploring=False), beyond=1.0))
+    if moving is not None:
+        moving = sought(state) or moving
+        state = replace(state, jitter=moving.orbits)
     state = settle(robust(state))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]

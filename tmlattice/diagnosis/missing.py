@@ -213,6 +213,7 @@ class Fitted:
     """The linearised fit, to which patterns can be added."""
 
     def __init__(self, state: State) -> None:
+        state = replace(state, jitter=None)  # a hypothesis among the others here
         self.state, data = state, state.data
         there = linear(state, 0)
         normal, self.start = there.normal, there.start

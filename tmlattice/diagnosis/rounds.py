@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import Family
 from tmlattice.diagnosis.state import Kept, State
-from tmlattice.diagnosis.weights import counts, look, weight
+from tmlattice.diagnosis.weights import log_scale, look, taken, weighed, weight
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Normal, Posterior, normal_equations, solve
 from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
@@ -131,7 +132,7 @@ def linear(state: State, block: int) -> Linear:
     by_ring = ring[0] if len(ring) == 1 else np.concatenate([np.zeros((0, *data.shape)), *ring])
     normal = normal_equations(
         data.pick(at.left, block), weight(state, block), data.plane_of(block), rows["monitor"],
-        rows["column"], by_ring,
+        rows["column"], by_ring, taken(state, block),
     )  # fmt: skip
     groups = []
     lowest = np.full(end, -np.inf)
@@ -210,7 +211,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
             _penalty([g for g in found.groups if g.basis[rows].any()], rows, at.values[name])
             for name, rows in there.where.items()
         )
-        return float(np.sum(weights * left**2)) + penalty
+        return float(np.sum(left * weighed(state, block, left))) + penalty
 
     best, aim = Moved(learnt, cost(state), np.inf), found.values
     for _ in range(CORRECTED + 1):
@@ -229,8 +230,9 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         moved = np.zeros_like(there.start)
         for name, at in there.where.items():
             moved[at] = values[name] - there.start[at]
-        left = np.where(weights > 0, state.data.pick(then.at.left, block), 0.0)
-        pull = _pull(state, block, there, weights * left) + there.normal.matrix @ moved
+        left = state.data.pick(then.at.left, block)
+        pull = _pull(there, state.data.plane_of(block), weighed(state, block, left))
+        pull += there.normal.matrix @ moved
         aim, before = _aim(there, found, bold * there.trust, pull), aim
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
@@ -251,10 +253,9 @@ def _within(there: Linear, bold: float) -> Posterior:
     return found
 
 
-def _pull(state: State, block: int, there: Linear, weighted: Array) -> Array:
-    """J^T W residual with the slopes of the start, [parameter]."""
-    columns, monitors = state.data.shape
-    plane = state.data.plane_of(block)
+def _pull(there: Linear, plane: Indices, weighted: Array) -> Array:
+    """J^T W residual with the slopes of the start, [parameter], of columns read in a plane each."""
+    columns, monitors = weighted.shape
     by_monitor = there.by_monitor * weighted
     alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
     ring = there.by_ring.reshape(len(there.by_ring), columns * monitors) @ weighted.ravel()
@@ -381,11 +382,9 @@ def log_evidence(state: State, good: Flags, shares: Array | None = None) -> floa
     total = 0.0
     for block in (block for block in (0, 1) if state.reads(block)):
         state = replace(look(state, block), good=good, independent=shares)
-        weights = weight(state, block)
-        use = weights > 0
-        left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-        count = np.broadcast_to(counts(state, block), use.shape)[use]
-        total += 0.5 * float(count @ np.log(weights[use] / count) - np.sum(weights * left**2))
+        left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
+        total += 0.5 * log_scale(state, block)
+        total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
         if state.of_block(block):
             there = linear(state, block)
             total += linear_evidence(there)[0]

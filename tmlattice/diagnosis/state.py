@@ -81,6 +81,8 @@ class State:
         apart: numbers that are wrong alone.
         independent: share of the readings that tell something of their own, see `independent`,
             [block, plane that is read]; None: all are taken to.
+        jitter: closed orbits that each step has an unknown amount of, as large as they typically
+            are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
         guessed: rms of the logarithm of a family's size about its first guess.
     """
 
@@ -97,6 +99,7 @@ class State:
     share: Array | None = None
     apart: tuple[Apart, ...] = ()
     independent: Array | None = None
+    jitter: Array | None = None
     guessed: float = GUESSED
 
     def of_block(self, block: int) -> tuple[Family, ...]:

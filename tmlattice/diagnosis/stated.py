@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.rounds import Linear
 from tmlattice.diagnosis.state import Apart, State
-from tmlattice.diagnosis.weights import weight
+from tmlattice.diagnosis.weights import taken, weight
 from tmlattice.inference.clusters import Found, Rows, widened
 from tmlattice.inference.normal import Posterior
 
@@ -60,4 +60,4 @@ def _widened(state: State, block: int, there: Linear, posterior: Posterior, foun
     for column in np.flatnonzero(weights.any(axis=1)):
         seen = np.flatnonzero(weights[column])
         left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]
-    return widened(rows, weights, left, found)
+    return widened(rows, weights, left, found, taken(state, block))

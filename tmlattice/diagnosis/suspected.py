@@ -17,7 +17,7 @@ from tmlattice.diagnosis.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.rounds import Linear, linear
 from tmlattice.diagnosis.small_errors import sizes_in
 from tmlattice.diagnosis.state import State
-from tmlattice.diagnosis.weights import weight
+from tmlattice.diagnosis.weights import weighed, weight
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
@@ -197,7 +197,7 @@ class Seen:
         for h, signature in zip(some, signatures, strict=True):
             for block, it in self.blocks.items():
                 row = np.where(weights[block] > 0, state.data.pick(signature, block), 0.0)
-                heavy = weights[block] * row
+                heavy = weighed(state, block, row)
                 it.own[h] = np.sum(heavy * row)
                 it.left[h] = np.sum(heavy * left[block])
                 it.across[:, h] = _across(it.there, heavy, state.data.plane_of(block))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.independent import independent
 from tmlattice.diagnosis.odd_readings import shares
 from tmlattice.diagnosis.state import State
+from tmlattice.inference.common import amounts, beside, common
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -22,6 +23,8 @@ FEW = 4
 """Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
 TYPICAL = 10.0
 """The median misfit of all columns counts as so many readings of each one's own."""
+LEAST = 0.2
+"""Of the noise: what the model lacks at least, and what noise is left beside a jitter."""
 DISPERSION = "quadrupole_gradient"
 """The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
 times what all others are, and would make the monitors' gains what fits it."""
@@ -44,6 +47,50 @@ def weight(state: State, block: int) -> Array:
     return np.where(use, count / variance, 0.0)
 
 
+def taken(state: State, block: int) -> Array | None:
+    """What the beam's jitter takes from the weights, see `inference.common`, [column, monitor,
+    pattern]; None where the beam stood still."""
+    return None if state.jitter is None else _common(state, block)[0]
+
+
+def _common(state: State, block: int) -> tuple[Array, Array]:
+    """What jitter takes from the weights, and its share of the log evidence."""
+    assert state.jitter is not None
+    count = counts(state, block)
+    alone = weight(state, block) / count
+    own, scale = common(alone, state.jitter[state.data.plane_of(block)])
+    return own * np.sqrt(count)[:, :, None], count[:, 0] * scale
+
+
+def weighed(state: State, block: int, left: Array) -> Array:
+    """Inverse covariance of the readings that are fitted times what is left, 1/m, [column,
+    monitor]."""
+    weights, own = weight(state, block), taken(state, block)
+    left = np.where(weights > 0, left, 0.0)
+    return weights * left if own is None else beside(weights, own, left)
+
+
+def log_scale(state: State, block: int) -> float:
+    """Logarithm of the determinant of that inverse covariance."""
+    weights = weight(state, block)
+    use = weights > 0
+    count = np.broadcast_to(counts(state, block), use.shape)[use]
+    total = float(count @ np.log(weights[use] / count))
+    return total if state.jitter is None else total - float(_common(state, block)[1].sum())
+
+
+def _without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
+    """What is left beside the likeliest jitter of each column, and the readings' noise, which
+    stated or learnt has the jitter in it, beside it; m, [column, monitor]."""
+    noise = state.data.noise_of(block)
+    if state.jitter is None:
+        return left, noise
+    patterns = state.jitter[state.data.plane_of(block)]
+    own = amounts(weight(state, block) / counts(state, block), patterns, left)[0]
+    alone = np.maximum(noise**2 - np.sum(patterns**2, axis=1), (LEAST * noise) ** 2)
+    return left - np.einsum("ck,ckm->cm", own, patterns), np.sqrt(alone)
+
+
 def counts(state: State, block: int) -> Array:
     """As how many readings each one counts, [column, 1]."""
     plane = state.data.plane_of(block)
@@ -56,6 +103,7 @@ def look(state: State, block: int) -> State:
     data = state.data
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)
+    left, alone = _without_jitter(state, block, left)
     if state.share is not None:
         state = replace(state, share=shares(state, block, left[:-1]))
     typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
@@ -66,17 +114,17 @@ def look(state: State, block: int) -> State:
     if state.allows(DISPERSION):
         squares[-1] = typical**2  # it is one column among many, and counts like any
     lacking = state.lacking.copy()
-    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (noise / 5) ** 2))
+    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
     good = state.good & _good_across(state) if block else good_monitors(state)
-    return _independent(replace(state, lacking=lacking, good=good), block, left)
+    return _independent(replace(state, lacking=lacking, good=good), block, left, alone)
 
 
-def _independent(state: State, block: int, left: Array) -> State:
+def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     """With the share of independent readings, where that is looked at: not before there are
     gradients, for all that they make is waves."""
     if state.independent is None or not state.allows(DISPERSION):
         return state
-    own, shares, noise = state.independent.copy(), state.share, state.data.noise_of(block)
+    own, shares = state.independent.copy(), state.share
     read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
     for p in (0, 1):
         rows = state.data.plane_of(block)[:-1] == p

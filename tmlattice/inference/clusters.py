@@ -9,12 +9,15 @@ Methodology 28 (2002) 169). By the model the mismatch of each is one standard de
 it is more, the errors are.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+
+from tmlattice.inference.common import beside
+from tmlattice.inference.normal import shared_by
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -77,7 +80,9 @@ class Found(NamedTuple):
         return cls(matrix, covariance, covariance, np.diag(covariance))
 
 
-def widened(rows: Rows, weight: Array, residual: Array, found: Found) -> Array:
+def widened(
+    rows: Rows, weight: Array, residual: Array, found: Found, taken: Array | None = None
+) -> Array:
     """Errors of a fit's quantities, widened where clusters of readings contradict one another.
 
     Where readings are independent they are the posterior's: up to some per cent that chance adds.
@@ -87,6 +92,8 @@ def widened(rows: Rows, weight: Array, residual: Array, found: Found) -> Array:
         weight: 1 / variance, 0 where missing, [column, monitor].
         residual: what the fit leaves, [column, monitor].
         found: the fit.
+        taken: from the weights by what the readings of a column have in common, L of
+            `inference.common.common`, [column, monitor, pattern]; None: they have nothing.
 
     Returns:
         Standard deviations, [quantity].
@@ -94,39 +101,91 @@ def widened(rows: Rows, weight: Array, residual: Array, found: Found) -> Array:
     # what the readings' noise makes of the variance; the rest is the prior's
     told = (found.along * (found.matrix @ found.along)).sum(axis=0)
     more = np.zeros_like(told)
-    for by in (0, 1):
-        shares, mismatch = _mismatches(rows, weight, residual, found, by)
+    for clusters in (_of_columns, _of_monitors):
+        shares, mismatch = _mismatches(clusters(rows, weight, residual, taken), found)
         size = np.maximum(shares.sum(axis=0), 1e-300)
         more += np.maximum((shares * mismatch).sum(axis=0) / size - 1, 0)
     return np.asarray(np.sqrt(np.maximum(found.variance + told * more, 0)))
 
 
-def _clusters(weight: Array, by: int) -> Iterator[tuple[Indices, Indices]]:
-    """Columns and monitors of the readings of one column (0), or of one monitor (1), each."""
-    read = np.flatnonzero(weight.any(axis=1 - by))
-    if len(read) > MOST:
-        read = np.sort(np.random.default_rng(0).permutation(read)[:MOST])
-    for own in read:
-        seen = np.flatnonzero(weight[own] if by == 0 else weight[:, own])
-        alike = np.full(len(seen), own)
-        yield (alike, seen) if by == 0 else (seen, alike)
+def _drawn(read: Array) -> Indices:
+    """Clusters that are taken out, of those that were read."""
+    found = np.flatnonzero(read)
+    if len(found) <= MOST:
+        return found
+    return np.sort(np.random.default_rng(0).permutation(found)[:MOST])
 
 
-def _mismatches(
-    rows: Rows, weight: Array, residual: Array, found: Found, by: int
-) -> tuple[Array, Array]:
+class _Cluster(NamedTuple):
+    """Readings that are taken out together, white beside all those that stay.
+
+    Attributes:
+        rows, column, monitor: of the readings.
+        root: by which they become white, [reading] or [reading, reading].
+        others: what the other readings of their columns tell, [reading, parameter]; None: nothing.
+        left: what the fit leaves, white, [reading].
+    """
+
+    rows: Rows
+    column: Indices
+    monitor: Indices
+    root: Array
+    others: Array | None
+    left: Array
+
+    def times(self, other: Array) -> Array:
+        """White rows times [parameter, any], [reading, any]."""
+        own = self.rows.times(self.column, self.monitor, other)
+        white = self.root[:, None] * own if self.root.ndim == 1 else self.root @ own
+        return np.asarray(white if self.others is None else white - self.others @ other)
+
+
+def _of_columns(
+    rows: Rows, weight: Array, residual: Array, taken: Array | None
+) -> Iterator[_Cluster]:
+    """Of one column each: nothing that stays has anything in common with them."""
+    for own in _drawn(weight.any(axis=1)):
+        monitor = np.flatnonzero(weight[own])
+        column = np.full(len(monitor), own)
+        root, left = np.sqrt(weight[own, monitor]), residual[own, monitor]
+        if taken is None:
+            yield _Cluster(rows, column, monitor, root, None, root * left)
+        else:
+            shared = taken[own, monitor]
+            root = np.linalg.cholesky(np.diag(root**2) - shared @ shared.T).T
+            yield _Cluster(rows, column, monitor, root, None, root @ left)
+
+
+def _of_monitors(
+    rows: Rows, weight: Array, residual: Array, taken: Array | None
+) -> Iterator[_Cluster]:
+    """Of one monitor each, one reading of a column: by the inverse covariance of the column, less
+    what its other readings tell."""
+    pulled = weight * residual if taken is None else beside(weight, taken, residual)
+    shared = None if taken is None else shared_by(*rows, taken)
+    for own in _drawn(weight.any(axis=0)):
+        column = np.flatnonzero(weight[:, own])
+        monitor, alone, others = np.full(len(column), own), weight[column, own], None
+        root = np.sqrt(alone)
+        if taken is not None and shared is not None:
+            here = taken[column, own]
+            root = np.sqrt(alone - np.sum(here**2, axis=1))
+            others = np.einsum("ck,pck->cp", here / root[:, None], shared[:, column])
+        left = pulled[column, own] / root
+        yield _Cluster(rows, column, monitor, alone / root, others, left)
+
+
+def _mismatches(clusters: Iterable[_Cluster], found: Found) -> tuple[Array, Array]:
     """Of each cluster its share of what is known of every quantity, and the square of what it says
     beside all others over what is expected of that, [cluster, quantity]."""
     known = found.variance > 0
     shares, mismatch = [], []
-    for column, monitor in _clusters(weight, by):
-        root = np.sqrt(weight[column, monitor])[:, None]
-        Y = along = root * rows.times(column, monitor, found.covariance)
+    for cluster in clusters:
+        Y = along = cluster.times(found.covariance)
         if found.along is not found.covariance:
-            Y = root * rows.times(column, monitor, found.along)
-        inside = root * rows.times(column, monitor, along.T)
-        left = root[:, 0] * residual[column, monitor]
-        solved = _apart((inside + inside.T) / 2, np.column_stack([Y, left]))
+            Y = cluster.times(found.along)
+        inside = cluster.times(along.T)
+        solved = _apart((inside + inside.T) / 2, np.column_stack([Y, cluster.left]))
         moved = Y.T @ solved[:, -1]
         grown = np.maximum((Y * solved[:, :-1]).sum(axis=0), 1e-300)  # of the variance without it
         whole = np.where(known, found.variance + grown, 1.0)

@@ -47,6 +47,7 @@ def normal_equations(
     by_monitor: Array,
     by_column: Array,
     by_ring: Array | Sequence[Array],
+    taken: Array | None = None,
 ) -> Normal:
     """Sums over all readings.
 
@@ -57,6 +58,8 @@ def normal_equations(
         by_monitor: d reading / d monitor's parameter, [column, monitor].
         by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
         by_ring: d reading / d error, [error, column, monitor]; may be empty.
+        taken: from the weights by what the readings of a column have in common, L of
+            `inference.common.common`, [column, monitor, pattern]; None: they have nothing.
     """
     columns, monitors = residual.shape
     J = np.asarray(by_ring, dtype=float).reshape(-1, columns, monitors)
@@ -86,7 +89,28 @@ def normal_equations(
     if len(J):
         A[m + c :, m + c :] = dsyrk(1.0, flat.T, trans=1, lower=0)
         b[m + c :] = flat @ (root * y).ravel()
+    if taken is not None:
+        shared = shared_by(plane, by_monitor, by_column, J, taken).reshape(len(A), -1)
+        A -= shared @ shared.T
+        b -= shared @ np.einsum("cm,cmk->ck", y, taken).ravel()
     return Normal(np.triu(A) + np.triu(A, 1).T, b)
+
+
+def shared_by(
+    plane: Indices, by_monitor: Array, by_column: Array, by_ring: Array, taken: Array
+) -> Array:
+    """J^T L of every column, [parameter, column, pattern]; see `normal_equations`."""
+    columns, monitors, patterns = taken.shape
+    m, own = 2 * monitors, np.arange(columns)
+    out = np.zeros((m + columns + len(by_ring), columns, patterns))
+    for p in (0, 1):
+        rows = np.flatnonzero(plane == p)
+        alone = by_monitor[rows, :, None] * taken[rows]
+        out[np.ix_(2 * np.arange(monitors) + p, rows)] = alone.transpose(1, 0, 2)
+    out[m + own, own] = np.einsum("cm,cmk->ck", by_column, taken)
+    if len(by_ring):
+        out[m + columns :] = (by_ring.transpose(1, 0, 2) @ taken).transpose(1, 0, 2)
+    return out
 
 
 @dataclass(frozen=True)

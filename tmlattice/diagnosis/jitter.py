@@ -1,0 +1,156 @@
+"""A jitter of the beam: closed orbits that every step has in it, each as much as chance has it.
+
+The orbits of a step are read seconds or minutes apart, and something kicks the beam meanwhile: a
+noisy supply, an injection element, the ground. All monitors read the same closed orbit then, in
+each step another amount of it. That is no noise of a monitor's own: hundreds of readings tell one
+amount. It is a covariance of each column's readings, whose amounts are integrated out
+(`inference.common`).
+
+It is sought where the ring's own errors hardly show, in the plane that is not kicked, beside the
+roll of each corrector: place by place, the one first that explains most, as long as evidence wants
+more. Which places these are is known up to the phase of the betatron oscillation.
+
+>>> found = sought(state)
+>>> state = settle(replace(state, jitter=found.orbits))
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.weights import weight
+from tmlattice.inference.common import amounts, beside, common
+
+Array = NDArray[np.float64]
+
+MOST = 3
+"""Places that kick, in a plane: two make every phase, a third is for what is not quite a wave."""
+LEAST = 5.0
+"""Log evidence of one, beyond that of as many places as there are."""
+SIZES = np.geomspace(0.03, 30.0, 40)
+"""That are tried, in units of a typical reading's noise."""
+FREE = 30.0
+"""Size of a corrector's own roll, in units of what its column has left: all but free."""
+ROUNDS = 30
+"""Of EM, for the sizes of all places together."""
+ENOUGH, COLUMNS = 12, 12
+"""Readings of a column, and columns, that it takes to say so."""
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """What was found.
+
+    Attributes:
+        orbits: as large as they typically are, m, [plane that is read, pattern, monitor]; a plane
+            with fewer of them has zeros.
+        places: magnets behind which a kick makes them, of each plane.
+    """
+
+    orbits: Array
+    places: tuple[tuple[str, ...], tuple[str, ...]]
+
+    @property
+    def sentence(self) -> str:
+        """In words."""
+        told = " and ".join(
+            f"{1e6 * np.sqrt(np.mean((own**2).sum(axis=0))):.2g} µm rms in {plane} "
+            f"(as from {', '.join(places)})"
+            for own, places, plane in zip(self.orbits, self.places, "xy", strict=True)
+            if places
+        )
+        return (
+            "the beam moved between the readings of a step, all monitors together, by another "
+            f"amount in each: {told}; which amount is taken for unknown (where it comes from is "
+            "known up to the phase of the betatron oscillation)"
+        )
+
+
+def sought(state: State) -> Jitter | None:
+    """The jitter that stands out, if any does.
+
+    Args:
+        state: with gains, rolls and gradients; a jitter that it has is not looked at.
+    """
+    still = replace(state, jitter=None)
+    found = [_in_plane(still, plane) for plane in (0, 1)]
+    most = max(len(places) for _, places in found)
+    if not most:
+        return None
+    orbits = np.zeros((2, most, len(state.data.at)))
+    for plane, (own, _) in enumerate(found):
+        orbits[plane, : len(own)] = own
+    return Jitter(orbits, (found[0][1], found[1][1]))
+
+
+def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
+    """Orbits [pattern, monitor] of one plane, and where they come from."""
+    data, at, model = state.data, state.at, state.at.model
+    found, places = np.zeros((0, len(data.at))), []
+    weights = weight(state, 1)
+    read = (data.plane_of(1) == plane) & ((weights > 0).sum(axis=1) >= ENOUGH)
+    read[-1] = False
+    if read.sum() < COLUMNS or not state.allows("corrector_roll"):
+        return found, ()
+    weights, left = weights[read], np.where(weights > 0, data.pick(at.left, 1), 0.0)[read]
+    rolls = data.pick(at.seen(at.across), 1)[read]
+    exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]
+    layers = np.arange(len(model.maps.layers))
+    orbits = orbits_of_kicks(model, layers, exits, rows, plane).T
+    orbits *= at.errors.monitors[:, plane, plane]
+    orbits /= np.maximum(_rms(orbits), 1e-300)
+    orbits *= np.median(data.noise[:, plane])
+    rolls *= FREE * _rms(left) / np.maximum(_rms(rolls), 1e-300)
+    for _ in range(MOST):
+        gained, sizes = _gains(weights, left, _patterns(rolls, found), orbits)
+        best = int(np.argmax(gained))
+        if gained[best] < LEAST + np.log(len(orbits)):
+            break
+        more = np.concatenate([found, sizes[best] * orbits[[best]]])
+        found = _sized(weights, left, rolls, more)
+        places.append(model.maps.layers[best])
+    return found, tuple(places)
+
+
+def _rms(values: Array) -> Array:
+    """Of each row, [row, 1]."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=1, keepdims=True)))
+
+
+def _patterns(rolls: Array, orbits: Array) -> Array:
+    """Of each column its own roll, and the orbits that all have, [column, pattern, monitor]."""
+    shared = np.broadcast_to(orbits, (len(rolls), *orbits.shape))
+    return np.concatenate([rolls[:, None], shared], axis=1)
+
+
+def _gains(weights: Array, left: Array, patterns: Array, orbits: Array) -> tuple[Array, Array]:
+    """Log evidence of each orbit beside patterns that are there, at its likeliest size; and that
+    size, [orbit].
+
+    A column knows the amount of an orbit with information d, and its likeliest one is n / d: with
+    a size s of all amounts the log evidence is the sum of s^2 n^2 / 2 (1 + s^2 d) - log(1 + s^2 d)
+    / 2.
+    """
+    taken = common(weights, patterns)[0]
+    score = orbits @ beside(weights, taken, left).T
+    known = orbits**2 @ weights.T
+    for k in range(taken.shape[2]):
+        known -= (orbits @ taken[..., k].T) ** 2
+    gained, size = np.full(len(orbits), -np.inf), np.zeros(len(orbits))
+    for s in SIZES:
+        spread = 1 + s**2 * known
+        now = 0.5 * (s**2 * score**2 / spread - np.log(spread)).sum(axis=1)
+        size = np.where(now > gained, s, size)
+        gained = np.maximum(gained, now)
+    return gained, size
+
+
+def _sized(weights: Array, left: Array, rolls: Array, orbits: Array) -> Array:
+    """Orbits as large as all columns together make each likely, by EM."""
+    for _ in range(ROUNDS):
+        likely, variance = amounts(weights, _patterns(rolls, orbits), left)
+        orbits = orbits * np.sqrt(np.mean(likely**2 + variance, axis=0))[1:, None]
+    return orbits

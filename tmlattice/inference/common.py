@@ -1,0 +1,62 @@
+"""Readings of a column that have some patterns in common, each by an amount that is unknown.
+
+Amounts are Gaussian with a size of one and are integrated out: of a column with weights W and
+patterns P (as large as they typically are) the inverse covariance is
+
+    (W^-1 + P^T P)^-1 = W - L L^T,   L = W P^T R^-T,   R R^T = 1 + P W P^T.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def _root(weight: Array, patterns: Array) -> tuple[Array, Array]:
+    """P W [column, pattern, monitor], and R [column, pattern, pattern]."""
+    pulled = patterns * weight[:, None]
+    inside = pulled @ patterns.transpose(0, 2, 1) + np.eye(patterns.shape[1])
+    return pulled, np.linalg.cholesky(inside)
+
+
+def common(weight: Array, patterns: Array) -> tuple[Array, Array]:
+    """What patterns in common take from the weights.
+
+    Args:
+        weight: 1 / variance of what each reading has of its own, [column, monitor].
+        patterns: as large as they typically are, [column, pattern, monitor].
+
+    Returns:
+        L, [column, monitor, pattern]: diag(weight) - L L^T is the inverse covariance of a column.
+        Logarithm of the determinant of W^-1 + P^T P over that of W^-1, [column].
+    """
+    pulled, root = _root(weight, patterns)
+    taken = np.linalg.solve(root, pulled).transpose(0, 2, 1)
+    return taken, 2 * np.log(np.einsum("ckk->ck", root)).sum(axis=1)
+
+
+def amounts(weight: Array, patterns: Array, left: Array) -> tuple[Array, Array]:
+    """The likeliest amounts of patterns in common, and their variances, [column, pattern].
+
+    Args:
+        weight, patterns: as in `common`.
+        left: what is to be explained, [column, monitor]; it counts where it has a weight.
+    """
+    pulled, root = _root(weight, patterns)
+    half = np.linalg.inv(root)
+    covariance = half.transpose(0, 2, 1) @ half
+    said = np.einsum("ckm,cm->ck", pulled, np.where(weight > 0, left, 0.0))
+    return np.einsum("ckl,cl->ck", covariance, said), np.einsum("ckk->ck", covariance)
+
+
+def beside(weight: Array, taken: Array, left: Array) -> Array:
+    """Inverse covariance times what is left, [column, monitor].
+
+    Args:
+        weight: of each reading, 0 where missing, [column, monitor].
+        taken: L of `common`, [column, monitor, pattern].
+        left: [column, monitor].
+    """
+    left = np.where(weight > 0, left, 0.0)
+    shared = np.einsum("cmk,cm->ck", taken, left)
+    return np.asarray(weight * left - np.einsum("cmk,ck->cm", taken, shared))
