@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.inference.clusters import Found, Rows, _mismatches, widened
+from tmlattice.inference.clusters import (
+    Found,
+    Rows,
+    _mismatches,
+    _of_columns,
+    _of_monitors,
+    widened,
+)
 from tmlattice.inference.normal import normal_equations, solve
 from tmlattice.inference.priors import Group
 
@@ -72,7 +79,7 @@ def test_a_cluster_against_all_others_vs_a_fit_without_it(by, rng):
     weight[3, 5] = 0.0  # a missing reading
     found, there = solved(rows, noise, weight)
     left = noise - readings(rows, found.values)
-    shares, mismatch = _mismatches(rows, weight, left, there, by)
+    shares, mismatch = _mismatches((_of_columns, _of_monitors)[by](rows, weight, left, None), there)
     without = weight.copy()
     without[(7, slice(None)) if by == 0 else (slice(None), 7)] = 0.0
     other, apart = solved(rows, noise, without)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
+from tmlattice.diagnosis.jitter import Jitter, sought
 from tmlattice.diagnosis.judges import Chi2, Score, against, inner, lost, score
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.odd_steps import beside, odd_steps
@@ -192,7 +193,20 @@ def fit_steps(
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
-    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), odd.said)
+    said = odd.said if moving is None else (*odd.said, moving.sentence)
+    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
+
+
+def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
+    """With a jitter of the beam, where one stands out and those who choose do not object."""
+    moving = sought(state)
+    if moving is None:
+        return state, None
+    progress("jitter of the beam")
+    with_it = settle(replace(state, jitter=moving.orbits))
+    said = lost(inner(state), inner(with_it))
+    log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
+    return (state, None) if against(said) else (with_it, moving)
 
 
 def one_by_one(

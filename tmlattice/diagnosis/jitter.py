@@ -14,6 +14,7 @@ more. Which places these are is known up to the phase of the betatron oscillatio
 >>> state = settle(replace(state, jitter=found.orbits))
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,10 +27,15 @@ from tmlattice.inference.common import amounts, beside, common
 
 Array = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
+
 MOST = 3
 """Places that kick, in a plane: two make every phase, a third is for what is not quite a wave."""
 LEAST = 5.0
 """Log evidence of one, beyond that of as many places as there are."""
+SHARE = 0.5
+"""Of what a typical column has left beside its own roll, in the mean square, that a jitter is at
+least: less may be waves of another origin, and its covariance mends nothing then."""
 SIZES = np.geomspace(0.03, 30.0, 40)
 """That are tried, in units of a typical reading's noise."""
 FREE = 30.0
@@ -112,7 +118,19 @@ def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
         more = np.concatenate([found, sizes[best] * orbits[[best]]])
         found = _sized(weights, left, rolls, more)
         places.append(model.maps.layers[best])
+    without, within = (
+        np.median(_rms(_rest(weights, left, _patterns(rolls, own)))) for own in (found[:0], found)
+    )
+    log.info("plane %d: %s leave %.3g of %.3g m", plane, places, within, without)
+    if within > np.sqrt(1 - SHARE) * without:
+        return found[:0], ()
     return found, tuple(places)
+
+
+def _rest(weights: Array, left: Array, patterns: Array) -> Array:
+    """What is left beside the likeliest amounts of patterns, [column, monitor]."""
+    likely = amounts(weights, patterns, left)[0]
+    return np.where(weights > 0, left - np.einsum("ck,ckm->cm", likely, patterns), 0.0)
 
 
 def _rms(values: Array) -> Array:

@@ -10,7 +10,7 @@ it is more, the errors are.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,7 @@ def widened(
     return np.asarray(np.sqrt(np.maximum(found.variance + told * more, 0)))
 
 
-def _drawn(read: Array) -> Indices:
+def _drawn(read: Any) -> Indices:
     """Clusters that are taken out, of those that were read."""
     found = np.flatnonzero(read)
     if len(found) <= MOST:

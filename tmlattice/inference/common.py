@@ -16,7 +16,7 @@ def _root(weight: Array, patterns: Array) -> tuple[Array, Array]:
     """P W [column, pattern, monitor], and R [column, pattern, pattern]."""
     pulled = patterns * weight[:, None]
     inside = pulled @ patterns.transpose(0, 2, 1) + np.eye(patterns.shape[1])
-    return pulled, np.linalg.cholesky(inside)
+    return pulled, np.asarray(np.linalg.cholesky(inside))
 
 
 def common(weight: Array, patterns: Array) -> tuple[Array, Array]:
@@ -32,7 +32,7 @@ def common(weight: Array, patterns: Array) -> tuple[Array, Array]:
     """
     pulled, root = _root(weight, patterns)
     taken = np.linalg.solve(root, pulled).transpose(0, 2, 1)
-    return taken, 2 * np.log(np.einsum("ckk->ck", root)).sum(axis=1)
+    return np.asarray(taken), 2 * np.log(np.einsum("ckk->ck", root)).sum(axis=1)
 
 
 def amounts(weight: Array, patterns: Array, left: Array) -> tuple[Array, Array]:
