@@ -2,9 +2,9 @@
 
 Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed, with
 default options, one after another; PETRA III's folder is diagnosed as it is. Told
-are the rms of held-out correctors, in plane, in the other plane (with a roll of their own where
-that was weighed) and of the RF's orbit, in micrometres: of the lattice and of the result; beside
-them what the experts' own LOCO fit leaves of all the data that it was fitted to (its last model,
+are the rms of held-out correctors, in plane (with a position jump of their own), in the other plane
+(with a roll of their own where that was weighed) and of the RF's orbit, in micrometres: of the
+lattice and of the result; beside them what the experts' own LOCO fit leaves of all the data that it was fitted to (its last model,
 in the file). Then the steps, kept and refused. `--iteration first` takes the model as it was
 before that fit; `--seed N` another split, `--seeds N` that many of them; `--families` seeks no
 single faults among small errors, which takes most of the time; `--json FILE` writes the table,
@@ -135,10 +135,11 @@ def _as_it_comes(name, seed, found):
 
 
 def _figures(step):
-    """In plane / across (with a roll) / RF."""
+    """In plane (with a jump) / across (with a roll) / RF."""
+    jump = "" if step["with_jump"] is None else f" ({step['with_jump']:.2f})"
     roll = "" if step["with_roll"] is None else f" ({step['with_roll']:.2f})"
     rf = "-" if step["rf"] is None else f"{step['rf']:.1f}"
-    return f"{step['in_plane']:.2f} / {step['coupling']:.2f}{roll} / {rf}"
+    return f"{step['in_plane']:.2f}{jump} / {step['coupling']:.2f}{roll} / {rf}"
 
 
 def _diagnosed(lattice, folder, seed, pictures, name):
@@ -202,6 +203,7 @@ def _step(step):
         "in_plane": micro("heldout_rms_in_plane"),
         "coupling": micro("heldout_rms_coupling"),
         "with_roll": micro("heldout_rms_roll"),
+        "with_jump": micro("heldout_rms_position"),
         "rf": micro("dispersion_rms"),
         "chi2": step["heldout_chi2_per_dof"],
     }
@@ -209,8 +211,8 @@ def _step(step):
 
 def table(rows):
     """The table, as Markdown."""
-    yield ("| ring | noise | lattice: in-plane / coupling / RF | result: in-plane / coupling "
-           "(with roll) / RF | chi² held out | fitted | experts' fit: in-plane / coupling | "
+    yield ("| ring | noise | lattice: in-plane / coupling / RF | result: in-plane (with "
+           "jump) / coupling (with roll) / RF | chi² held out | fitted | experts' fit: in-plane / coupling | "
            "verdict | s |")  # fmt: skip
     yield "|" + "---|" * 9
     for row in rows:
@@ -232,8 +234,8 @@ def over_seeds(row):
     if len(good) < 2:
         return
     said = []
-    for key, unit in (("in_plane", " µm"), ("coupling", " µm"), ("with_roll", " µm"),
-                      ("rf", " µm"), ("chi2", "")):  # fmt: skip
+    for key, unit in (("in_plane", " µm"), ("with_jump", " µm"), ("coupling", " µm"),
+                      ("with_roll", " µm"), ("rf", " µm"), ("chi2", "")):  # fmt: skip
         values = [one[key] for one in good if one[key] is not None]
         if values:
             said.append(f"{key} {np.median(values):.2f}{unit}, at worst {max(values):.2f}")
