@@ -1,14 +1,15 @@
 """Measured responses of real rings: `TMLATTICE_DATA=... python benchmarks/real_rings.py [NAME]`.
 
 Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed, with
-default options, one after another; PETRA III's folder is diagnosed as it is. Told
-are the rms of held-out correctors, in plane (with a position jump of their own), in the other plane
-(with a roll of their own where that was weighed) and of the RF's orbit, in micrometres: of the
-lattice and of the result; beside them what the experts' own LOCO fit leaves of all the data that it was fitted to (its last model,
-in the file). Then the steps, kept and refused. `--iteration first` takes the model as it was
-before that fit; `--seed N` another split, `--seeds N` that many of them; `--families` seeks no
-single faults among small errors, which takes most of the time; `--json FILE` writes the table,
-`--pictures FOLDER` a picture a ring: what is left before and after, and the gradients.
+default options, one after another; PETRA III's folder is diagnosed as it is. Told are the rms of
+held-out correctors, in plane (with a position jump of their own), in the other plane (with a roll
+of their own where that was weighed) and of the RF's orbit, in micrometres: of the lattice and of
+the result; beside them what the experts' own LOCO fit leaves of all the data that it was fitted to
+(its last model, in the file). Then the steps, kept and refused. `--iteration first` takes the
+model as it was before that fit; `--seed N` another split, `--seeds N` that many of them;
+`--families` seeks no single faults among small errors, which takes most of the time; `--json FILE`
+writes the table, `--pictures FOLDER` a picture a ring: what is left before and after, and the
+gradients.
 
 Of several seeds each is told as it comes, and at the end of each ring the median and the worst, and
 by how much what was found scatters between them, in units of its stated errors: 0.5 is right where
@@ -211,9 +212,9 @@ def _step(step):
 
 def table(rows):
     """The table, as Markdown."""
-    yield ("| ring | noise | lattice: in-plane / coupling / RF | result: in-plane (with "
-           "jump) / coupling (with roll) / RF | chi² held out | fitted | experts' fit: in-plane / coupling | "
-           "verdict | s |")  # fmt: skip
+    yield ("| ring | noise | lattice: in-plane (with jump) / coupling / RF | result: in-plane "
+           "(with jump) / coupling (with roll) / RF | chi² held out | fitted | experts' fit: "
+           "in-plane / coupling | verdict | s |")  # fmt: skip
     yield "|" + "---|" * 9
     for row in rows:
         if "error" in row:

@@ -65,8 +65,8 @@ def test_likeliest_amounts(problem):
 
 
 def test_errors_of_clusters_are_those_of_fits_without_them(problem):
-    """Rows that are white already, which a change of variables makes of common patterns, are the
-    referee for columns: cases without and with patterns agree once these are taken out."""
+    """Each column, and each monitor, is left out of a fit with dense covariances; the errors are
+    widened by how far these fits are from that of all, over what is expected of that."""
     rows, weight, patterns, left = problem
     J, V, seen = dense(rows, weight, patterns)
     prior = np.eye(J.shape[1])

@@ -10,7 +10,7 @@ it is more, the errors are.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,9 +108,9 @@ def widened(
     return np.asarray(np.sqrt(np.maximum(found.variance + told * more, 0)))
 
 
-def _drawn(read: Any) -> Indices:
-    """Clusters that are taken out, of those that were read."""
-    found = np.flatnonzero(read)
+def _drawn(weight: Array, axis: int) -> Indices:
+    """Clusters that are taken out, of those that have readings along an axis."""
+    found = np.flatnonzero(weight.sum(axis))
     if len(found) <= MOST:
         return found
     return np.sort(np.random.default_rng(0).permutation(found)[:MOST])
@@ -144,7 +144,7 @@ def _of_columns(
     rows: Rows, weight: Array, residual: Array, taken: Array | None
 ) -> Iterator[_Cluster]:
     """Of one column each: nothing that stays has anything in common with them."""
-    for own in _drawn(weight.any(axis=1)):
+    for own in _drawn(weight, axis=1):
         monitor = np.flatnonzero(weight[own])
         column = np.full(len(monitor), own)
         root, left = np.sqrt(weight[own, monitor]), residual[own, monitor]
@@ -162,15 +162,15 @@ def _of_monitors(
     """Of one monitor each, one reading of a column: by the inverse covariance of the column, less
     what its other readings tell."""
     pulled = weight * residual if taken is None else beside(weight, taken, residual)
-    shared = None if taken is None else shared_by(*rows, taken)
-    for own in _drawn(weight.any(axis=0)):
+    shared = None if taken is None else (taken, shared_by(*rows, taken))
+    for own in _drawn(weight, axis=0):
         column = np.flatnonzero(weight[:, own])
         monitor, alone, others = np.full(len(column), own), weight[column, own], None
         root = np.sqrt(alone)
-        if taken is not None and shared is not None:
-            here = taken[column, own]
+        if shared is not None:
+            here, told = shared[0][column, own], shared[1][:, column]
             root = np.sqrt(alone - np.sum(here**2, axis=1))
-            others = np.einsum("ck,pck->cp", here / root[:, None], shared[:, column])
+            others = np.einsum("ck,pck->cp", here / root[:, None], told)
         left = pulled[column, own] / root
         yield _Cluster(rows, column, monitor, alone / root, others, left)
 
