@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
-from tmlattice.diagnosis.jitter import Jitter, sought
-from tmlattice.diagnosis.judges import Chi2, Score, against, inner, lost, score
+from tmlattice.diagnosis.jitter import MOSTLY, Jitter, sought
+from tmlattice.diagnosis.judges import Chi2, Score, against, clearly_for, inner, lost, score
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
@@ -198,15 +198,18 @@ def fit_steps(
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
-    """With a jitter of the beam, where one stands out and those who choose do not object."""
+    """With a jitter of the beam, where one stands out and those who choose do not object; or where
+    one is seen and they fare clearly better with it."""
     moving = sought(state)
     if moving is None:
         return state, None
     progress("jitter of the beam")
-    with_it = settle(replace(state, jitter=moving.orbits))
-    said = lost(inner(state), inner(with_it))
+    beside_it = replace(state, jitter=moving.orbits)
+    with_it = settle(beside_it)
+    said = lost(inner(beside_it), inner(with_it))
     log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
-    return (state, None) if against(said) else (with_it, moving)
+    taken = not against(said) if moving.share > MOSTLY else clearly_for(said)
+    return (with_it, moving) if taken else (state, None)
 
 
 def one_by_one(

@@ -16,16 +16,20 @@ more. Which places these are is known up to the phase of the betatron oscillatio
 
 import logging
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.independent import independent
 from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.weights import weight
 from tmlattice.inference.common import amounts, beside, common
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
@@ -33,16 +37,21 @@ MOST = 3
 """Places that kick, in a plane: two make every phase, a third is for what is not quite a wave."""
 LEAST = 5.0
 """Log evidence of one, beyond that of as many places as there are."""
-SHARE = 0.5
+SHARE = 0.25
 """Of what a typical column has left beside its own roll, in the mean square, that a jitter is at
-least: less may be waves of another origin, and its covariance mends nothing then."""
-SIZES = np.geomspace(0.03, 30.0, 40)
-"""That are tried, in units of a typical reading's noise."""
+least: less is not worth a covariance."""
+MOSTLY = 0.5
+"""From which share on it needs no other witness: less may be waves of another origin, whose
+covariance mends nothing."""
+SIZES = np.geomspace(0.01, 3.0, 30)
+"""That are tried, in units of what a typical column has left."""
+PASSES = 3
+"""Through all places: how well each is told depends on what the others leave."""
 FREE = 30.0
 """Size of a corrector's own roll, in units of what its column has left: all but free."""
 ROUNDS = 30
 """Of EM, for the sizes of all places together."""
-ENOUGH, COLUMNS = 12, 12
+ENOUGH, COLUMNS = 12, 8
 """Readings of a column, and columns, that it takes to say so."""
 
 
@@ -54,10 +63,13 @@ class Jitter:
         orbits: as large as they typically are, m, [plane that is read, pattern, monitor]; a plane
             with fewer of them has zeros.
         places: magnets behind which a kick makes them, of each plane.
+        share: of what a typical column has left beside its own roll, in the mean square, in the
+            plane where it is more.
     """
 
     orbits: Array
     places: tuple[tuple[str, ...], tuple[str, ...]]
+    share: float
 
     @property
     def sentence(self) -> str:
@@ -82,49 +94,76 @@ def sought(state: State) -> Jitter | None:
         state: with gains, rolls and gradients; a jitter that it has is not looked at.
     """
     still = replace(state, jitter=None)
-    found = [_in_plane(still, plane) for plane in (0, 1)]
-    most = max(len(places) for _, places in found)
-    if not most:
+    x, y = (_in_plane(still, plane) for plane in (0, 1))
+    share = max(x.share, y.share)
+    if share < SHARE:
         return None
-    orbits = np.zeros((2, most, len(state.data.at)))
-    for plane, (own, _) in enumerate(found):
-        orbits[plane, : len(own)] = own
-    return Jitter(orbits, (found[0][1], found[1][1]))
+    orbits = np.zeros((2, max(len(x.places), len(y.places)), len(state.data.at)))
+    for plane, own in enumerate((x, y)):
+        orbits[plane, : len(own.places)] = own.orbits
+    return Jitter(orbits, (x.places, y.places), share)
 
 
-def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
-    """Orbits [pattern, monitor] of one plane, and where they come from."""
+class _OfPlane(NamedTuple):
+    """Orbits [pattern, monitor] of one plane, where they come from, their share of what is left."""
+
+    orbits: Array
+    places: tuple[str, ...]
+    share: float
+
+
+def _in_plane(state: State, plane: int) -> _OfPlane:
+    """What is found in one plane."""
     data, at, model = state.data, state.at, state.at.model
-    found, places = np.zeros((0, len(data.at))), []
+    nothing = _OfPlane(np.zeros((0, len(data.at))), (), 0.0)
     weights = weight(state, 1)
     read = (data.plane_of(1) == plane) & ((weights > 0).sum(axis=1) >= ENOUGH)
     read[-1] = False
     if read.sum() < COLUMNS or not state.allows("corrector_roll"):
-        return found, ()
+        return nothing
     weights, left = weights[read], np.where(weights > 0, data.pick(at.left, 1), 0.0)[read]
     rolls = data.pick(at.seen(at.across), 1)[read]
+    rolls *= FREE * _rms(left) / np.maximum(_rms(rolls), 1e-300)
+    without = rest = _rest(weights, left, _patterns(rolls, nothing.orbits))
     exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]
     layers = np.arange(len(model.maps.layers))
     orbits = orbits_of_kicks(model, layers, exits, rows, plane).T
     orbits *= at.errors.monitors[:, plane, plane]
-    orbits /= np.maximum(_rms(orbits), 1e-300)
-    orbits *= np.median(data.noise[:, plane])
-    rolls *= FREE * _rms(left) / np.maximum(_rms(rolls), 1e-300)
-    for _ in range(MOST):
+    orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), 1e-300)
+    least = (NOISE_LEFT * data.noise_of(1)[read]) ** 2
+    count = 1.0  # what makes few readings independent is what is sought
+    for _ in range(PASSES):
+        weights = count * _weights(weights > 0, rest, least)
+        found, which = _places(weights, left, rolls, orbits)
+        rest = _rest(weights, left, _patterns(rolls, found))
+        count = independent(np.where(weights > 0, rest, np.nan), np.sqrt(least))
+    places = tuple(model.maps.layers[i] for i in which)
+    before, after = np.median(_rms(without)), np.median(_rms(rest))
+    log.info("plane %d: %s leave %.3g of %.3g m", plane, places, after, before)
+    share = 1 - float((after / before) ** 2)
+    return nothing if share < SHARE else _OfPlane(found, places, share)
+
+
+def _weights(seen: Flags, rest: Array, least: Array) -> Array:
+    """1 / variance of what is left, of each column at least that of the typical one, [column,
+    monitor]."""
+    squares = np.sum(rest**2, axis=1, keepdims=True) / seen.sum(axis=1, keepdims=True)
+    return np.where(seen, 1 / (np.maximum(squares, np.median(squares)) + least), 0.0)
+
+
+def _places(weights: Array, left: Array, rolls: Array, orbits: Array) -> tuple[Array, list[int]]:
+    """Orbits that columns have in common beside their rolls, as large as they typically are; and
+    which these are."""
+    found, which = orbits[:0], list[int]()
+    while len(which) < MOST:
         gained, sizes = _gains(weights, left, _patterns(rolls, found), orbits)
         best = int(np.argmax(gained))
         if gained[best] < LEAST + np.log(len(orbits)):
             break
-        more = np.concatenate([found, sizes[best] * orbits[[best]]])
-        found = _sized(weights, left, rolls, more)
-        places.append(model.maps.layers[best])
-    without, within = (
-        np.median(_rms(_rest(weights, left, _patterns(rolls, own)))) for own in (found[:0], found)
-    )
-    log.info("plane %d: %s leave %.3g of %.3g m", plane, places, within, without)
-    if within > np.sqrt(1 - SHARE) * without:
-        return found[:0], ()
-    return found, tuple(places)
+        found = np.concatenate([found, sizes[best] * orbits[[best]]])
+        found = _sized(weights, left, rolls, found)
+        which.append(best)
+    return found, which
 
 
 def _rest(weights: Array, left: Array, patterns: Array) -> Array:
@@ -167,8 +206,10 @@ def _gains(weights: Array, left: Array, patterns: Array, orbits: Array) -> tuple
 
 
 def _sized(weights: Array, left: Array, rolls: Array, orbits: Array) -> Array:
-    """Orbits as large as all columns together make each likely, by EM."""
+    """Orbits as large as all columns together make each likely, those whose amounts go together
+    combined, by EM."""
     for _ in range(ROUNDS):
-        likely, variance = amounts(weights, _patterns(rolls, orbits), left)
-        orbits = orbits * np.sqrt(np.mean(likely**2 + variance, axis=0))[1:, None]
+        likely, covariance = amounts(weights, _patterns(rolls, orbits), left)
+        squares = np.mean(likely[:, :, None] * likely[:, None] + covariance, axis=0)[1:, 1:]
+        orbits = np.linalg.cholesky(squares).T @ orbits
     return orbits

@@ -20,8 +20,8 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
 25 readings), and by how much their sum may fall without a step that stays all the same: evidence
 takes what the model lacks for noise, and gladly fits it."""
-SURELY = 1.0
-"""Standard errors of that fall from which on it counts."""
+SURELY, CLEARLY = 1.0, 2.0
+"""Standard errors of a fall from which on it counts, and of a rise that is a reason by itself."""
 
 
 class Chi2(NamedTuple):
@@ -76,8 +76,15 @@ class _Missed(NamedTuple):
     rf_monitors: Flags
 
 
-def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
-    """What correctors that were not fitted say; see `score`."""
+def _missed(
+    state: State, judges: Flags, rf: Flags | None = None, jitter: Array | None = None
+) -> _Missed:
+    """What correctors that were not fitted say; see `score`.
+
+    Args:
+        state, judges, rf: as there.
+        jitter: orbits that a step may have some of, see `State`, which near monitors tell too.
+    """
     data, at, half = state.data, state.at, state.split.half
     read = at.seen(at.beam)
     straight, across = data.pick(read), data.pick(read, 1)
@@ -88,13 +95,25 @@ def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
     variance, variance_across = (data.noise_of(block) ** 2 for block in (0, 1))
     inside, jumped, outside, rolled, squares, spread = [], [], [], [], [], []
     cross = []
+    moving = np.zeros((2, 0, data.shape[1])) if jitter is None else jitter
+    typical = np.median(data.noise, axis=0)
+
+    def still(left: Array, near: Flags, plane: int) -> Array:
+        """Without the jitter that near monitors tell."""
+        orbits = moving[plane].T
+        held = np.full(orbits.shape[1], typical[plane])
+        amounts, _ = amplitudes(orbits, left, near, near, held)
+        return np.asarray(left - orbits @ amounts)
+
     for c in np.flatnonzero(judges):
         seen = np.isfinite(orbits[c]) & state.good
         near, far = seen & half[c], seen & ~half[c]
         if not (near.any() and far.any()):
             continue
         # all alike: what the model lacks is not the readings' noise
-        kick, miss = amplitudes(straight[c][:, None], orbits[c], near, far)
+        moved = moving[data.plane[c]].T
+        held = np.append(0.0, np.full(moved.shape[1], typical[data.plane[c]]))
+        kick, miss = amplitudes(np.column_stack([straight[c], moved]), orbits[c], near, far, held)
         inside.append(miss)
         squares.append(miss**2 / variance[c, far])
         # the kick's own error stands beside the reading's
@@ -102,12 +121,16 @@ def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
         jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
         left = orbits_across[c] - kick[0] * across[c]
         there = np.isfinite(left)
+        if moving.size and (near & there).any():
+            left = still(left, near & there, 1 - data.plane[c])
         outside.append(left[far & there])
         cross.append(outside[-1] ** 2 / variance_across[c, far & there])
         if rolls[c].any() and (near & there).any():
             rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
     judge = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
-    of_rf = (orbits[-1] - straight[-1])[judge]
+    left = orbits[-1] - straight[-1]
+    near = state.good & np.isfinite(left) & half[-1] & ~judge
+    of_rf = (still(left, near, 0) if moving.size and near.any() else left)[judge]
     return _Missed(inside, outside, jumped, rolled, squares, cross, spread, of_rf,
                    of_rf**2 / variance[-1, judge], judge)  # fmt: skip
 
@@ -161,9 +184,13 @@ def _logs(sums: Array) -> Array:
 
 def inner(state: State) -> Judged:
     """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
-    monitors gives the kick once."""
+    monitors gives the kick once, and a jitter of the beam that the state has: else one that the
+    judges have themselves would hide what is better."""
     other = replace(state, split=replace(state.split, half=~state.split.half))
-    said = [_missed(one, state.split.inner, state.split.inner_rf) for one in (state, other)]
+    said = [
+        _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
+        for one in (state, other)
+    ]
     sums = [
         np.array([[[np.sum(own**2), len(own)] for own in pair]
                   for pair in zip(one.inside, one.outside, strict=True)])
@@ -194,3 +221,8 @@ def lost(without: Judged, within: Judged) -> tuple[float, float]:
 def against(said: tuple[float, float]) -> bool:
     """Whether the judges would rather be without, by what `lost` says."""
     return said[0] < -max(VETO, SURELY * said[1])
+
+
+def clearly_for(said: tuple[float, float]) -> bool:
+    """Whether the judges alone are reason enough, by what `lost` says."""
+    return said[0] > max(VETO, CLEARLY * said[1])

@@ -234,9 +234,21 @@ def rms_of(parts: Iterable[Array]) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-def amplitudes(patterns: Array, data: Array, near: Flags, far: Flags) -> tuple[Array, Array]:
-    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss."""
+def amplitudes(
+    patterns: Array, data: Array, near: Flags, far: Flags, held: Array | None = None
+) -> tuple[Array, Array]:
+    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss.
+
+    Args:
+        patterns, data: m, [monitor, pattern] and [monitor].
+        near, far: [monitor].
+        held: by priors about zero, noise of a reading over the amplitude's rms, [pattern]; 0: free.
+    """
     size = np.abs(patterns[near]).max(axis=0)
     size[size == 0] = 1
-    amounts = np.linalg.lstsq(patterns[near] / size, data[near], rcond=None)[0] / size
+    rows, right = patterns[near] / size, data[near]
+    if held is not None:
+        rows = np.concatenate([rows, np.diag(held / size)])
+        right = np.concatenate([right, np.zeros(len(held))])
+    amounts = np.linalg.lstsq(rows, right, rcond=None)[0] / size
     return amounts, data[far] - patterns[far] @ amounts

@@ -36,7 +36,8 @@ def common(weight: Array, patterns: Array) -> tuple[Array, Array]:
 
 
 def amounts(weight: Array, patterns: Array, left: Array) -> tuple[Array, Array]:
-    """The likeliest amounts of patterns in common, and their variances, [column, pattern].
+    """The likeliest amounts of patterns in common, [column, pattern], and their covariances,
+    [column, pattern, pattern].
 
     Args:
         weight, patterns: as in `common`.
@@ -46,7 +47,7 @@ def amounts(weight: Array, patterns: Array, left: Array) -> tuple[Array, Array]:
     half = np.linalg.inv(root)
     covariance = half.transpose(0, 2, 1) @ half
     said = np.einsum("ckm,cm->ck", pulled, np.where(weight > 0, left, 0.0))
-    return np.einsum("ckl,cl->ck", covariance, said), np.einsum("ckk->ck", covariance)
+    return np.einsum("ckl,cl->ck", covariance, said), covariance
 
 
 def beside(weight: Array, taken: Array, left: Array) -> Array:
