@@ -64,7 +64,7 @@ class _Magnets(Family):
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
         """Of every piece."""
         return [
-            (Cause(self.effect, place, share * float(value)), share * float(error))
+            (Cause(self.effect, place, share * float(value)), abs(share) * float(error))
             for pieces, value, error in zip(self.shares(data), values, sigma, strict=True)
             for place, share in pieces.items()
         ]

@@ -84,6 +84,8 @@ class State:
         jitter: closed orbits that each step has an unknown amount of, as large as they typically
             are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
         guessed: rms of the logarithm of a family's size about its first guess.
+        unneeded: families that were tried: their numbers are taken for zero, and stated errors know
+            that they may not be.
     """
 
     data: ResponseData
@@ -101,6 +103,7 @@ class State:
     independent: Array | None = None
     jitter: Array | None = None
     guessed: float = GUESSED
+    unneeded: tuple[Family, ...] = ()
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

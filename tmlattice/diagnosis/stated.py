@@ -8,17 +8,19 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.rounds import Linear
-from tmlattice.diagnosis.state import Apart, State
+from tmlattice.diagnosis.rounds import Linear, linear
+from tmlattice.diagnosis.state import Apart, State, allow
 from tmlattice.diagnosis.weights import taken, weight
 from tmlattice.inference.clusters import Found, Rows, widened
 from tmlattice.inference.normal import Posterior
+from tmlattice.inference.unknown_sizes import of_sizes
 
 Array = NDArray[np.float64]
 
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Posterior errors, widened where single columns, or monitors, contradict all others.
+    """Posterior errors, widened where single columns, or monitors, contradict all others, and by
+    what the sizes of families are unknown by, of those too that were tried and not needed.
 
     Args:
         state: where the fit stands.
@@ -31,7 +33,13 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Arr
     """
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     found = Found.of(there.normal.matrix, covariance)
-    return _widened(state, block, there, posterior, found)
+    sigma = _widened(state, block, there, posterior, found)
+    tried = [f for f in state.unneeded if f.block == block and f.per == "ring"]
+    if tried:
+        there = linear(allow(state, tried), block)
+    gone = [group.name for family in tried for group in family.groups(state.data)]
+    more = of_sizes(there.normal, there.groups, there.start, gone)
+    return np.asarray(np.sqrt(sigma**2 + more[: len(sigma)]))  # what was tried comes after
 
 
 def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:

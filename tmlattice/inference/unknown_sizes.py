@@ -1,0 +1,135 @@
+"""What numbers are unknown by because the sizes of their priors are.
+
+A family's size follows the evidence. Where it has few members, or the data say little of them, the
+evidence is flat: a size near zero, which holds its members there as if they were known, is as
+likely as one twenty times as large, with which they, and all that makes up for them, are elsewhere.
+So it is with a family that was tried and left out. Errors at one size alone are then far too small.
+Sizes are therefore drawn as likely as they are, their members integrated out, and what that adds to
+the variance of each number is told (the law of total variance).
+"""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from tmlattice.inference.normal import Normal
+from tmlattice.inference.priors import Group
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FEW = 6.0
+"""Of so many members that the data know the size is known to 30 %."""
+MANY = 64
+"""Members of a family that was left out from which on it is not looked at: each draw costs the
+third power."""
+FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
+"""Logarithms of sizes over the present ones that are drawn from."""
+DRAWS, FORGOTTEN = 220, 20
+"""Of all sizes in turn; and of them those before the chain is at home."""
+
+
+def of_sizes(
+    normal: Normal, groups: Sequence[Group], start: Array, gone: Collection[str] = ()
+) -> Array:
+    """Variance that each base parameter has beside that of its posterior, [parameter].
+
+    It is about the values that the groups' present sizes give.
+
+    Args:
+        normal: at `start`.
+        groups: the priors, as they are.
+        start: the base parameters where the residual was taken.
+        gone: names of groups whose members are taken for zero, as they may be: as likely as that
+            they are not. Their sizes are first guesses.
+    """
+    groups = [
+        group
+        for group in groups
+        if group.basis.any() and (group.name not in gone or group.basis.shape[1] <= MANY)
+    ]
+    if not groups:
+        return np.zeros(len(start))
+    basis = np.concatenate([group.basis * group.scale for group in groups], axis=1)
+    own = np.repeat(np.arange(len(groups)), [group.basis.shape[1] for group in groups])
+    absent = np.array([group.name in gone for group in groups])
+    A = basis.T @ normal.matrix @ basis
+    b = basis.T @ (normal.vector + normal.matrix @ start)
+    known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
+    unsure = np.array([
+        absent[i] or (not group.fixed and 0 < known[own == i].sum() < FEW)
+        for i, group in enumerate(groups)
+    ])  # fmt: skip
+    if not unsure.any():
+        return np.zeros(len(start))
+    U = unsure[own]
+    # the others with their priors taken out: by how much they follow, and what is left to say
+    inside = cho_factor(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())))
+    follow = cho_solve(inside, A[np.ix_(~U, U)])
+    sizes = _Sizes(
+        A[np.ix_(U, U)] - A[np.ix_(U, ~U)] @ follow,
+        b[U] - follow.T @ b[~U],
+        (np.cumsum(unsure) - 1)[own[U]],
+        [group for group, here in zip(groups, unsure, strict=True) if here],
+        absent[unsure],
+    )
+    moved = basis[:, U] - basis[:, ~U] @ follow
+    return np.asarray(np.maximum(((moved @ sizes.more()) * moved).sum(axis=1), 0))
+
+
+class _Sizes:
+    """Sizes of some groups, and their members' amounts in units of the present sizes.
+
+    Args:
+        information, score: of the members, all others taken out.
+        group: of each member.
+        groups: with their hyperpriors.
+        absent: whether a group's members are taken for zero, [group].
+    """
+
+    def __init__(
+        self, information: Array, score: Array, group: Indices, groups: Sequence[Group],
+        absent: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        self.information, self.score, self.group = information, score, group
+        self.now = np.where(absent, -np.inf, 0.0)
+        self.choices, self.chances = [], []
+        for own, gone in zip(groups, absent, strict=True):
+            factors = FACTORS[own.rms * np.exp(FACTORS) <= own.most]
+            size = np.log(own.rms / own.guess) + factors
+            chances = np.exp(-0.5 * (size / own.guessed) ** 2)
+            chances /= chances.sum()
+            if gone:
+                factors, chances = np.append(-np.inf, factors), np.append(1.0, chances)
+            self.choices.append(factors)
+            self.chances.append(np.log(chances))
+
+    def amounts(self, sizes: Array) -> tuple[float, Array, Array]:
+        """Log evidence of the readings, the likeliest amounts, and their covariance."""
+        scale = np.exp(sizes)[self.group]
+        inverse = np.linalg.inv(np.eye(len(scale)) + scale[:, None] * self.information * scale)
+        pull = scale * self.score
+        value = 0.5 * (pull @ inverse @ pull + np.linalg.slogdet(inverse)[1])
+        covariance = scale[:, None] * inverse * scale
+        return float(value), covariance @ self.score, covariance
+
+    def more(self) -> Array:
+        """Covariance of the amounts about those at the present sizes, less what it is there,
+        [member, member]: by Gibbs' sampling of the sizes."""
+        random = np.random.default_rng(0)
+        here = np.where(np.isinf(self.now), 0.0, self.now)
+        _, told, stated = self.amounts(self.now)
+        total = np.zeros_like(stated)
+        for draw in range(DRAWS):
+            for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
+                tried = np.repeat(here[None], len(choices), axis=0)
+                tried[:, i] = choices
+                values = chances + [self.amounts(one)[0] for one in tried]
+                weights = np.exp(values - values.max())
+                here = tried[random.choice(len(tried), p=weights / weights.sum())]
+            if draw >= FORGOTTEN:
+                _, then, spread = self.amounts(here)
+                total += spread + np.outer(then - told, then - told)
+        return np.asarray(total / (DRAWS - FORGOTTEN) - stated)
