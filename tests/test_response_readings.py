@@ -14,6 +14,7 @@ from tmlattice.diagnosis.odd_readings import odd_readings
 from tmlattice.diagnosis.other_kicks import other_kicks
 from tmlattice.diagnosis.response import assumed_of
 from tmlattice.diagnosis.rounds import linear
+from tmlattice.diagnosis.set_aside import taken_back
 from tmlattice.diagnosis.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
@@ -160,6 +161,22 @@ def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(smal
     assert told.plane == 1
     assert np.allclose(told.amount * orbit, added, atol=0.1 * np.abs(added).max())
     assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
+
+
+def test_neighbours_that_were_set_aside_are_taken_back_where_they_are_sound(small_ring, clean, rng):
+    """Pohang: the magnet beside them was far off, and was not found without them."""
+    state = fitted(small_ring, clean)
+    monitor = np.arange(len(state.good))
+    alone = replace(state, good=monitor != 12)
+    assert taken_back(alone) is alone
+    back = taken_back(replace(state, good=~np.isin(monitor, [6, 7])))
+    assert back.good.all()
+    assert error(back) < 1.1 * error(state)
+    response = clean.response.copy()
+    response[:, [6, 7]] += 2e-7 * rng.standard_normal(response[:, [6, 7]].shape)
+    noisy = fitted(small_ring, replace(clean, response=response))
+    assert np.flatnonzero(~noisy.good).tolist() == [6, 7]
+    assert taken_back(noisy) is noisy
 
 
 @pytest.mark.parametrize("times", [5, 200])

@@ -21,6 +21,7 @@ from tmlattice.diagnosis.judges import Chi2, Score, against, clearly_for, inner,
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
+from tmlattice.diagnosis.set_aside import taken_back
 from tmlattice.diagnosis.state import (
     State,
     allow,
@@ -151,7 +152,7 @@ def fit_steps(
     odd = odd_steps(state)
     state = beside(state, odd.unread)
     progress("all together")
-    state = settle(bend(jump(replace(state, independent=np.ones((2, 2))))))
+    state = taken_back(settle(bend(jump(replace(state, independent=np.ones((2, 2)))))))
     log.info("independent readings: %s", state.independent)
     odd = odd.and_more(odd_steps(state))  # what is usual is less now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
@@ -190,7 +191,7 @@ def fit_steps(
     if moving is not None:
         moving = sought(state) or moving
         state = replace(state, jitter=moving.orbits)
-    state = settle(robust(state))
+    state = taken_back(settle(robust(state)))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)

@@ -302,6 +302,7 @@ def settle(
     most: int = ROUNDS,
     gain: float = GAIN,
     possible: Callable[[State], bool] = lambda state: True,
+    look_at_monitors: bool = True,
 ) -> State:
     """Rounds until none gains any more, none of which may make things worse.
 
@@ -314,7 +315,9 @@ def settle(
         most: rounds of each block.
         gain: share of the cost that a round has to gain for another one.
         possible: whether a state is one that is sought; rounds end at one that is not.
+        look_at_monitors: whether those that are bad are set aside after each round.
     """
+    good = state.good
     bold = dict.fromkeys(blocks, 1.0)
     for turn in range(most):
         gained = 0.0
@@ -336,6 +339,8 @@ def settle(
             for seen in (0, 1):
                 if state.of_block(seen):
                     state = look(state, seen)
+            if not look_at_monitors:
+                state = replace(state, good=good)
         log.info(
             "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
         )

@@ -132,8 +132,13 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     return replace(state, independent=own)
 
 
-def good_monitors(state: State) -> Flags:
-    """Those that read, in the plane that is kicked, what the others make likely, [monitor]."""
+def good_monitors(state: State, bad: float = BAD) -> Flags:
+    """Those that read, in the plane that is kicked, what the others make likely, [monitor].
+
+    Args:
+        state: that is fitted.
+        bad: so many times the median rms residual, gains fitted, is a bad monitor's.
+    """
     data = state.data
     read, orbits = data.pick(state.at.read), data.pick(data.orbits)
     ratio = np.zeros(data.shape[1])
@@ -147,7 +152,12 @@ def good_monitors(state: State) -> Flags:
         typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
         if np.isfinite(typical):  # else the fit is astray, not half of the monitors
             ratio = np.maximum(ratio, np.where(read_at_all, rms / typical, 0.0))
-    return np.asarray(ratio <= BAD)
+    return np.asarray(ratio <= bad)
+
+
+def sound_monitors(state: State) -> Flags:
+    """Those that read what is likely in both planes, [monitor]."""
+    return good_monitors(state) & _good_across(state)
 
 
 def _good_across(state: State) -> Flags:
