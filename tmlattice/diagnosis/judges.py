@@ -20,9 +20,9 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
 25 readings), and by how much their sum may fall without a step that stays all the same: evidence
 takes what the model lacks for noise, and gladly fits it."""
-SURELY, CLEARLY, WORTH = 1.0, 2.0, 0.05
-"""Standard errors of a fall from which on it counts, and of a rise that is a reason by itself; and
-how much such a rise is at least."""
+SURELY, WORTH = 1.0, 0.05
+"""Standard errors of a fall, or a rise, from which on it counts; and how much a rise is at least that
+is a reason by itself."""
 
 
 class Chi2(NamedTuple):
@@ -224,6 +224,6 @@ def against(said: tuple[float, float]) -> bool:
     return said[0] < -max(VETO, SURELY * said[1])
 
 
-def clearly_for(said: tuple[float, float]) -> bool:
+def in_favour(said: tuple[float, float]) -> bool:
     """Whether the judges alone are reason enough, by what `lost` says."""
-    return said[0] > max(WORTH, CLEARLY * said[1])
+    return said[0] > max(WORTH, SURELY * said[1])
