@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from tmlattice.inference.normal import Normal
 from tmlattice.inference.priors import Group
@@ -22,9 +22,8 @@ Indices = NDArray[np.int64]
 
 FEW = 6.0
 """Of so many members that the data know the size is known to 30 %."""
-MANY = 64
-"""Members of a family that was left out from which on it is not looked at: each draw costs the
-third power."""
+MANY = 128
+"""Members from which on a size is not looked at: each draw costs the third power."""
 FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
 """Logarithms of sizes over the present ones that are drawn from."""
 DRAWS, FORGOTTEN = 220, 20
@@ -59,7 +58,8 @@ def of_sizes(
     b = basis.T @ (normal.vector + normal.matrix @ start)
     known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
     unsure = np.array([
-        absent[i] or (not group.fixed and 0 < known[own == i].sum() < FEW)
+        absent[i]
+        or (not group.fixed and (own == i).sum() <= MANY and 0 < known[own == i].sum() < FEW)
         for i, group in enumerate(groups)
     ])  # fmt: skip
     if not unsure.any():
@@ -106,30 +106,41 @@ class _Sizes:
             self.choices.append(factors)
             self.chances.append(np.log(chances))
 
-    def amounts(self, sizes: Array) -> tuple[float, Array, Array]:
-        """Log evidence of the readings, the likeliest amounts, and their covariance."""
+    def _root(self, sizes: Array) -> tuple[Array, Array]:
+        """Prior rms of the members, and the root of what is known of them in these units."""
         scale = np.exp(sizes)[self.group]
-        inverse = np.linalg.inv(np.eye(len(scale)) + scale[:, None] * self.information * scale)
-        pull = scale * self.score
-        value = 0.5 * (pull @ inverse @ pull + np.linalg.slogdet(inverse)[1])
-        covariance = scale[:, None] * inverse * scale
-        return float(value), covariance @ self.score, covariance
+        inside = scale[:, None] * self.information * scale
+        inside[np.diag_indices(len(inside))] += 1
+        return scale, np.linalg.cholesky(inside)
+
+    def log_evidence(self, sizes: Array) -> float:
+        """Of the readings, with all members integrated out."""
+        scale, root = self._root(sizes)
+        pull = solve_triangular(root, scale * self.score, lower=True, check_finite=False)
+        return float(0.5 * pull @ pull - np.log(np.diag(root)).sum())
+
+    def amounts(self, sizes: Array) -> tuple[Array, Array]:
+        """The likeliest, and their covariance."""
+        scale, root = self._root(sizes)
+        half = solve_triangular(root, np.diag(scale), lower=True, check_finite=False)
+        covariance = half.T @ half
+        return covariance @ self.score, covariance
 
     def more(self) -> Array:
         """Covariance of the amounts about those at the present sizes, less what it is there,
         [member, member]: by Gibbs' sampling of the sizes."""
         random = np.random.default_rng(0)
         here = np.where(np.isinf(self.now), 0.0, self.now)
-        _, told, stated = self.amounts(self.now)
+        told, stated = self.amounts(self.now)
         total = np.zeros_like(stated)
         for draw in range(DRAWS):
             for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
                 tried = np.repeat(here[None], len(choices), axis=0)
                 tried[:, i] = choices
-                values = chances + [self.amounts(one)[0] for one in tried]
+                values = chances + [self.log_evidence(one) for one in tried]
                 weights = np.exp(values - values.max())
                 here = tried[random.choice(len(tried), p=weights / weights.sum())]
             if draw >= FORGOTTEN:
-                _, then, spread = self.amounts(here)
+                then, spread = self.amounts(here)
                 total += spread + np.outer(then - told, then - told)
         return np.asarray(total / (DRAWS - FORGOTTEN) - stated)
