@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from tmlattice.inference.normal import Normal
 from tmlattice.inference.priors import Group
@@ -66,8 +66,7 @@ def of_sizes(
         return np.zeros(len(start))
     U = unsure[own]
     # the others with their priors taken out: by how much they follow, and what is left to say
-    inside = cho_factor(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())))
-    follow = cho_solve(inside, A[np.ix_(~U, U)])
+    follow = np.linalg.solve(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())), A[np.ix_(~U, U)])
     sizes = _Sizes(
         A[np.ix_(U, U)] - A[np.ix_(U, ~U)] @ follow,
         b[U] - follow.T @ b[~U],
@@ -111,7 +110,7 @@ class _Sizes:
         scale = np.exp(sizes)[self.group]
         inside = scale[:, None] * self.information * scale
         inside[np.diag_indices(len(inside))] += 1
-        return scale, np.linalg.cholesky(inside)
+        return scale, np.asarray(np.linalg.cholesky(inside))
 
     def log_evidence(self, sizes: Array) -> float:
         """Of the readings, with all members integrated out."""
