@@ -8,6 +8,7 @@ import pytest
 from tmlattice.diagnosis.dense import fit_steps, told
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.fields import BendGradient, EdgeFocusing
+from tmlattice.diagnosis.state import allow
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
@@ -79,7 +80,9 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
         return np.sqrt(np.mean(np.square(left)))
 
     assert pull(state) > 4
-    assert pull(replace(state, unneeded=(BendGradient(),))) < 2
+    tried = replace(state, unneeded=(BendGradient(),))
+    assert pull(tried) < 2
+    assert not allow(tried, [BendGradient()]).unneeded
 
 
 def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):

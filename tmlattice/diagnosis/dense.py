@@ -180,7 +180,7 @@ def fit_steps(
         if doubted:
             again, without = _worth(state, doubted, progress)
             worth |= again
-    spoilt = -lost(inner(design), inner(state))[0]
+    spoilt = -lost(inner(replace(design, jitter=state.jitter)), inner(state))[0]
     if spoilt > SPOILT:  # all together spoil what they should mend
         refused += [replace(step, kept=False) for step in steps.values()]
         return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
@@ -189,7 +189,7 @@ def fit_steps(
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
     state = bend(jump(replace(state, exploring=False), beyond=1.0))
     if moving is not None:
-        moving = sought(state) or moving
+        moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
     after = score(state, split.held)
@@ -201,7 +201,7 @@ def fit_steps(
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
     """With a jitter of the beam, where one stands out and those who choose do not object; or where
-    one is seen and they fare clearly better with it."""
+    one is seen and they fare better with it."""
     moving = sought(state)
     if moving is None:
         return state, None

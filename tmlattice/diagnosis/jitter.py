@@ -15,6 +15,7 @@ more. Which places these are is known up to the phase of the betatron oscillatio
 """
 
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -64,12 +65,17 @@ class Jitter:
             with fewer of them has zeros.
         places: magnets behind which a kick makes them, of each plane.
         share: of what a typical column has left beside its own roll, in the mean square, in the
-            plane where it is more.
+            plane where it is less.
     """
 
     orbits: Array
     places: tuple[tuple[str, ...], tuple[str, ...]]
     share: float
+
+    @property
+    def planes(self) -> tuple[int, ...]:
+        """In which it was found."""
+        return tuple(plane for plane, own in enumerate(self.places) if own)
 
     @property
     def sentence(self) -> str:
@@ -87,17 +93,19 @@ class Jitter:
         )
 
 
-def sought(state: State) -> Jitter | None:
+def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
     """The jitter that stands out, if any does.
 
     Args:
         state: with gains, rolls and gradients; a jitter that it has is not looked at.
+        planes: that are looked at.
     """
     still = replace(state, jitter=None)
-    x, y = (_in_plane(still, plane) for plane in (0, 1))
-    share = max(x.share, y.share)
-    if share < SHARE:
+    nothing = _OfPlane(np.zeros((0, len(state.data.at))), (), 0.0)
+    x, y = (_in_plane(still, plane) if plane in planes else nothing for plane in (0, 1))
+    if not (x.places or y.places):
         return None
+    share = min(own.share for own in (x, y) if own.places)
     orbits = np.zeros((2, max(len(x.places), len(y.places)), len(state.data.at)))
     for plane, own in enumerate((x, y)):
         orbits[plane, : len(own.places)] = own.orbits
@@ -139,6 +147,8 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
         count = independent(np.where(weights > 0, rest, np.nan), np.sqrt(least))
     places = tuple(model.maps.layers[i] for i in which)
     before, after = np.median(_rms(without)), np.median(_rms(rest))
+    if not before > 0:
+        return nothing
     log.info("plane %d: %s leave %.3g of %.3g m", plane, places, after, before)
     share = 1 - float((after / before) ** 2)
     return nothing if share < SHARE else _OfPlane(found, places, share)

@@ -20,7 +20,7 @@ from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import families, magnets
 from tmlattice.diagnosis.rounds import linear, marginal
 from tmlattice.diagnosis.state import State
-from tmlattice.diagnosis.stated import stated
+from tmlattice.diagnosis.stated import of_readings, of_sizes
 from tmlattice.inference.levels import Levels
 from tmlattice.inference.normal import solve
 from tmlattice.lattice import Element, Ring
@@ -150,12 +150,15 @@ def explain_gradients(state: State) -> Reasons | None:
     rows = there.where[family.variable]
     spread = posterior.spread[rows]
     covariance = spread @ posterior.covariance @ spread.T
-    sigma = stated(state, 0, there, posterior)[rows]
-    # what the stated errors have more than the posterior's is of the readings, and no scatter of
-    # the magnets; but it is in every error as that is
+    # what the stated errors have more than the posterior's is no scatter of the magnets; but it is
+    # in every error as that is
     plain = np.maximum(np.diag(covariance), 1e-24)
-    more = np.sqrt(np.maximum(sigma**2 / plain - 1, 0))
-    beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more)
+    wider = of_readings(state, 0, there, posterior)[rows] / np.sqrt(plain)
+    sizes = of_sizes(state, 0, there)[rows]
+    more = np.sqrt(np.maximum(wider**2 - 1, 0))
+    beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
+    covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
     levels = Levels(
         information,
         pull,
@@ -182,7 +185,7 @@ def explain_gradients(state: State) -> Reasons | None:
     left = values - shared
     return Reasons(
         reasons,
-        _outliers(places, left, values, sigma, covariance / np.sqrt(np.outer(plain, plain))),
+        _outliers(places, left, values, sigma, covariance / np.outer(sigma, sigma)),
         1 - float(np.sum(left**2)) / size if size else 0.0,
         float(np.sqrt(np.mean(left**2))),
     )

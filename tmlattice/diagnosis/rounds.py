@@ -339,8 +339,7 @@ def settle(
             for seen in (0, 1):
                 if state.of_block(seen):
                     state = look(state, seen)
-            if not look_at_monitors:
-                state = replace(state, good=good)
+                    state = state if look_at_monitors else replace(state, good=good)
         log.info(
             "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
         )

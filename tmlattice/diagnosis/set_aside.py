@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tmlattice.diagnosis.rounds import settle
+from tmlattice.diagnosis.rounds import log_evidence, settle
 from tmlattice.diagnosis.state import State
 from tmlattice.diagnosis.weights import good_monitors, sound_monitors
 
@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 HOPELESS = 20.0
 """Of the median rms residual: no magnet's error does that to a sound monitor, once all families are
 there."""
+WORTH = 0.5
+"""Log evidence that the others may lose for each of their readings: what one standard error is."""
 
 
 def taken_back(state: State) -> State:
@@ -36,8 +38,14 @@ def taken_back(state: State) -> State:
     good = state.good | together
     trial = settle(replace(state, good=good), look_at_monitors=False)
     sound = sound_monitors(trial)
-    log.info("neighbours set aside: %s, sound in the end: %s",
-             np.flatnonzero(together), np.flatnonzero(sound & together))  # fmt: skip
-    if not (sound & good).sum() > state.good.sum():
+    back = together & sound
+    lost = log_evidence(state, state.good, state.independent) - log_evidence(
+        trial, state.good, state.independent
+    )
+    orbits = state.data.pick(state.data.orbits)[state.fitted]
+    readings = int(np.isfinite(orbits[:, back]).sum())
+    log.info("neighbours set aside: %s, sound in the end: %s; the others lose %.1f",
+             np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
+    if not back.any() or (state.good & ~sound).any() or lost > WORTH * readings:
         return state
-    return settle(replace(trial, good=sound & good))
+    return settle(replace(trial, good=state.good | back))

@@ -85,7 +85,7 @@ class State:
             are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
         guessed: rms of the logarithm of a family's size about its first guess.
         unneeded: families that were tried: their numbers are taken for zero, and stated errors know
-            that they may not be.
+            that they may not be (those of the ring, where they are few).
     """
 
     data: ResponseData
@@ -150,8 +150,10 @@ def bend(state: State) -> State:
 def allow(state: State, families: Sequence[Family]) -> State:
     """With more families, at zero."""
     new = {f.variable: np.zeros(f.size(state.data)) for f in families}
+    names = [family.name for family in families]
     return replace(
-        state, families=(*state.families, *families), values={**new, **state.values}
+        state, families=(*state.families, *families), values={**new, **state.values},
+        unneeded=tuple(family for family in state.unneeded if family.name not in names),
     )  # fmt: skip
 
 

@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.rounds import Linear, linear
 from tmlattice.diagnosis.state import Apart, State, allow
 from tmlattice.diagnosis.weights import taken, weight
+from tmlattice.inference import unknown_sizes
 from tmlattice.inference.clusters import Found, Rows, widened
 from tmlattice.inference.normal import Posterior
-from tmlattice.inference.unknown_sizes import of_sizes
+from tmlattice.inference.unknown_sizes import MANY
 
 Array = NDArray[np.float64]
 
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Posterior errors, widened where single columns, or monitors, contradict all others, and by
-    what the sizes of families are unknown by, of those too that were tried and not needed.
+    """Posterior errors, widened by what readings share (`of_readings`) and by what the sizes of
+    families are unknown by (`of_sizes`).
 
     Args:
         state: where the fit stands.
@@ -31,15 +32,30 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Arr
     Returns:
         Of each number, in the order of `there`, [parameter].
     """
+    more = np.sum(of_sizes(state, block, there) ** 2, axis=1)
+    return np.asarray(np.sqrt(of_readings(state, block, there, posterior) ** 2 + more))
+
+
+def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
+    """Posterior errors, widened where single columns, or monitors, contradict all others; see
+    `stated`."""
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     found = Found.of(there.normal.matrix, covariance)
-    sigma = _widened(state, block, there, posterior, found)
-    tried = [f for f in state.unneeded if f.block == block and f.per == "ring"]
-    if tried:
-        there = linear(allow(state, tried), block)
+    return _widened(state, block, there, posterior, found)
+
+
+def of_sizes(state: State, block: int, there: Linear) -> Array:
+    """What sizes of families add to the covariance that are unknown, of those too that were tried
+    and not needed: F, of F F^T, [parameter, direction]; see `stated`."""
+    tried = [
+        family
+        for family in state.unneeded
+        if family.block == block and family.per == "ring" and family.size(state.data) <= MANY
+    ]
+    whole = linear(allow(state, tried), block) if tried else there
     gone = [group.name for family in tried for group in family.groups(state.data)]
-    more = of_sizes(there.normal, there.groups, there.start, gone)
-    return np.asarray(np.sqrt(sigma**2 + more[: len(sigma)]))  # what was tried comes after
+    more = unknown_sizes.of_sizes(whole.normal, whole.groups, whole.start, gone)
+    return more[: len(there.start)]  # what was tried comes after
 
 
 def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:

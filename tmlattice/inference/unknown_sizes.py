@@ -9,12 +9,13 @@ the variance of each number is told (the law of total variance).
 """
 
 from collections.abc import Collection, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from tmlattice.inference.normal import Normal
+from tmlattice.inference.normal import ROUNDING, Normal
 from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
@@ -26,14 +27,15 @@ MANY = 128
 """Members from which on a size is not looked at: each draw costs the third power."""
 FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
 """Logarithms of sizes over the present ones that are drawn from."""
-DRAWS, FORGOTTEN = 220, 20
+DRAWS, FORGOTTEN = 420, 20
 """Of all sizes in turn; and of them those before the chain is at home."""
 
 
 def of_sizes(
     normal: Normal, groups: Sequence[Group], start: Array, gone: Collection[str] = ()
 ) -> Array:
-    """Variance that each base parameter has beside that of its posterior, [parameter].
+    """What the base parameters' covariance has beside that of the posterior: F, of F F^T,
+    [parameter, direction].
 
     It is about the values that the groups' present sizes give.
 
@@ -50,11 +52,12 @@ def of_sizes(
         if group.basis.any() and (group.name not in gone or group.basis.shape[1] <= MANY)
     ]
     if not groups:
-        return np.zeros(len(start))
+        return np.zeros((len(start), 0))
     basis = np.concatenate([group.basis * group.scale for group in groups], axis=1)
     own = np.repeat(np.arange(len(groups)), [group.basis.shape[1] for group in groups])
     absent = np.array([group.name in gone for group in groups])
     A = basis.T @ normal.matrix @ basis
+    A[np.diag_indices(len(A))] *= 1 + ROUNDING
     b = basis.T @ (normal.vector + normal.matrix @ start)
     known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
     unsure = np.array([
@@ -63,7 +66,7 @@ def of_sizes(
         for i, group in enumerate(groups)
     ])  # fmt: skip
     if not unsure.any():
-        return np.zeros(len(start))
+        return np.zeros((len(start), 0))
     U = unsure[own]
     # the others with their priors taken out: by how much they follow, and what is left to say
     follow = np.linalg.solve(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())), A[np.ix_(~U, U)])
@@ -75,7 +78,8 @@ def of_sizes(
         absent[unsure],
     )
     moved = basis[:, U] - basis[:, ~U] @ follow
-    return np.asarray(np.maximum(((moved @ sizes.more()) * moved).sum(axis=1), 0))
+    variance, directions = np.linalg.eigh(sizes.more())
+    return np.asarray(moved @ (directions * np.sqrt(np.maximum(variance, 0))))
 
 
 class _Sizes:
@@ -95,8 +99,11 @@ class _Sizes:
         self.information, self.score, self.group = information, score, group
         self.now = np.where(absent, -np.inf, 0.0)
         self.choices, self.chances = [], []
+        self.pairs = list(combinations(np.flatnonzero(absent).tolist(), 2))
         for own, gone in zip(groups, absent, strict=True):
-            factors = FACTORS[own.rms * np.exp(FACTORS) <= own.most]
+            largest = own.scale.max()
+            factors = FACTORS[(FACTORS <= 0) | (largest * np.exp(FACTORS) <= own.most)]
+            factors = np.zeros(1) if own.fixed else factors
             size = np.log(own.rms / own.guess) + factors
             chances = np.exp(-0.5 * (size / own.guessed) ** 2)
             chances /= chances.sum()
@@ -117,6 +124,16 @@ class _Sizes:
         scale, root = self._root(sizes)
         pull = solve_triangular(root, scale * self.score, lower=True, check_finite=False)
         return float(0.5 * pull @ pull - np.log(np.diag(root)).sum())
+
+    def _chance(self, sizes: Array) -> float:
+        """Log probability of sizes, -inf where one is none of its choices."""
+        chance = 0.0
+        for size, choices, chances in zip(sizes, self.choices, self.chances, strict=True):
+            (at,) = np.nonzero(choices == size)
+            if not len(at):
+                return -np.inf
+            chance += float(chances[at[0]])
+        return chance + self.log_evidence(sizes)
 
     def amounts(self, sizes: Array) -> tuple[Array, Array]:
         """The likeliest, and their covariance."""
@@ -139,6 +156,12 @@ class _Sizes:
                 values = chances + [self.log_evidence(one) for one in tried]
                 weights = np.exp(values - values.max())
                 here = tried[random.choice(len(tried), p=weights / weights.sum())]
+            for a, b in self.pairs:  # one may stand for the other, both not likely
+                other = here.copy()
+                other[[a, b]] = here[[b, a]]
+                both = self._chance(other) - self._chance(here)
+                if np.log(random.random()) < both:
+                    here = other
             if draw >= FORGOTTEN:
                 then, spread = self.amounts(here)
                 total += spread + np.outer(then - told, then - told)
