@@ -52,13 +52,19 @@ def test_what_all_or_one_polarity_share_is_one_reason(small_ring, shared, name, 
     assert found.outliers == ()
 
 
-def test_a_magnet_that_no_magnet_is_like_is_flagged(small_ring):
+def test_a_magnet_that_no_magnet_is_like_is_flagged(small_ring, monkeypatch):
     more = [Cause("quadrupole_gradient", "QD::5", 0.04)]
     found = explained(small_ring, {"QF": 0.0, "QD": 0.0}, more)
     assert [own.name for own in found.reasons] == ["QD::5"]
     (outlier,) = found.outliers
     assert outlier.element == "QD::5"
     assert abs(outlier.amount - 0.04) < 0.005
+    # ALS: six magnets -3 +- 3 %, whose family's size is unknown
+    monkeypatch.setattr(
+        "tmlattice.diagnosis.reasons.of_sizes",
+        lambda state, block, there: 0.03 * np.eye(len(there.start)),
+    )
+    assert explained(small_ring, {"QF": 0.0, "QD": 0.0}, more).outliers == ()
 
 
 def test_small_scatter_alone_has_no_reason(small_ring):

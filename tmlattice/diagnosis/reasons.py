@@ -195,7 +195,7 @@ def _outliers(
     places: Sequence[str], left: Array, values: Array, sigma: Array, correlation: Array
 ) -> tuple[Outlier, ...]:
     found = []
-    for i in np.flatnonzero(np.abs(left) > TOLERANCE).tolist():
+    for i in np.flatnonzero(np.abs(left) - sigma > TOLERANCE).tolist():
         other = np.argsort(-np.abs(correlation[i]))
         pulls = [int(j) for j in other if j != i and abs(correlation[i, j]) > AGAINST][:SHOWN]
         against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)
