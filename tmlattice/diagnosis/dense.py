@@ -172,7 +172,6 @@ def fit_steps(
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
         least = min(worth, key=lambda trial: worth[trial])
         state = without[least] if least in without else _without(state, least)
-        state = replace(state, unneeded=(*state.unneeded, *least.families))
         refused.append(replace(steps.pop(least), kept=False))
         doubted = [trial for trial in steps if worth[trial] <= 0]
         del worth[least]

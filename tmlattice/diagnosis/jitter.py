@@ -101,8 +101,7 @@ def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
         planes: that are looked at.
     """
     still = replace(state, jitter=None)
-    nothing = _OfPlane(np.zeros((0, len(state.data.at))), (), 0.0)
-    x, y = (_in_plane(still, plane) if plane in planes else nothing for plane in (0, 1))
+    x, y = (_in_plane(still, plane) if plane in planes else _nothing(state) for plane in (0, 1))
     if not (x.places or y.places):
         return None
     share = min(own.share for own in (x, y) if own.places)
@@ -120,10 +119,14 @@ class _OfPlane(NamedTuple):
     share: float
 
 
+def _nothing(state: State) -> _OfPlane:
+    return _OfPlane(np.zeros((0, len(state.data.at))), (), 0.0)
+
+
 def _in_plane(state: State, plane: int) -> _OfPlane:
     """What is found in one plane."""
     data, at, model = state.data, state.at, state.at.model
-    nothing = _OfPlane(np.zeros((0, len(data.at))), (), 0.0)
+    nothing = _nothing(state)
     weights = weight(state, 1)
     read = (data.plane_of(1) == plane) & ((weights > 0).sum(axis=1) >= ENOUGH)
     read[-1] = False

@@ -164,7 +164,8 @@ def forbid(state: State, families: Sequence[Family]) -> State:
     left = tuple(family for family in state.families if family.name not in names)
     values = {f.variable: state.values[f.variable] for f in left}
     groups = {name: group for name, group in state.groups.items() if name not in gone}
-    return replace(state, families=left, groups=groups).moved(values)
+    unneeded = (*state.unneeded, *families)
+    return replace(state, families=left, groups=groups, unneeded=unneeded).moved(values)
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:

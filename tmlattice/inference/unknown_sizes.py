@@ -43,14 +43,10 @@ def of_sizes(
         normal: at `start`.
         groups: the priors, as they are.
         start: the base parameters where the residual was taken.
-        gone: names of groups whose members are taken for zero, as they may be: as likely as that
-            they are not. Their sizes are first guesses.
+        gone: names of groups whose members, `MANY` at most, are taken for zero, as they may be: as
+            likely as that they are not. Their sizes are first guesses.
     """
-    groups = [
-        group
-        for group in groups
-        if group.basis.any() and (group.name not in gone or group.basis.shape[1] <= MANY)
-    ]
+    groups = [group for group in groups if group.basis.any()]
     if not groups:
         return np.zeros((len(start), 0))
     basis = np.concatenate([group.basis * group.scale for group in groups], axis=1)
