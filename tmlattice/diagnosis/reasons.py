@@ -5,8 +5,9 @@
 
 A dense fit ends in an error of every quadrupole. Here the same readings are asked which few numbers
 that many magnets share explain them: candidates of every level are weighed by evidence
-(`inference.levels`), with the scatter of single magnets, as the fit has learnt it, in every error.
-Single magnets that stay far off all the same are flagged, with the neighbours they pull against.
+(`inference.levels`), beside other sets of them that say the same (`inference.sets`), with the
+scatter of single magnets, as the fit has learnt it, in every error. Single magnets that stay far
+off all the same are flagged, with the neighbours they pull against.
 """
 
 from collections.abc import Sequence
@@ -17,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.fields import QuadrupoleGradient
-from tmlattice.diagnosis.magnets import families, magnets
+from tmlattice.diagnosis.magnets import magnets
 from tmlattice.diagnosis.rounds import linear, marginal
+from tmlattice.diagnosis.sharing import candidates
 from tmlattice.diagnosis.state import State
 from tmlattice.diagnosis.stated import of_readings, of_sizes
-from tmlattice.inference.levels import Levels
+from tmlattice.inference.levels import CLEAR, Levels
 from tmlattice.inference.normal import solve
-from tmlattice.lattice import Element, Ring
+from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
 
 Array = NDArray[np.float64]
 
@@ -33,14 +35,20 @@ LEAST_SCATTER = 1e-4
 """Relative: no two magnets are more alike."""
 TOLERANCE = 0.02
 """Relative: no sound magnet is further from its family."""
+BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
+"""By how much families may differ from one another, relative rms."""
+MORE = 3.0
+"""Log evidence that is asked for them to differ at all."""
+FEWEST = 3
+"""Families that tell by how much they differ."""
 MOST = 20
 """Reasons at most: more are no explanation."""
+SETS, LIKELY = 3, 0.05
+"""Other sets of reasons that are told at most, and how likely they have to be."""
 AGAINST = 0.4
 """Correlation from which magnets pull against each other."""
 SHOWN = 3
 """Neighbours that are named."""
-GAP = 2.5
-"""Times the usual way between two bends that makes a straight."""
 COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
 """Log odds against a reason of each kind, beside those of how many there are."""
 MAKES = {
@@ -66,8 +74,9 @@ class Reason:
         kind: see `MAKES`.
         name: of what shares it.
         members: the magnets, by their first pieces.
-        amount, amount_sigma: relative change of the gradients, with the scatter of single magnets
-            in the error.
+        amount, amount_sigma: relative change of the gradients; in the error are the scatter of
+            single magnets, and what the amount is in other sets of reasons as likely as they are.
+        probability: that it is there, of all sets of reasons.
         statistic: chi-square that it explains beside all the others.
         makes: what would make it.
         rivals: what the data do not exclude in its place, with probabilities.
@@ -78,6 +87,7 @@ class Reason:
     members: tuple[str, ...]
     amount: float
     amount_sigma: float
+    probability: float
     statistic: float
     makes: str
     rivals: tuple[tuple[str, float], ...]
@@ -86,6 +96,24 @@ class Reason:
         """As it stands in the diagnosis."""
         rivals = [{"name": name, "probability": p} for name, p in self.rivals]
         return {**vars(self), "members": list(self.members), "rivals": rivals}
+
+
+@dataclass(frozen=True)
+class Instead:
+    """Another set of reasons for the same gradients.
+
+    Attributes:
+        probability: among all sets.
+        amounts: of each reason in it: name, amount and error, relative.
+    """
+
+    probability: float
+    amounts: tuple[tuple[str, float, float], ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        reasons = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
+        return {"probability": self.probability, "reasons": reasons}
 
 
 @dataclass(frozen=True)
@@ -114,24 +142,31 @@ class Reasons:
     """What is behind the gradients.
 
     Attributes:
-        reasons: by falling chi-square.
+        reasons: by falling chi-square; the likeliest set.
+        instead: other sets that are likely, by falling probability.
         outliers: by falling size.
         share: of the gradients' mean square, that the reasons hold.
         scatter: rms of single magnets about them, relative.
+        between: rms of families about what they share, relative; 0 where they are alike, or are a
+            reason one by one.
     """
 
     reasons: tuple[Reason, ...]
+    instead: tuple[Instead, ...]
     outliers: tuple[Outlier, ...]
     share: float
     scatter: float
+    between: float
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
         return {
             "reasons": [own.as_json() for own in self.reasons],
+            "instead": [own.as_json() for own in self.instead],
             "outliers": [own.as_json() for own in self.outliers],
             "share": self.share,
             "scatter": self.scatter,
+            "between_families": self.between,
         }
 
 
@@ -159,36 +194,93 @@ def explain_gradients(state: State) -> Reasons | None:
     beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
     covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
-    levels = Levels(
-        information,
-        pull,
-        members,
-        beside,
-        np.full(len(names), USUAL),
-        np.array([COST[kind] for kind in kinds]),
-    )
-    found = levels.reasons(levels.choose(MOST))
+    between, levels, sets = weighed(information, pull, kinds, members, beside)
+    found = [
+        (one, chance)
+        for one, chance in over_sets(levels, sets)
+        if one.statistic >= CLEAR  # families that do not stand out are in the sets all the same
+    ]
     places = [pieces[0].name for pieces in own]
     reasons = tuple(
         Reason(
             kinds[one.candidate], names[one.candidate],
             tuple(places[i] for i in np.flatnonzero(members[:, one.candidate])),
-            one.amount, one.sigma, one.statistic, MAKES[kinds[one.candidate]],
+            one.amount, one.sigma, chance, one.statistic, MAKES[kinds[one.candidate]],
             tuple((names[c], p) for c, p in one.rivals[1:]),
         )
-        for one in found
+        for one, chance in found
     )  # fmt: skip
     values = state.values[family.variable]
-    shared = sum((one.amount * members[:, one.candidate] for one in found
+    shared = sum((one.amount * members[:, one.candidate] for one, _ in found
                   if kinds[one.candidate] != "magnet"), np.zeros(len(own)))  # fmt: skip
     size = float(np.sum(values**2))
     left = values - shared
+    instead = tuple(
+        Instead(one.probability, tuple(
+            (names[c], one.amount(c), float(np.sqrt(one.variance(c))))
+            for c, square in zip(one.chosen, levels.squares(one.chosen), strict=True)
+            if square >= CLEAR
+        ))
+        for one in sets[1 : SETS + 1] if one.probability > LIKELY
+    )  # fmt: skip
     return Reasons(
         reasons,
+        instead,
         _outliers(places, left, values, sigma, covariance / np.outer(sigma, sigma)),
         1 - float(np.sum(left**2)) / size if size else 0.0,
         float(np.sqrt(np.mean(left**2))),
+        between,
     )
+
+
+def weighed(
+    information: Array, pull: Array, kinds: Sequence[str], members: Array, beside: Array
+) -> tuple[float, Levels, list[LikelySet]]:
+    """How much families differ, by evidence, and the sets of reasons beside that.
+
+    Where families differ by no more than their magnets, one that is off is a reason as others are.
+    Where each has a calibration of its own, no sum of a few reasons is right, and all are in every
+    set, with the prior that their scatter is: else the errors of what many of them share would be
+    those of families that are alike.
+
+    Args:
+        information: J^T W J of the gradients, nuisances taken out, [magnet, magnet].
+        pull: J^T W y with all gradients at zero, [magnet].
+        kinds: of the candidates, see `COST`.
+        members: what each moves, [magnet, candidate].
+        beside: covariance of the scatter of single magnets, [magnet, magnet].
+
+    Returns:
+        Rms of families about what they share, relative, 0 where they are alike; the candidates
+        weighed beside one another; the likely sets of them.
+    """
+    cost = np.array([COST[kind] for kind in kinds])
+    family = np.array([kind == "family" for kind in kinds]) & (members.sum(axis=0) > 1)
+    families = np.flatnonzero(family)
+    others = np.flatnonzero(~family)
+
+    def levels(at: NDArray[np.int64], between: float) -> Levels:
+        share = members[:, families] * between
+        return Levels(information, pull, members[:, at], beside + share @ share.T,
+                      np.full(len(at), max(USUAL, between)), cost[at])  # fmt: skip
+
+    alike = levels(np.arange(len(kinds)), 0.0)
+    best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + MORE
+    for between in BETWEEN if len(families) >= FEWEST else ():
+        tried = levels(others, between)
+        evidence = tried.background + tried.log_evidence(tried.choose(MOST))
+        if evidence > known:
+            best, known = between, evidence
+    if not best:
+        return 0.0, alike, likely_sets(alike, MOST)
+    slab = np.full(len(kinds), max(USUAL, best))
+    slab[families] = best
+    whole = Levels(information, pull, members, beside, slab, cost)
+    sets = []
+    for one in likely_sets(levels(others, best), MOST):
+        chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())
+        sets.append(LikelySet(chosen, one.probability, *whole.fitted(chosen)))
+    return best, whole, sets
 
 
 def _outliers(
@@ -201,75 +293,3 @@ def _outliers(
         against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)
         found.append(Outlier(places[i], float(left[i]), float(sigma[i]), against))
     return tuple(sorted(found, key=lambda one: -abs(one.amount)))
-
-
-# --- what may share an error ----------------------------------------------------------------------
-def candidates(
-    ring: Ring, own: Sequence[tuple[Element, ...]]
-) -> tuple[list[str], list[str], Array]:
-    """Kinds, names and members [magnet, candidate] of all that may share an error.
-
-    Args:
-        ring: where the magnets stand.
-        own: the magnets, each with its pieces.
-    """
-    kinds: list[str] = []
-    names: list[str] = []
-    columns: list[Array] = []
-
-    def add(kind: str, name: str, members: Array) -> None:
-        fewest = 1 if kind == "magnet" else 2
-        new = not any((members == column).all() for column in columns)
-        if members.sum() >= fewest and new:
-            kinds.append(kind)
-            names.append(name)
-            columns.append(members)
-
-    focusing = np.array([float(pieces[0].k1 > 0) for pieces in own])
-    add("all", "all quadrupoles", np.ones(len(own)))
-    add("focusing", "all focusing quadrupoles", focusing)
-    add("focusing", "all defocusing quadrupoles", 1 - focusing)
-    for name, members in _regions(ring, own):
-        add("region", name, members)
-        add("region", f"{name}, focusing", members * focusing)
-        add("region", f"{name}, defocusing", members * (1 - focusing))
-    stems, by_stem = families([pieces[0].name for pieces in own])
-    for length in sorted({_length(pieces) for pieces in own}):
-        alike = np.array([float(_length(pieces) == length) for pieces in own])
-        add("type", f"quadrupoles of {length:g} m", alike)
-    for name, members in zip(stems, by_stem.T, strict=True):
-        add("family", name, members)
-    groups = [pieces[0].family.casefold() for pieces in own]
-    for name in dict.fromkeys(groups):
-        add("family", name, np.array([float(group == name) for group in groups]))
-    for i, pieces in enumerate(own):
-        add("magnet", pieces[0].name, np.eye(len(own))[i])
-    return kinds, names, np.array(columns).T
-
-
-def _length(pieces: Sequence[Element]) -> float:
-    return round(sum(e.length for e in pieces), 3)
-
-
-def _regions(ring: Ring, own: Sequence[tuple[Element, ...]]) -> list[tuple[str, Array]]:
-    """Arcs and straights, all of them and one by one."""
-    bends = np.array([e.s for e in ring.elements if e.kind == "bend"])
-    if len(bends) < 3:
-        return []
-    ways = np.diff(np.append(bends, bends[0] + ring.length))
-    long = np.flatnonzero(ways > GAP * np.median(ways))
-    if not 0 < len(long) < len(ways) / 2:
-        return []
-    s = np.array([pieces[0].s for pieces in own])
-    low, high = bends[long], bends[long] + ways[long]
-    within = [((s > a) & (s < b)) | (s + ring.length < b) for a, b in zip(low, high, strict=True)]
-    straight = np.any(within, axis=0)
-    found = [("arcs", np.where(straight, 0.0, 1.0)), ("straights", straight.astype(float))]
-    for inside, a, b in zip(within, low, high, strict=True):
-        found.append((f"straight at s = {((a + b) / 2) % ring.length:.0f} m", inside.astype(float)))
-    for start, end in zip(high, np.append(low[1:], low[0] + ring.length), strict=True):
-        inside = ((s > start) & (s < end)) | (s + ring.length < end) & (s + ring.length > start)
-        inside &= ~straight
-        middle = ((start + end) / 2) % ring.length
-        found.append((f"arc at s = {middle:.0f} m", inside.astype(float)))
-    return found

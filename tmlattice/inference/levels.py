@@ -9,7 +9,7 @@ the one that gains most evidence, taking out what the others make needless, and 
 linear and Gaussian, so that every amount comes with the error that the scatter leaves it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +55,9 @@ class Levels:
             [number, number].
         slab: prior rms of each candidate's amount, [candidate].
         cost: log odds against each candidate, beside the number of them, [candidate].
+
+    Attributes:
+        background: log evidence of the scatter alone, over numbers that are zero.
     """
 
     def __init__(
@@ -68,11 +71,14 @@ class Levels:
     ) -> None:
         scatter = np.diag(variance) if variance.ndim == 1 else variance
         factor = lu_factor(np.eye(len(score)) + information @ scatter)
+        wide = np.log(np.abs(np.diag(factor[0]))).sum()
+        self.background = float(score @ scatter @ lu_solve(factor, score) - wide) / 2
         self.slab = slab
         self.cost = np.log(len(slab)) + (np.zeros(len(slab)) if cost is None else cost)
         self.score = candidates.T @ lu_solve(factor, score)
         self.information = candidates.T @ lu_solve(factor, information) @ candidates
         self.information = (self.information + self.information.T) / 2
+        self.candidates = candidates
 
     def fitted(self, chosen: Sequence[int]) -> tuple[Array, Array]:
         """Amounts and covariance of some candidates together."""
@@ -81,6 +87,23 @@ class Levels:
         covariance = np.linalg.inv(inside)
         return covariance @ self.score[at], covariance
 
+    def log_evidence(self, chosen: Sequence[int]) -> float:
+        """Of some candidates together over none, with the odds against them."""
+        if not len(chosen):
+            return 0.0
+        at = np.array(chosen, dtype=int)
+        amounts, covariance = self.fitted(chosen)
+        wide = np.linalg.slogdet(covariance)[1] / 2 - np.log(self.slab[at]).sum()
+        return float(amounts @ self.score[at] / 2 + wide - self.cost[at].sum())
+
+    def squares(self, chosen: Sequence[int]) -> Array:
+        """Chi-square that each of some explains beside the others."""
+        amounts, covariance = self.fitted(chosen)
+        variance = np.diag(covariance)
+        known = 1 / variance - self.slab[np.array(chosen, dtype=int)] ** -2.0
+        known = np.maximum(known, 0)
+        return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
+
     def gains(self, chosen: Sequence[int]) -> tuple[Array, Array]:
         """Log evidence of one more of each candidate beside some, and its chi-square."""
         score, own = self.score, np.diag(self.information)
@@ -88,7 +111,7 @@ class Levels:
             amounts, covariance = self.fitted(chosen)
             across = self.information[:, list(chosen)]
             score = score - across @ amounts
-            own = own - np.einsum("ij,jk,ik->i", across, covariance, across)
+            own = own - np.einsum("ij,ij->i", across @ covariance, across)
         own = np.maximum(own, 0.0)
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
@@ -98,11 +121,12 @@ class Levels:
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
 
-    def choose(self, most: int, clear: float = CLEAR) -> list[int]:
-        """The candidates that are there."""
+    def choose(self, most: int, clear: float = CLEAR, without: Collection[int] = ()) -> list[int]:
+        """The candidates that are there, of all but some."""
         chosen: list[int] = []
         while len(chosen) < most:
             gain, square = self.gains(chosen)
+            gain[list(without)] = -np.inf
             gain[square < clear] = -np.inf
             best = int(np.argmax(gain))
             if not gain[best] > 0:
@@ -115,6 +139,7 @@ class Levels:
             for own in before:
                 others = [c for c in chosen if c != own]
                 gain, square = self.gains(others)
+                gain[list(without)] = -np.inf
                 best = int(np.argmax(np.where(square < clear, -np.inf, gain)))
                 if gain[best] > gain[own] + 1e-9:
                     chosen = [*others, best]

@@ -105,15 +105,43 @@ def reasons_sentence(result: Diagnosis) -> str:
     own = result.reasons
     if own is None:
         return ""
+    families = (
+        f" Families differ by {100 * own.between:.2g} % (rms): each has a calibration of its own, "
+        "told where it is known to five standard deviations."
+        if own.between
+        else ""
+    )
     if not own.reasons:
         return (
             "Nothing that magnets share explains their gradients, which scatter by "
-            f"{100 * own.scatter:.2g} % (rms)."
+            f"{100 * own.scatter:.2g} % (rms).{families}"
         )
     return (
         f"These few numbers hold {100 * own.share:.0f} % of the gradients' mean square; single "
-        f"magnets scatter about what they share by {100 * own.scatter:.2g} % (rms)."
+        f"magnets scatter about what they share by {100 * own.scatter:.2g} % (rms).{families}"
     )
+
+
+INSTEAD = "The same gradients may be told otherwise:"
+
+
+def instead_texts(result: Diagnosis) -> list[str]:
+    """Other sets of reasons for the same gradients: what is otherwise in them."""
+    found = result.reasons
+    if found is None:
+        return []
+    first = {own.name: own.amount for own in found.reasons}
+    said = []
+    for one in found.instead:
+        other = [
+            f"{name} {100 * amount:+.2f} ± {100 * sigma:.2f} %"
+            for name, amount, sigma in one.amounts
+            if name not in first or abs(first[name] - amount) > sigma
+        ]
+        gone = [name for name in first if name not in {name for name, _, _ in one.amounts}]
+        parts = [", ".join(other)] * bool(other) + ["without " + ", ".join(gone)] * bool(gone)
+        said.append(f"{'; '.join(parts)} ({100 * one.probability:.0f} %)")
+    return said
 
 
 def outlier_texts(result: Diagnosis) -> list[str]:
@@ -158,6 +186,11 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
             head = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
             lines += wrapped(head, "   ", width)
         lines += wrapped(reasons_sentence(result), "", width)
+        instead = instead_texts(result)
+        if instead:
+            lines += ["", INSTEAD]
+            for text in instead:
+                lines += wrapped(text, "   ", width)
         outliers = outlier_texts(result)
         if outliers:
             lines += ["", "Further off than magnets are, so that something else is likely there:"]

@@ -1,0 +1,111 @@
+"""Sets of reasons: all that are likely, by enumerating every set of few candidates."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from tmlattice.inference.levels import Levels
+from tmlattice.inference.sets import likely_sets, over_sets
+
+FAMILIES = np.kron(np.eye(4), np.ones((10, 1)))
+A, B, C, D, FIRST_THREE, LAST_TWO, ALL = range(7)
+CANDIDATES = np.column_stack(
+    [FAMILIES, FAMILIES[:, :3].sum(axis=1), FAMILIES[:, 2:].sum(axis=1), np.ones(40)]
+)
+
+
+def levels(means, noise=0.1, candidates=CANDIDATES, seed=0):
+    """Of 40 numbers in four families, each known to `noise`."""
+    values = FAMILIES @ np.array(means, dtype=float)
+    values = values + noise * np.random.default_rng(seed).standard_normal(40)
+    information = np.eye(40) / noise**2
+    return Levels(
+        information,
+        information @ values,
+        candidates,
+        np.full(40, 1e-12),
+        np.full(candidates.shape[1], 3.0),
+    )
+
+
+def two_ways(means, noise=0.1):
+    """The first of four families is told by itself, or beside what three share: as likely."""
+    own = levels(means, noise, np.delete(CANDIDATES, [LAST_TWO, ALL], axis=1))
+    rest = [D] if means[D] else []
+    own.cost[FIRST_THREE] += own.log_evidence([A, FIRST_THREE, *rest])
+    own.cost[FIRST_THREE] -= own.log_evidence([A, B, C, *rest])
+    return own
+
+
+def test_every_likely_set_is_found_with_its_probability():
+    own = two_ways([2, 1, 1, 0.5], 0.3)
+    every = [one for count in range(6) for one in combinations(range(5), count)]
+    every = [one for one in every if (own.squares(one) >= 25).all()]
+    logs = np.array([own.log_evidence(one) for one in every])
+    shares = np.exp(logs - logs.max())
+    shares /= shares.sum()
+    expected = {one: share for one, share in zip(every, shares, strict=True) if share > 1e-2}
+    found = {one.chosen: one.probability for one in likely_sets(own, 5)}
+    assert len(expected) > 1
+    for one, share in expected.items():
+        assert found[one] == pytest.approx(share, abs=0.01)
+
+
+def test_log_evidence_is_that_of_the_readings():
+    """Against the density of the readings themselves, with and without the candidates."""
+    own = levels([2, 1, 1, 0])
+    chosen = [A, FIRST_THREE]
+    noise = 0.1
+    y = np.linalg.solve(np.eye(40) / noise**2, own_score(noise))
+    with_them = noise**2 * np.eye(40) + 9.0 * CANDIDATES[:, chosen] @ CANDIDATES[:, chosen].T
+
+    def density(covariance):
+        return -0.5 * y @ np.linalg.solve(covariance, y) - 0.5 * np.linalg.slogdet(covariance)[1]
+
+    expected = density(with_them) - density(noise**2 * np.eye(40)) - 2 * np.log(7)
+    assert own.log_evidence(chosen) == pytest.approx(expected, abs=1e-6)
+    assert own.log_evidence(chosen) == pytest.approx(
+        own.gains([])[0][A] + own.gains([A])[0][FIRST_THREE]
+    )
+
+
+def own_score(noise):
+    values = FAMILIES @ np.array([2.0, 1, 1, 0])
+    return (values + noise * np.random.default_rng(0).standard_normal(40)) / noise**2
+
+
+def test_an_amount_that_hangs_on_the_set_is_told_with_such_an_error():
+    """2, or 1 beside the 1 that three share."""
+    own = two_ways([2, 1, 1, 3])
+    sets = likely_sets(own, 5)
+    told = {one.candidate: (one, there) for one, there in over_sets(own, sets)}
+    first, there = told[A]
+    assert there > 0.99
+    assert first.sigma == pytest.approx(np.sqrt(0.5), rel=0.05)
+    last, there = told[D]
+    assert there > 0.99
+    assert last.sigma < 0.04
+    inside = [one for one in sets if FIRST_THREE in one.chosen]
+    assert sum(one.probability for one in inside) == pytest.approx(0.5, abs=0.05)
+
+
+def test_sets_that_span_the_same_are_one_told_in_parts():
+    """All by 1 and three by 1 more: the fourth alone by 1, the three by 2."""
+    own = levels([2, 2, 2, 1])
+    own.cost[ALL] -= 3.0  # else it is found so at once
+    sets = likely_sets(own, 7)
+    assert sets[0].chosen == (D, FIRST_THREE)
+    assert sets[0].probability > 0.9
+    assert all(not {ALL, FIRST_THREE} <= set(one.chosen) for one in sets)
+    told = {one.candidate: one for one, _ in over_sets(own, sets)}
+    assert told[FIRST_THREE].amount == pytest.approx(2, abs=0.1)
+    assert told[D].amount == pytest.approx(1, abs=0.1)
+    assert told[D].rivals == ((D, 1.0),)
+
+
+def test_where_nothing_is_there_the_empty_set_is_told():
+    own = levels([0, 0, 0, 0])
+    sets = likely_sets(own, 7)
+    assert sets[0].chosen == ()
+    assert over_sets(own, sets) == []

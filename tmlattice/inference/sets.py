@@ -1,0 +1,192 @@
+"""Sets of reasons that explain the same numbers: which others are as likely as the best one.
+
+>>> sets = likely_sets(levels, most=20)
+>>> sets[0].chosen, sets[0].probability
+
+Shared errors can be told in many ways: two families, or a polarity and one of its families with the
+other sign. Adding and exchanging one by one ends in one of them, and which one that is hangs on
+little. So it begins anew without each of those that were chosen, and from all ends the sets beside
+them are looked at (one more, one less, one exchanged; the likeliest first, as in the search of
+Hans, Dobra and West, J. Am. Stat. Assoc. 102, 507, 2007, without its draws). All are weighed, and
+an amount's error is told over all sets that hold it. Sets that span the same are one: a whole and a
+part are told as the two parts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from heapq import heapify, heappop, heappush
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.inference.levels import CLEAR, RIVAL, Levels, Reason
+
+Array = NDArray[np.float64]
+
+DEEP = 2
+"""Candidates left out together, of those that were chosen, to end elsewhere."""
+STEPS = 300
+"""Sets whose neighbours are looked at. Of ESRF-EBS' 857 candidates 150 are needed."""
+BEHIND = 6.0
+"""Log probability behind the best by which a set is not counted: a four hundredth."""
+
+
+@dataclass(frozen=True)
+class LikelySet:
+    """Candidates that explain the numbers together.
+
+    Attributes:
+        chosen: which ones.
+        probability: among all that were counted.
+        amounts: of each.
+        covariance: of the amounts, of this set alone.
+    """
+
+    chosen: tuple[int, ...]
+    probability: float
+    amounts: Array
+    covariance: Array
+
+    def amount(self, candidate: int) -> float:
+        """Of one of them."""
+        return float(self.amounts[self.chosen.index(candidate)])
+
+    def variance(self, candidate: int) -> float:
+        """Of the amount of one of them, in this set alone."""
+        at = self.chosen.index(candidate)
+        return float(self.covariance[at, at])
+
+
+def likely_sets(levels: Levels, most: int, clear: float = CLEAR) -> list[LikelySet]:
+    """Those in which every candidate explains `clear` of chi-square beside the others, likeliest
+    first; never empty.
+
+    Args:
+        levels: the candidates.
+        most: candidates in a set.
+        clear: chi-square.
+    """
+    rests = _rests(levels.candidates)
+    starts = _starts(levels, most, clear)
+    chances: dict[frozenset[int], float] = {}
+    for one in _likely(levels, starts, most):
+        for told in (_in_parts(rests, one), one):
+            if (levels.squares(sorted(told)) >= clear).all():
+                chance = levels.log_evidence(sorted(one))
+                chances[told] = max(chance, chances.get(told, -np.inf))
+                break
+    chances = chances or {starts[0]: 0.0}  # all that are likelier are not clear
+    sets = list(chances)
+    logs = np.array([chances[one] for one in sets])
+    shares = np.exp(logs - logs.max())
+    shares /= shares.sum()
+    order = sorted(range(len(sets)), key=lambda i: (-shares[i], sorted(sets[i])))
+    return [
+        LikelySet(tuple(sorted(sets[i])), float(shares[i]), *levels.fitted(sorted(sets[i])))
+        for i in order
+    ]
+
+
+def over_sets(levels: Levels, sets: Sequence[LikelySet]) -> list[tuple[Reason, float]]:
+    """The reasons of the first set, by falling chi-square, and the probability that each is there.
+
+    Errors are those about all sets that hold a reason; its rivals are those of the sets that have
+    one other candidate in its place.
+    """
+    first = sets[0]
+    found = []
+    for own in levels.reasons(first.chosen):
+        c, amount = own.candidate, own.amount
+        there = [one for one in sets if c in one.chosen]
+        share = sum(one.probability for one in there)
+        square = sum(
+            one.probability * (one.variance(c) + (one.amount(c) - amount) ** 2) for one in there
+        )
+        others = frozenset(first.chosen) - {c}
+        rivals = [(c, first.probability)]
+        for one in sets[1:]:
+            (*more,) = frozenset(one.chosen) - others
+            likely = one.probability > np.exp(-RIVAL) * first.probability
+            if likely and len(one.chosen) == len(first.chosen) and len(more) == 1:
+                rivals.append((more[0], one.probability))
+        total = sum(chance for _, chance in rivals)
+        told = tuple((candidate, chance / total) for candidate, chance in rivals)
+        found.append((replace(own, sigma=float(np.sqrt(square / share)), rivals=told), share))
+    return found
+
+
+def _starts(levels: Levels, most: int, clear: float) -> list[frozenset[int]]:
+    """What adding and exchanging ends in, with all candidates, and without each one of those that
+    were chosen so; of a likely end each of its own in turn. Likeliest first."""
+    ends = {frozenset[int](): 0.0}
+    waiting: list[frozenset[int]] = [frozenset()]  # candidates that are not to be chosen
+    tried = set(waiting)
+    while waiting:
+        without = waiting.pop(0)
+        end = frozenset(levels.choose(most, clear, without))
+        ends[end] = levels.log_evidence(sorted(end))
+        if len(without) < DEEP and ends[end] > max(ends.values()) - BEHIND:
+            more = [without | {own} for own in sorted(end)]
+            waiting += [one for one in more if one not in tried]
+            tried.update(more)
+    best = max(ends.values())
+    likely = [one for one, value in ends.items() if value > best - BEHIND]
+    return sorted(likely, key=lambda one: (-ends[one], sorted(one)))
+
+
+def _likely(levels: Levels, starts: Sequence[frozenset[int]], most: int) -> list[frozenset[int]]:
+    """All that are reached from the starts over sets that are likely, by one candidate more, less
+    or exchanged at a time; the likeliest are looked at first, `STEPS` of them."""
+    met = {one: levels.log_evidence(sorted(one)) for one in starts}
+    best = max(met.values())
+    waiting = [(-value, sorted(one)) for one, value in met.items()]
+    heapify(waiting)
+
+    def meet(one: frozenset[int], value: float) -> None:
+        if value > best - BEHIND and one not in met:
+            met[one] = value
+            heappush(waiting, (-value, sorted(one)))
+
+    for _ in range(STEPS):
+        if not waiting or -waiting[0][0] < best - BEHIND:
+            break
+        negative, here = heappop(waiting)
+        # with one more: of each such set the log probability with any candidate
+        more = []
+        if len(here) < most:
+            more.append((frozenset(here), levels.gains(here)[0] - negative))
+        for own in here:
+            others = [c for c in here if c != own]
+            gain, _ = levels.gains(others)
+            meet(frozenset(others), float(-negative - gain[own]))
+            more.append((frozenset(others), gain - gain[own] - negative))
+        best = max([best, *(float(values.max()) for _, values in more)])
+        for other, values in more:
+            for candidate in np.flatnonzero(values > best - BEHIND).tolist():
+                meet(other | {candidate}, float(values[candidate]))
+    return [one for one, value in met.items() if value > best - BEHIND]
+
+
+def _rests(candidates: Array) -> dict[tuple[int, int], int]:
+    """Of a candidate and one that moves a part of its numbers, the one that moves the rest of them,
+    where there is one; each several numbers."""
+    several = np.flatnonzero(np.count_nonzero(candidates, axis=0) > 1)
+    columns = {candidates[:, c].tobytes(): int(c) for c in several}
+    own = candidates[:, several]
+    within = own.T @ own == np.sum(own**2, axis=0)  # [whole, part], of numbers that are 0 or 1
+    found = {}
+    for w, p in np.argwhere(within & ~np.eye(len(several), dtype=bool)).tolist():
+        rest = columns.get((own[:, w] - own[:, p]).tobytes())
+        if rest is not None:
+            found[int(several[w]), int(several[p])] = rest
+    return found
+
+
+def _in_parts(rests: dict[tuple[int, int], int], one: frozenset[int]) -> frozenset[int]:
+    """With no whole beside a part of it."""
+    while True:
+        found = next((pair for pair in permutations(sorted(one), 2) if pair in rests), None)
+        if found is None:
+            return one
+        one = one - {found[0]} | {rests[found]}
