@@ -26,6 +26,21 @@ def small_ring():
 
 
 @pytest.fixture(scope="session")
+def ring_kicking_x(tmp_path_factory):
+    """The small ring, of whose correctors v0 to v15 some kick in x; by a function of which these
+    are, as an expression of i."""
+    from tmlattice import load_ring
+
+    def ring(which):
+        path = tmp_path_factory.mktemp("ring") / "small_ring.py"
+        other = f'(Hcor if {which} else Vcor)(eid=f"v{{i}}")'
+        path.write_text(SMALL.read_text().replace('Vcor(eid=f"v{i}")', other))
+        return load_ring(path)
+
+    return ring
+
+
+@pytest.fixture(scope="session")
 def small_network(small_ring):
     from tmlattice import TaylorNetwork
 

@@ -6,6 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.kicks import by_energy
+from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.dispersion import (
     HorizontalKicks,
@@ -20,6 +23,12 @@ from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
+from tmlattice.observe.calibration import (
+    calibrated_response,
+    read_calibration,
+    read_dispersion,
+    write_calibration,
+)
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
 
 STEP = -2000.0
@@ -32,10 +41,18 @@ def simulated(ring, causes, **how):
     return simulate_response(ring, causes, rf_step=STEP, progress=False, **how).measured
 
 
-def with_orbit(measured, more):
-    """More of the RF's orbit, in x."""
-    orbit = measured.rf.orbit + np.stack([more, 0 * more], axis=1)
-    return replace(measured, rf=replace(measured.rf, orbit=orbit))
+def with_kicks(ring, measured, more):
+    """Of kicks that add so much to the RF's orbit, in x: to the correctors' orbits too."""
+    data, kicks = response_data(ring, measured), HorizontalKicks()
+    none = Errors.none(data)
+    values = np.linalg.lstsq(kicks.patterns(data).rf.T, more, rcond=None)[0]
+    before, after = (Predicted(data, own).read for own in (none, kicks.put(none, values, data)))
+    added = after - before
+    return replace(
+        measured,
+        response=measured.response + added[:-1],
+        rf=replace(measured.rf, orbit=measured.rf.orbit + added[-1]),
+    )
 
 
 def state_of(ring, measured, fit):
@@ -73,7 +90,6 @@ def beside(plain):
 def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, beside):
     state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
     patterns = HYPOTHESES["dispersion"](state).patterns
-    assert not patterns[:, :-1].any()
     assert len(patterns) < len(beside) / 2
     amounts = np.linalg.lstsq(patterns[:, -1].T, beside, rcond=None)[0]
     left = beside - amounts @ patterns[:, -1]
@@ -85,7 +101,7 @@ def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, bes
 
 def test_vertical_patterns_make_what_is_displaced_in_y_in_at(plain):
     state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
-    across, along = (patterns_of_kicks(state.at, plane) for plane in (1, 0))
+    across, along = (patterns_of_kicks(state.at, plane).rf for plane in (1, 0))
     more = displaced(plain, 1)
     left = [
         np.std(more - np.linalg.lstsq(own.T, more, rcond=None)[0] @ own)
@@ -102,7 +118,7 @@ def measured(small_ring, beside):
     causes = [Cause("quadrupole_gradient", e.name, 5e-3 * rng.standard_normal())
               for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
     plain = simulated(small_ring, causes, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
-    return causes, plain, with_orbit(plain, beside)
+    return causes, plain, with_kicks(small_ring, plain, beside)
 
 
 def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, measured):
@@ -120,24 +136,86 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
     assert missed[2] > 2 * missed[1]
 
 
-def test_patterns_are_read_as_they_were_put(small_ring, measured, rng):
-    """Beside an energy spread too, which changes the RF's orbit by its own."""
-    data = response_data(small_ring, measured[1])
-    for family in (HorizontalKicks(), VerticalKicks()):
-        spread = replace(Errors.none(data), spread=1.0)
-        values = 1e-4 * rng.standard_normal(family.size(data))
-        before, after = (Predicted(data, own) for own in (spread, family.put(spread, values, data)))
+def test_patterns_are_read_as_they_were_put(ring_kicking_x, rng):
+    """Linear about other kicks of both planes; beside an energy spread too, which changes the RF's
+    orbit by its own."""
+    ring = ring_kicking_x("i % 2")
+    data = response_data(ring, simulated(ring, [], kick=1e-5, noise=2e-8, engine="ocelot"))
+    families = HorizontalKicks(), VerticalKicks()
+    errors = replace(Errors.none(data), spread=1.0)
+    errors = replace(errors, calibration=np.append(0.1 * rng.standard_normal(17), 0.0))
+    for family in families:
+        errors = family.put(errors, 1e-4 * rng.standard_normal(family.size(data)), data)
+    for family in families:
+        values = 1e-8 * rng.standard_normal(family.size(data))
+        before, after = (Predicted(data, own) for own in (errors, family.put(errors, values, data)))
         rows = np.tensordot(values, family.rows(before, values), 1)
         moved = data.pick(after.read - before.read, family.block)
-        assert np.abs(rows).max() > 1e-8
-        assert moved == pytest.approx(rows, abs=1e-9 * np.abs(rows).max())
+        # what the spread adds to the energy's part is of second order in both
+        for part in (np.s_[:-1], np.s_[-1:]):
+            assert np.abs(rows[part]).max() > 1e-14
+            assert moved[part] == pytest.approx(rows[part], abs=1e-2 * np.abs(rows[part]).max())
+
+
+def test_dispersion_at_correctors_counts_as_that_at_monitors_does(ring_kicking_x):
+    """Against closed orbits with six coordinates, less those at a fixed energy, of a ring whose
+    correctors of y are powered: all of its maps, without the formula."""
+    ring = ring_kicking_x("i % 2")
+    rng = np.random.default_rng(0)
+    plain = ring.with_elements({
+        i: e.changed(k2=0.0) for i, e in enumerate(ring.elements) if e.kind == "sextupole"
+    })  # fmt: skip
+    bent = plain.with_elements({
+        i: e.changed(angle=1e-5 * rng.standard_normal())
+        for i, e in enumerate(plain.elements)
+        if e.kind == "vcorrector"
+    })  # fmt: skip
+    parts, at_monitors, at_correctors = [], [], []
+    for own in (plain, bent):
+        model, fixed = ResponseModel(own), ResponseModel(own, 4)
+        columns = model.columns()
+        plane = np.array(["xy".index(p) for p in columns.planes])
+        there = model.tangents[columns.layer + 1] @ model.rf_start / model.rf_start[5]
+        parts.append(model.response() - fixed.response())
+        at_monitors.append(model.rf_response() / model.rf_start[5])
+        at_correctors.append(np.where(plane == 0, there[:, 0], there[:, 2]))
+    found = by_energy(
+        ResponseModel(plain), columns.names, np.arange(len(model.monitors)),
+        at_monitors[1] - at_monitors[0], at_correctors[1] - at_correctors[0],
+    )  # fmt: skip
+    for kicked, read in ((0, 1), (1, 0)):
+        actual = (parts[1] - parts[0])[plane == kicked][..., read]
+        missed = found[plane == kicked][..., read] - actual
+        assert np.std(actual) > 1e-6
+        assert np.std(missed) < 1e-3 * np.std(actual)
+
+
+def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, beside):
+    ring = ring_kicking_x("i % 2")
+    plain = simulated(ring, [], kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
+    found = diagnose(ring, with_kicks(ring, plain, 10 * beside))
+    assert any("no gradient makes" in said for said in found.warnings)
+    path = tmp_path / "ring.calibration.json"
+    write_calibration(path, found.calibration, found.dispersion)
+    dispersion = read_dispersion(path, ring)
+    assert dispersion == found.dispersion
+    measured = found.view.measured
+    at = [found.as_found.monitors.index(found.as_found[name]) for name in measured.monitors]
+    missed = []
+    for more in (dispersion, None):
+        _, response = calibrated_response(
+            found.as_found, read_calibration(path, ring), measured.correctors, more
+        )
+        read = np.array(measured.kicks)[:, None, None] * response[:, at]
+        missed.append(np.nanstd(read - found.view.model[:-1]))
+    assert missed[0] < 2e-9 < 0.1 * missed[1]  # the steps' third order
 
 
 def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, beside):
     one = [Cause("quadrupole_gradient", "QF::3", 5e-3)]
     measured = simulated(small_ring, one, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
     said = []
-    for own in (measured, with_orbit(measured, beside)):
+    for own in (measured, with_kicks(small_ring, measured, beside)):
         said += weigh(state_of(small_ring, own, True), ["dispersion"])[1:]
     assert said[0].evidence < 0
     assert said[1].evidence > 10

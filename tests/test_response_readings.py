@@ -182,20 +182,13 @@ def test_neighbours_that_were_set_aside_are_taken_back_where_they_are_sound(smal
         assert taken_back(noisy) is noisy
 
 
-def turned(ring):
-    """Its correctors of y kick in x, all but the first."""
-    return ring.with_elements({
-        i: replace(e, kind="hcorrector")
-        for i, e in enumerate(ring.elements)
-        if e.kind == "vcorrector" and e.name != "v0"
-    })  # fmt: skip
-
-
 @pytest.mark.parametrize(("plane", "times"), [("x", 5), ("x", 200), ("y", 20)])
-def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(small_ring, monkeypatch, plane, times):
+def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
+    small_ring, ring_kicking_x, monkeypatch, plane, times
+):
     """PETRA III: a closed orbit in every step, the RF's too, each time another amount of it."""
     noise = 2e-8
-    ring = small_ring if plane == "x" else turned(small_ring)
+    ring = small_ring if plane == "x" else ring_kicking_x("i")
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
     measured = simulate_response(
         ring, causes, kick=1e-5, noise=noise, rf_step=-3000.0, engine="ocelot",

@@ -58,3 +58,44 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
     sources = kicking(model.ring, plane)
     orbits = orbits_of_kicks(model, sources, model.maps.at, model.reading_slopes[:, plane], plane)
     return np.asarray(-step * model.rf_start[5] * orbits)
+
+
+def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, plane: int) -> Array:
+    """What a kick of 1 rad behind each magnet that kicks in a plane adds to the dispersion behind
+    some layers, m per relative energy, [layer, source].
+
+    Args:
+        model: of the ring, six coordinates.
+        layers: behind which.
+        plane: 0 or 1.
+    """
+    behind = np.asarray(layers) + 1
+    rows = model.tangents[behind][:, 2 * plane]
+    return -orbits_of_kicks(model, kicking(model.ring, plane), behind, rows, plane)
+
+
+def by_energy(
+    model: ResponseModel,
+    names: Sequence[str],
+    at: Indices,
+    at_monitors: Array,
+    at_correctors: Array,
+) -> Array:
+    """What a dispersion that the model does not have adds to correctors' orbits at a fixed
+    frequency, m/rad, [corrector, monitor, 2].
+
+    A corrector's orbit is longer by its kick times the dispersion where it stands, and the energy
+    follows: the kicks that a particle of another energy misses lengthen its way, for their map is
+    symplectic. So the dispersion at correctors counts as much as that at monitors.
+
+    Args:
+        model: of the ring, six coordinates.
+        names: of the correctors.
+        at: the monitors' places among the ring's, [monitor].
+        at_monitors: m per relative energy, [monitor, 2].
+        at_correctors: in the plane of each, m per relative energy, [corrector].
+    """
+    own = model.rf_response()[at] / model.rf_start[5]
+    energy = model.columns(names).start[:, 5]
+    more = -model.rf_start[5] / model.slip * at_correctors
+    return np.asarray((energy + more)[:, None, None] * at_monitors + more[:, None, None] * own)

@@ -44,14 +44,19 @@ def predict(
     """
     from tmlattice.files import output_file
     from tmlattice.measurement.write import write_response_table
-    from tmlattice.observe.calibration import calibrated_response, read_calibration
+    from tmlattice.observe.calibration import (
+        calibrated_response,
+        read_calibration,
+        read_dispersion,
+    )
 
     if kick == 0 or not abs(kick) < float("inf"):
         raise click.BadParameter(f"a kick of {kick:g} rad; it is finite and not zero")
     with output_file(out) as file:
         ring = open_ring(lattice, sequence, energy)
         causes = read_calibration(calibration, ring) if calibration else []
-        columns, response = calibrated_response(ring, causes, correctors or None)
+        dispersion = read_dispersion(calibration, ring) if calibration else None
+        columns, response = calibrated_response(ring, causes, correctors or None, dispersion)
         monitors = [monitor.name for monitor in ring.monitors]
         orbits = list(zip(columns.names, kick * response, strict=True))
         write_response_table(file, monitors, orbits)

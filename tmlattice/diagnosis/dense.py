@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.jitter import MOSTLY, Jitter, sought
-from tmlattice.diagnosis.judges import Chi2, Score, against, in_favour, inner, lost, score
+from tmlattice.diagnosis.judges import (
+    WORTH,
+    Chi2,
+    Score,
+    against,
+    in_favour,
+    inner,
+    lost,
+    score,
+)
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
@@ -209,7 +218,7 @@ def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State,
     with_it = settle(beside_it)
     said = lost(inner(beside_it), inner(with_it))
     log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
-    taken = not against(said) if moving.share > MOSTLY else in_favour(said)
+    taken = not against(said, WORTH) if moving.share > MOSTLY else in_favour(said)
     return (with_it, moving) if taken else (state, None)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.dispersion import patterns_of_kicks
+from tmlattice.diagnosis.dispersion import HorizontalKicks
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import families
 from tmlattice.diagnosis.state import State
@@ -180,14 +180,14 @@ def _energy_offset(state: State) -> Hypothesis:
 
 
 def _dispersion(state: State) -> Hypothesis | None:
-    """See `dispersion`, in the fit's optics; one amount a pattern."""
+    """See `dispersion`; one amount a pattern."""
     if state.allows("horizontal kicks"):
         return None  # they are in the fit
-    patterns = patterns_of_kicks(state.at, 0)
-    if not len(patterns):
+    kicks = HorizontalKicks()
+    count = kicks.size(state.data)
+    if not count:
         return None
-    rows = np.zeros((len(patterns), *state.data.shape))
-    rows[:, -1] = patterns * state.at.gain(0)[-1]
+    rows = kicks.rows(state.at, np.zeros(count))
     return Hypothesis("dispersion that no gradient makes (kicks)", "rad", "< 1e-3", rows, most=1e-3)
 
 

@@ -219,9 +219,9 @@ def lost(without: Judged, within: Judged) -> tuple[float, float]:
     return whole, float(np.sqrt(variance))
 
 
-def against(said: tuple[float, float]) -> bool:
-    """Whether the judges would rather be without, by what `lost` says."""
-    return said[0] < -max(VETO, SURELY * said[1])
+def against(said: tuple[float, float], least: float = VETO) -> bool:
+    """Whether the judges would rather be without, by what `lost` says, and by so much at least."""
+    return said[0] < -max(least, SURELY * said[1])
 
 
 def in_favour(said: tuple[float, float]) -> bool:

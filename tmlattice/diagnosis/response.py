@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import DenseFit, fit_chi2, fit_steps, told
-from tmlattice.diagnosis.dispersion import dispersion_by_kicks
+from tmlattice.diagnosis.dispersion import dispersion_beside, dispersion_by_kicks
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swapped
 from tmlattice.diagnosis.exchanged import told as told_exchanged
@@ -294,6 +294,7 @@ def as_diagnosis(
             for name, group in fit.state.groups.items()
             if name not in {one.name for one in fit.state.apart}
         },
+        dispersion=dispersion_beside(fit.state.values, data),
         **told,
     )
 

@@ -22,7 +22,7 @@ from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.maps.magnets import ring_matrix
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.calibration import CALIBRATES
+from tmlattice.observe.calibration import CALIBRATES, Dispersion
 from tmlattice.observe.data import Data
 from tmlattice.optics import matrix_tunes
 
@@ -261,6 +261,7 @@ class Diagnosis(ShownDiagnosis):
         reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
+        dispersion: beside that of the ring as found, for `write_calibration`.
     """
 
     verdict: str
@@ -292,6 +293,7 @@ class Diagnosis(ShownDiagnosis):
     reasons: "Reasons | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
+    dispersion: Dispersion = field(default_factory=dict, repr=False)
 
     @property
     def kind(self) -> str:

@@ -1,12 +1,13 @@
 """Calibration of monitors and correctors: a file of effects, and the response that they make."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import Columns, ResponseModel
+from tmlattice.beam.kicks import by_energy
 from tmlattice.effects import CATALOGUE, Cause, apply, check, find, monitors_with
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.files import output_file, write_json
@@ -20,6 +21,9 @@ ENERGY = 1e-3
 FORMAT = "tmlattice-calibration"
 CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrates)
 """The effects that a calibration may hold."""
+Dispersion = Mapping[str, tuple[float, float]]
+"""What kicks of the closed orbit add to the dispersion of the lattice at monitors and correctors, x
+and y, m per relative energy; see `beam.kicks`."""
 
 
 def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
@@ -44,7 +48,27 @@ def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
     return causes
 
 
-def write_calibration(path: str | Path, causes: Iterable[Cause]) -> None:
+def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
+    """What a calibration file says of the dispersion beside the lattice's; empty where nothing.
+
+    Args:
+        path: JSON, see the schema `calibration`.
+        ring: that it is of.
+
+    Raises:
+        MeasurementError: no such file, or not a calibration.
+        UnknownNameError: of another ring.
+    """
+    path = Path(path)
+    document = read_document(path, "calibration", FORMAT)
+    rows = document.get("dispersion", [])
+    with located(path):
+        return {ring[e["element"]].name: (float(e["x"]), float(e["y"])) for e in rows}
+
+
+def write_calibration(
+    path: str | Path, causes: Iterable[Cause], dispersion: Dispersion | None = None
+) -> None:
     """Write a calibration file: whole, or not at all.
 
     Raises:
@@ -57,6 +81,10 @@ def write_calibration(path: str | Path, causes: Iterable[Cause]) -> None:
     _check(causes)
     effects = [{"effect": c.effect, "element": c.element, "amount": c.amount} for c in causes]
     document = {"format": FORMAT, "version": 1, "package": __version__, "effects": effects}
+    if dispersion:
+        document["dispersion"] = [
+            {"element": name, "x": x, "y": y} for name, (x, y) in dispersion.items()
+        ]
     with output_file(Path(path)) as file:
         write_json(file, document)
 
@@ -73,7 +101,10 @@ def corrector_scales(ring: Ring, causes: Iterable[Cause], names: Sequence[str]) 
 
 
 def calibrated_response(
-    ring: Ring, causes: Sequence[Cause] = (), correctors: Sequence[str] | None = None
+    ring: Ring,
+    causes: Sequence[Cause] = (),
+    correctors: Sequence[str] | None = None,
+    dispersion: Dispersion | None = None,
 ) -> tuple[Columns, Array]:
     """What the monitors of a ring with errors read for a radian of each corrector.
 
@@ -81,6 +112,7 @@ def calibrated_response(
         ring: the design.
         causes: on the ring, on its monitors, and an energy spread of the beam.
         correctors: names; None: all, in beam order.
+        dispersion: beside that of the ring.
 
     Returns:
         The correctors, and m/rad [corrector, monitor, 2]; NaN where a monitor is silent.
@@ -94,21 +126,37 @@ def calibrated_response(
     columns = model.columns(correctors)
     monitors = monitors_with(ring, causes)
     scales = corrector_scales(ring, causes, columns.names)
-    beam = scales[:, None, None] * _of_centroid(model, columns.names, causes)
+    beam = scales[:, None, None] * _of_centroid(model, columns, causes, dispersion or {})
     readings = np.einsum("mij,cmj->cmi", monitors.matrix(), beam)
     readings[:, monitors.silent | monitors.frozen] = np.nan
     return columns, readings
 
 
-def _of_centroid(model: ResponseModel, names: Sequence[str], causes: Iterable[Cause]) -> Array:
+def _of_centroid(
+    model: ResponseModel, columns: Columns, causes: Iterable[Cause], dispersion: Dispersion
+) -> Array:
     """m/rad of particles that answer each as its energy has it: half the second derivative by the
     energy, times the mean square, beside what one particle does."""
-    one = model.response(names)
+    nothing = (0.0, 0.0)
+    monitors = np.array([dispersion.get(name, nothing) for name in model.monitors])
+    correctors = np.array([
+        dispersion.get(name, nothing)["xy".index(plane)]
+        for name, plane in zip(columns.names, columns.planes, strict=True)
+    ])  # fmt: skip
+
+    def response(model: ResponseModel) -> Array:
+        own = model.response(columns.names)
+        if not dispersion:
+            return own
+        every = np.arange(len(model.monitors))
+        return own + by_energy(model, columns.names, every, monitors, correctors)
+
+    one = response(model)
     square = sum(cause.amount**2 for cause in causes if cause.effect == "energy_spread")
     if not square:
         return one
     step = ENERGY / model.rf_start[5]
-    up, down = (model.at_frequency(f).response(names) for f in (step, -step))
+    up, down = (response(model.at_frequency(f)) for f in (step, -step))
     return np.asarray(one + square / ENERGY**2 * ((up + down) / 2 - one))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
 from tmlattice.errors import EffectError, MeasurementError
@@ -64,6 +65,11 @@ class ResponseData:
     kicks: Array
     plane: Indices
     noise: Array
+
+    @property
+    def energy_of_rf(self) -> float:
+        """Relative energy that the RF's step makes in the design."""
+        return float(self.kicks[-1] * self.design.rf_start[5])
 
     @cached_property
     def design(self) -> ResponseModel:
@@ -186,6 +192,8 @@ class Errors:
         ring: causes in the ring.
         spread: mean square energy deviation, in units of `DELTA` squared.
         dispersion: what the RF's orbit has of kicks, see `beam.kicks`, m, [monitor, 2].
+        at_correctors: what they make of the dispersion at correctors, in the plane of each, m per
+            relative energy, [corrector].
     """
 
     monitors: Array
@@ -194,6 +202,7 @@ class Errors:
     ring: tuple[Cause, ...] = ()
     spread: float = 0.0
     dispersion: Array | float = 0.0
+    at_correctors: Array | float = 0.0
 
     @classmethod
     def none(cls, data: ResponseData) -> "Errors":
@@ -264,7 +273,19 @@ class Predicted:
         steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
         whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
         whole[-1] += self.errors.dispersion
+        if np.any(self.errors.dispersion):
+            whole[:-1] += self.by_energy(model) * data.kicks[:-1, None, None]
         return np.asarray(whole + self.bent)
+
+    def by_energy(self, model: ResponseModel) -> Array:
+        """What the kicks' dispersion adds to the correctors' orbits, m/rad, [column, monitor, 2]:
+        see `beam.kicks.by_energy`."""
+        data = self.data
+        at_monitors = np.asarray(self.errors.dispersion) / data.energy_of_rf
+        return by_energy(
+            model, data.measured.correctors, data.at, at_monitors,
+            np.broadcast_to(self.errors.at_correctors, len(data.measured.correctors)),
+        )  # fmt: skip
 
     def bend(self) -> "Predicted":
         """With the third order of the correctors' two-sided steps.
