@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.exchanged import exchanged
-from tmlattice.diagnosis.other_kicks import OtherKick, other_kicks
+from tmlattice.diagnosis.other_kicks import OtherKick, left_in_plane, other_kicks
 from tmlattice.diagnosis.state import State
 from tmlattice.diagnosis.torn_steps import torn
 from tmlattice.observe.orbit_response import Predicted, ResponseData
@@ -65,6 +65,7 @@ def odd_steps(state: State) -> OddSteps:
         unread[own.column, own.plane] = True
         if own.plane == data.plane[own.column]:  # its own kick is not known either
             unread[own.column] = True
+    unread[left_in_plane(state, [own.column for own in others])] = True
     gone = unread.all(axis=1)
     if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
         return OddSteps(nothing)

@@ -8,6 +8,7 @@ it 3 urad in y, a kilometre away.) It teaches nothing of the ring, and would jud
 can know.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ Indices = NDArray[np.int64]
 
 TIMES = 5.0
 """What a step leaves, its own kick apart, over what the typical one leaves in the same plane."""
+ALSO = 2.0
+"""The same of a step that had a kick in the other plane: one of both."""
 SHARE = 0.15
 """Of the mean square of the far monitors, left at most beside one kick elsewhere."""
 HERE = 0.5
@@ -58,6 +61,23 @@ def other_kicks(state: State) -> list[OtherKick]:
     for kicked in (0, 1):
         for plane in (0, 1):
             found += _of_planes(state, kicked, plane)
+    return found
+
+
+def left_in_plane(state: State, suspects: Sequence[int]) -> list[int]:
+    """Of columns that something else kicked in the plane across, those that leave more than is
+    usual in their own, too.
+
+    Args:
+        state: as in `other_kicks`.
+        suspects: the columns.
+    """
+    found: list[int] = []
+    for plane in (0, 1) if suspects else ():
+        columns = _columns(state, plane, plane)
+        usual = float(np.median([one.rms for one in columns])) if columns else 0.0
+        found += [one.column for one in columns
+                  if one.column in suspects and one.rms > ALSO * usual]  # fmt: skip
     return found
 
 
