@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.kicks import by_energy
+from tmlattice.beam.kicks import by_energy, dispersion_behind, kicking
 from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.dispersion import (
@@ -22,6 +22,7 @@ from tmlattice.diagnosis.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.state import begin
 from tmlattice.effects import Cause
+from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.calibration import (
     calibrated_response,
@@ -157,37 +158,81 @@ def test_patterns_are_read_as_they_were_put(ring_kicking_x, rng):
             assert moved[part] == pytest.approx(rows[part], abs=1e-2 * np.abs(rows[part]).max())
 
 
-def test_dispersion_at_correctors_counts_as_that_at_monitors_does(ring_kicking_x):
-    """Against closed orbits with six coordinates, less those at a fixed energy, of a ring whose
-    correctors of y are powered: all of its maps, without the formula."""
+@pytest.mark.parametrize("plane", [0, 1])
+def test_dispersion_at_correctors_counts_as_that_at_monitors_does(ring_kicking_x, plane):
+    """Against the closed orbits, six coordinates, of a ring whose correctors are powered: all of
+    its maps, without the formula. What its energy is of an orbit stands in the model."""
     ring = ring_kicking_x("i % 2")
     rng = np.random.default_rng(0)
     plain = ring.with_elements({
         i: e.changed(k2=0.0) for i, e in enumerate(ring.elements) if e.kind == "sextupole"
     })  # fmt: skip
     bent = plain.with_elements({
-        i: e.changed(angle=1e-5 * rng.standard_normal())
+        i: e.changed(angle=1e-6 * rng.standard_normal())
         for i, e in enumerate(plain.elements)
-        if e.kind == "vcorrector"
+        if e.kind == ("hcorrector", "vcorrector")[plane]
     })  # fmt: skip
-    parts, at_monitors, at_correctors = [], [], []
-    for own in (plain, bent):
-        model, fixed = ResponseModel(own), ResponseModel(own, 4)
+    models = [ResponseModel(own) for own in (plain, bent)]
+    rf, at_correctors, parts = [], [], []
+    for model in models:
         columns = model.columns()
-        plane = np.array(["xy".index(p) for p in columns.planes])
+        own = np.array(["xy".index(p) for p in columns.planes])
         there = model.tangents[columns.layer + 1] @ model.rf_start / model.rf_start[5]
-        parts.append(model.response() - fixed.response())
-        at_monitors.append(model.rf_response() / model.rf_start[5])
-        at_correctors.append(np.where(plane == 0, there[:, 0], there[:, 2]))
+        at_correctors.append(np.where(own == 0, there[:, 0], there[:, 2]))
+        rf.append(model.rf_response())
+        energy = columns.start[:, 5, None, None]
+        parts.append(energy * model.rf_response() / model.rf_start[5])
+    more = (rf[1] - rf[0]) / models[0].rf_start[5]
     found = by_energy(
-        ResponseModel(plain), columns.names, np.arange(len(model.monitors)),
-        at_monitors[1] - at_monitors[0], at_correctors[1] - at_correctors[0],
-    )  # fmt: skip
-    for kicked, read in ((0, 1), (1, 0)):
-        actual = (parts[1] - parts[0])[plane == kicked][..., read]
-        missed = found[plane == kicked][..., read] - actual
-        assert np.std(actual) > 1e-6
+        models[0], columns.names, np.arange(len(more)), more, at_correctors[1] - at_correctors[0]
+    )
+    for kicked, read in ((0, 0),) if plane == 0 else ((0, 1), (1, 0)):
+        actual = (parts[1] - parts[0])[own == kicked][..., read]
+        missed = found[own == kicked][..., read] - actual
+        assert np.std(actual) > 1e-7
         assert np.std(missed) < 1e-3 * np.std(actual)
+    if plane == 1:  # the energy's part is what four coordinates lack
+        lacked = [a.response() - ResponseModel(b, 4).response()
+                  for a, b in zip(models, (plain, bent), strict=True)]  # fmt: skip
+        for kicked, read in ((0, 1), (1, 0)):
+            actual = (lacked[1] - lacked[0])[own == kicked][..., read]
+            missed = found[own == kicked][..., read] - actual
+            assert np.std(missed) < 1e-3 * np.std(actual)
+
+
+@pytest.mark.parametrize("plane", [0, 1])
+def test_patterns_at_correctors_are_those_of_a_ring_with_such_kicks(ring_kicking_x, plane):
+    """Of powered correctors, and of what the orbit has of quadrupoles: the dispersion at correctors
+    and at monitors of all its maps."""
+    ring = ring_kicking_x("i % 2")
+    rng = np.random.default_rng(0)
+    plain = ring.with_elements({
+        i: e.changed(k2=0.0) for i, e in enumerate(ring.elements) if e.kind == "sextupole"
+    })  # fmt: skip
+    amounts = {
+        e.name: 1e-6 * rng.standard_normal()
+        for e in plain.elements
+        if e.kind == ("hcorrector", "vcorrector")[plane]
+    }
+    bent = plain.with_elements({
+        i: e.changed(angle=amounts[e.name])
+        for i, e in enumerate(plain.elements)
+        if e.name in amounts
+    })  # fmt: skip
+    models = [ResponseModel(own) for own in (plain, bent)]
+    path = models[1].path[:, 2 * plane]
+    sources = [plain.magnets[i] for i in kicking(plain, plane)]
+    kicks = [
+        amounts.get(e.name, (1 if plane else -1) * e.k1 * e.length * (path[i] + path[i + 1]) / 2)
+        for e, i in zip(sources, kicking(plain, plane), strict=True)
+    ]
+    layers = models[0].columns().layer
+    there = [m.tangents[layers + 1][:, 2 * plane] @ m.rf_start / m.rf_start[5] for m in models]
+    added = there[1] - there[0]
+    found = dispersion_behind(models[0], layers, plane) @ kicks
+    # kicks stand behind their magnets; of bends the orbit has more in x
+    assert np.std(found - added) < 0.35 * np.std(added)
+    assert np.corrcoef(found, added)[0, 1] > 0.95
 
 
 def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, beside):
@@ -200,6 +245,18 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
     dispersion = read_dispersion(path, ring)
     assert dispersion == found.dispersion
     measured = found.view.measured
+    for row, said in (
+        ('{"element": "QF::1", "x": 0, "y": 0}', "is a quadrupole"),
+        ('{"element": "v1", "x": 1e999, "y": 0}', "is no number"),
+        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "stands twice"),
+    ):
+        other = tmp_path / "other.json"
+        other.write_text(
+            f'{{"format": "tmlattice-calibration", "version": 1, "effects": [], '
+            f'"dispersion": [{row}]}}'
+        )
+        with pytest.raises(MeasurementError, match=said):
+            read_dispersion(other, ring)
     at = [found.as_found.monitors.index(found.as_found[name]) for name in measured.monitors]
     missed = []
     for more in (dispersion, None):

@@ -10,7 +10,7 @@ from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import magnets
 from tmlattice.diagnosis.reasons import explain_gradients, weighed
 from tmlattice.diagnosis.rounds import settle
-from tmlattice.diagnosis.sharing import candidates
+from tmlattice.diagnosis.sharing import Candidates, candidates
 from tmlattice.diagnosis.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
@@ -78,7 +78,7 @@ def test_arcs_and_straights_are_regions(small_ring):
     other = {i: replace(small_ring.elements[i], kind="drift", angle=0.0) for i in gone}
     ring = small_ring.with_elements(other)
     own = magnets(ring, ("quadrupole",), powered=True)
-    _, names, members = candidates(ring, own)
+    _, names, members, _ = candidates(ring, own)
     straight = members[:, names.index("straights")]
     inside = {own[i][0].name for i in np.flatnonzero(straight)}
     assert inside == {"QD::2", "QF::3", "QD::3"}
@@ -92,9 +92,11 @@ def of_families(amounts, seed=0, noise=2e-3):
     values = families @ np.array(amounts) + 1e-3 * rng.standard_normal(48)
     information = np.eye(48) / noise**2
     members = np.hstack([np.ones((48, 1)), families[:, :3].sum(axis=1)[:, None], families])
-    kinds = ["all", "focusing", *["family"] * 6]
+    # a family that is all magnets of a type too is one candidate, of either kind
+    kinds = ("all", "focusing", "type", "family", "type", "family", "region", "family")
+    among = Candidates(kinds, kinds, members, np.arange(8) >= 2)
     pull = information @ (values + noise * rng.standard_normal(48))
-    return weighed(information, pull, kinds, members, 1e-6 * np.eye(48))
+    return weighed(information, pull, among, 1e-6 * np.eye(48))
 
 
 def test_families_that_each_have_their_own_amount_are_told_so():

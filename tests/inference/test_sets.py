@@ -90,6 +90,26 @@ def test_an_amount_that_hangs_on_the_set_is_told_with_such_an_error():
     assert sum(one.probability for one in inside) == pytest.approx(0.5, abs=0.05)
 
 
+def test_sets_are_told_though_likelier_ones_are_not_clear():
+    """One more candidate that explains less than is asked for, and more than it costs."""
+    own = two_ways([2, 1, 1, 3])
+    before = likely_sets(own, 5)
+    more = np.concatenate([np.delete(CANDIDATES, [LAST_TWO, ALL], axis=1), np.eye(40)[:, [17]]], 1)
+    noise = 0.1
+    values = FAMILIES @ np.array([2.0, 1, 1, 3])
+    values = values + noise * np.random.default_rng(0).standard_normal(40)
+    values[17] += 4.7 * noise - (values[17] - 1)
+    information = np.eye(40) / noise**2
+    slab = np.append(np.full(5, 3.0), 0.5)
+    other = Levels(information, information @ values, more, np.full(40, 1e-12), slab)
+    other.cost[:5] = own.cost
+    other.cost[5] = -8.0
+    sets = likely_sets(other, 5)
+    assert all(5 not in one.chosen for one in sets)
+    assert {one.chosen for one in sets[:2]} == {one.chosen for one in before[:2]}
+    assert sets[1].probability > 0.1
+
+
 def test_sets_that_span_the_same_are_one_told_in_parts():
     """All by 1 and three by 1 more: the fourth alone by 1, the three by 2."""
     own = levels([2, 2, 2, 1])

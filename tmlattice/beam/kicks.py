@@ -70,8 +70,15 @@ def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, pla
         plane: 0 or 1.
     """
     behind = np.asarray(layers) + 1
+    sources = kicking(model.ring, plane)
     rows = model.tangents[behind][:, 2 * plane]
-    return -orbits_of_kicks(model, kicking(model.ring, plane), behind, rows, plane)
+    orbits = orbits_of_kicks(model, sources, behind, rows, plane)
+    # the energy that a kick makes is no dispersion of it: what it does to the RF's orbit, by which
+    # energy a step makes, stands in that at the monitors
+    start, last = np.zeros(1, dtype=int), np.eye(model.dimension)[[5]]
+    energy = orbits_of_kicks(model, sources, start, last, plane)
+    own = rows @ model.rf_start / model.rf_start[5]
+    return np.asarray(own[:, None] * energy - orbits)
 
 
 def by_energy(
@@ -92,7 +99,8 @@ def by_energy(
         model: of the ring, six coordinates.
         names: of the correctors.
         at: the monitors' places among the ring's, [monitor].
-        at_monitors: m per relative energy, [monitor, 2].
+        at_monitors: the RF's orbit over the energy that its step makes in the model, m, [monitor,
+            2].
         at_correctors: in the plane of each, m per relative energy, [corrector].
     """
     own = model.rf_response()[at] / model.rf_start[5]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import DenseFit, Step, one_by_one
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families import CHANGES, STEPS, Trial
+from tmlattice.diagnosis.families import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
@@ -123,7 +123,7 @@ def diagnose_change(
         said.append("the two measurements are the same, to the last digit")
     progress("the reference")
     rng = np.random.default_rng(seed)
-    fitted = _reference(first, split_columns(first, holdout, rng), STEPS if trials else ())
+    fitted = _reference(first, split_columns(first, holdout, rng), WITHOUT_KICKS if trials else ())
     bad = [name for name, good in zip(before.monitors, fitted.good, strict=True) if not good]
     if bad:
         kept = [name for name in before.monitors if name not in bad]
@@ -208,7 +208,9 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 
 
 def _reference(data: ResponseData, split: Split, steps: Sequence[Trial]) -> State:
-    """Everything fitted to all of the first measurement; the design where that goes astray."""
+    """Everything that a lattice holds, fitted to all of the first measurement: a ring whose
+    dispersion is the measured one, for that is what a changed gradient acts on; kicks would stay
+    behind. The design where that goes astray."""
     state = replace(begin(data, _judged_by_nobody(split)), exploring=False)
     try:
         for _, settled in one_by_one(state, steps):

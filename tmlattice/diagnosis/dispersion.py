@@ -63,7 +63,8 @@ class _Kicks(Family):
         """In the design."""
         read = bool(np.isfinite(data.orbits[-1, :, self.plane]).any())
         names = tuple(data.measured.correctors)
-        key = (self.name, data.at.tobytes(), float(data.kicks[-1]), read, names)
+        planes = data.plane.tobytes()
+        key = (self.name, data.at.tobytes(), float(data.kicks[-1]), read, names, planes)
         memory = data.ring.memory
         if key not in memory:
             memory[key] = patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
@@ -180,3 +181,17 @@ def dispersion_beside(
             dispersion_behind(model, columns.layer, family.plane),
         ]) @ kicks  # fmt: skip
     return {name: (float(x), float(y)) for name, (x, y) in zip(names, dispersion, strict=True)}
+
+
+def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
+    """The design with what `dispersion_beside` says, as other correctors and monitors have it."""
+    none = Errors.none(data)
+    if not dispersion:
+        return none
+    ring, nothing = data.ring, (0.0, 0.0)
+    monitors, correctors = (
+        np.array([dispersion.get(ring[name].name, nothing) for name in names])
+        for names in (data.measured.monitors, data.measured.correctors)
+    )
+    own = correctors[np.arange(len(correctors)), data.plane[:-1]]
+    return replace(none, dispersion=monitors * data.energy_of_rf, at_correctors=own)

@@ -250,7 +250,7 @@ class Trial:
     across: int
 
 
-STEPS = (
+WITHOUT_KICKS = (
     Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
     Trial((MonitorGain(),), 2, 0),
     Trial((QuadrupoleGradient(),), 4, 0),
@@ -261,11 +261,16 @@ STEPS = (
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
+)
+"""What a lattice with its monitors and correctors can have wrong. Skew gradients move the tunes to
+second order, which the gradients then take back."""
+
+STEPS = (
+    *WITHOUT_KICKS,
     Trial((HorizontalKicks(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),
 )
-"""What is tried, one after another. Skew gradients move the tunes to second order, which the
-gradients then take back."""
+"""What is tried, one after another."""
 
 CHANGES = (
     Trial((CorrectorCalibration(),), 3, 0),

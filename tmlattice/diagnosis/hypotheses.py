@@ -68,9 +68,8 @@ def _orders(state: State) -> tuple[Array, Array]:
         ])[:, state.data.at]
         for side in (1, -1)
     )  # fmt: skip
-    linear = (state.at.orbits(model) - state.at.bent) * np.append(
-        1 + state.at.errors.calibration[:-1], 1
-    )[:, None, None]
+    steps = model.response(state.data.measured.correctors) * kicks[:, None, None]
+    linear = np.concatenate([steps, model.rf_change(f)[None]])[:, state.data.at]
     return (up + down) / 2 - model.readings[state.data.at], (up - down) / 2 - linear
 
 
@@ -153,18 +152,8 @@ def _tune_drift(state: State) -> Hypothesis:
 def _energy_spread(state: State) -> Hypothesis | None:
     if state.allows("energy_spread"):
         return None  # it is in the fit
-    kicks = state.data.kicks[:-1, None, None]
-    per_step = state.at.model.rf_start[5]
-    f = DELTA / per_step
-    up, down = (
-        state.at.model.at_frequency(side * f).response(state.data.measured.correctors)[
-            :, state.data.at
-        ]
-        * kicks
-        for side in (1, -1)
-    )
-    curved = np.zeros_like(state.at.beam)
-    curved[:-1] = (up + down - 2 * state.at.beam[:-1]) / 2
+    curved = state.at.curved.copy()
+    curved[-1] = 0
     return Hypothesis(
         "energy spread of the beam", "(1e-3)^2", "about 1", _readings(state, curved)[None], most=4.0
     )

@@ -21,8 +21,8 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 25 readings), and by how much their sum may fall without a step that stays all the same: evidence
 takes what the model lacks for noise, and gladly fits it."""
 SURELY, WORTH = 1.0, 0.05
-"""Standard errors of a fall, or a rise, from which on it counts; and how much a rise that is a
-reason by itself is at least."""
+"""Standard errors of a fall, or a rise, from which on it counts; and how much a rise is at least
+that is a reason by itself, or a fall that refuses what most of the readings ask for."""
 
 
 class Chi2(NamedTuple):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import magnets
 from tmlattice.diagnosis.rounds import linear, marginal
-from tmlattice.diagnosis.sharing import candidates
+from tmlattice.diagnosis.sharing import Candidates, candidates
 from tmlattice.diagnosis.state import State
 from tmlattice.diagnosis.stated import of_readings, of_sizes
 from tmlattice.inference.levels import CLEAR, Levels
@@ -178,7 +178,8 @@ def explain_gradients(state: State) -> Reasons | None:
     there = linear(state, 0)
     information, pull = marginal(there, [family.variable])
     own = magnets(state.data.ring, ("quadrupole",), True)
-    kinds, names, members = candidates(state.data.ring, own)
+    among = candidates(state.data.ring, own)
+    kinds, names, members, _ = among
     known = state.groups.get(family.name)
     scatter = max(LEAST_SCATTER if known is None else known.rms, LEAST_SCATTER)
     posterior = solve(there.normal, there.groups, there.start, rounds=0)
@@ -194,7 +195,7 @@ def explain_gradients(state: State) -> Reasons | None:
     beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
     covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
-    between, levels, sets = weighed(information, pull, kinds, members, beside)
+    between, levels, sets = weighed(information, pull, among, beside)
     found = [
         (one, chance)
         for one, chance in over_sets(levels, sets)
@@ -211,8 +212,8 @@ def explain_gradients(state: State) -> Reasons | None:
         for one, chance in found
     )  # fmt: skip
     values = state.values[family.variable]
-    shared = sum((one.amount * members[:, one.candidate] for one, _ in found
-                  if kinds[one.candidate] != "magnet"), np.zeros(len(own)))  # fmt: skip
+    shared = sum((sets[0].amount(c) * members[:, c] for c in sets[0].chosen
+                  if kinds[c] != "magnet"), np.zeros(len(own)))  # fmt: skip
     size = float(np.sum(values**2))
     left = values - shared
     instead = tuple(
@@ -234,37 +235,36 @@ def explain_gradients(state: State) -> Reasons | None:
 
 
 def weighed(
-    information: Array, pull: Array, kinds: Sequence[str], members: Array, beside: Array
+    information: Array, pull: Array, among: Candidates, beside: Array
 ) -> tuple[float, Levels, list[LikelySet]]:
     """How much families differ, by evidence, and the sets of reasons beside that.
 
     Where families differ by no more than their magnets, one that is off is a reason as others are.
     Where each has a calibration of its own, no sum of a few reasons is right, and all are in every
     set, with the prior that their scatter is: else the errors of what many of them share would be
-    those of families that are alike.
+    those of families that are alike. A magnet without a family is one of its own.
 
     Args:
         information: J^T W J of the gradients, nuisances taken out, [magnet, magnet].
         pull: J^T W y with all gradients at zero, [magnet].
-        kinds: of the candidates, see `COST`.
-        members: what each moves, [magnet, candidate].
+        among: the candidates.
         beside: covariance of the scatter of single magnets, [magnet, magnet].
 
     Returns:
         Rms of families about what they share, relative, 0 where they are alike; the candidates
         weighed beside one another; the likely sets of them.
     """
-    cost = np.array([COST[kind] for kind in kinds])
-    family = np.array([kind == "family" for kind in kinds]) & (members.sum(axis=0) > 1)
-    families = np.flatnonzero(family)
-    others = np.flatnonzero(~family)
+    cost = np.array([COST[kind] for kind in among.kinds])
+    families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)
+    alone = np.diag(1.0 - np.minimum(among.members[:, families].sum(axis=1), 1.0))
 
     def levels(at: NDArray[np.int64], between: float) -> Levels:
-        share = members[:, families] * between
-        return Levels(information, pull, members[:, at], beside + share @ share.T,
-                      np.full(len(at), max(USUAL, between)), cost[at])  # fmt: skip
+        share = among.members[:, families] * between
+        scatter = beside + share @ share.T + between**2 * alone
+        slab = np.full(len(at), max(USUAL, between))
+        return Levels(information, pull, among.members[:, at], scatter, slab, cost[at])
 
-    alike = levels(np.arange(len(kinds)), 0.0)
+    alike = levels(np.arange(len(cost)), 0.0)
     best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + MORE
     for between in BETWEEN if len(families) >= FEWEST else ():
         tried = levels(others, between)
@@ -273,9 +273,9 @@ def weighed(
             best, known = between, evidence
     if not best:
         return 0.0, alike, likely_sets(alike, MOST)
-    slab = np.full(len(kinds), max(USUAL, best))
+    slab = np.full(len(cost), max(USUAL, best))
     slab[families] = best
-    whole = Levels(information, pull, members, beside, slab, cost)
+    whole = Levels(information, pull, among.members, beside + best**2 * alone, slab, cost)
     sets = []
     for one in likely_sets(levels(others, best), MOST):
         chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())

@@ -1,11 +1,12 @@
 """What magnets may share an error: all, a polarity, a region, a type, a family; or one alone."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.magnets import families
+from tmlattice.diagnosis.magnets import families as named_alike
 from tmlattice.lattice import Element, Ring
 
 Array = NDArray[np.float64]
@@ -14,10 +15,23 @@ GAP = 2.5
 """Times the usual way between two bends that makes a straight."""
 
 
-def candidates(
-    ring: Ring, own: Sequence[tuple[Element, ...]]
-) -> tuple[list[str], list[str], Array]:
-    """Kinds, names and members [magnet, candidate] of all that may share an error.
+class Candidates(NamedTuple):
+    """All that may share an error.
+
+    Attributes:
+        kinds, names: see `reasons.MAKES`.
+        members: what each moves, [magnet, candidate].
+        families: which are families of several magnets, whatever kind they are told as.
+    """
+
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+    members: Array
+    families: NDArray[np.bool_]
+
+
+def candidates(ring: Ring, own: Sequence[tuple[Element, ...]]) -> Candidates:
+    """The magnets of a ring in all ways in which they may share an error; one way has one name.
 
     Args:
         ring: where the magnets stand.
@@ -26,35 +40,40 @@ def candidates(
     kinds: list[str] = []
     names: list[str] = []
     columns: list[Array] = []
+    families: list[bool] = []
 
     def add(kind: str, name: str, members: Array) -> None:
-        fewest = 1 if kind == "magnet" else 2
-        new = not any((members == column).all() for column in columns)
-        if members.sum() >= fewest and new:
-            kinds.append(kind)
-            names.append(name)
-            columns.append(members)
+        if members.sum() < (1 if kind == "magnet" else 2):
+            return
+        same = [i for i, column in enumerate(columns) if (members == column).all()]
+        if same:
+            families[same[0]] |= kind == "family"
+            return
+        kinds.append(kind)
+        names.append(name)
+        columns.append(members)
+        families.append(kind == "family")
 
     focusing = np.array([float(pieces[0].k1 > 0) for pieces in own])
     add("all", "all quadrupoles", np.ones(len(own)))
     add("focusing", "all focusing quadrupoles", focusing)
     add("focusing", "all defocusing quadrupoles", 1 - focusing)
-    for name, members in _regions(ring, own):
-        add("region", name, members)
-        add("region", f"{name}, focusing", members * focusing)
-        add("region", f"{name}, defocusing", members * (1 - focusing))
-    stems, by_stem = families([pieces[0].name for pieces in own])
-    for length in sorted({_length(pieces) for pieces in own}):
-        alike = np.array([float(_length(pieces) == length) for pieces in own])
-        add("type", f"quadrupoles of {length:g} m", alike)
+    stems, by_stem = named_alike([pieces[0].name for pieces in own])
     for name, members in zip(stems, by_stem.T, strict=True):
         add("family", name, members)
     groups = [pieces[0].family.casefold() for pieces in own]
     for name in dict.fromkeys(groups):
         add("family", name, np.array([float(group == name) for group in groups]))
+    for name, members in _regions(ring, own):
+        add("region", name, members)
+        add("region", f"{name}, focusing", members * focusing)
+        add("region", f"{name}, defocusing", members * (1 - focusing))
+    for length in sorted({_length(pieces) for pieces in own}):
+        alike = np.array([float(_length(pieces) == length) for pieces in own])
+        add("type", f"quadrupoles of {length:g} m", alike)
     for i, pieces in enumerate(own):
         add("magnet", pieces[0].name, np.eye(len(own))[i])
-    return kinds, names, np.array(columns).T
+    return Candidates(tuple(kinds), tuple(names), np.array(columns).T, np.array(families))
 
 
 def _length(pieces: Sequence[Element]) -> float:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.dispersion import errors_beside
 from tmlattice.diagnosis.result import Diagnosis, JointView, ResponseView
 from tmlattice.effects import Cause, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
@@ -24,7 +25,7 @@ from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.posterior import posterior
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Predicted, response_data
 from tmlattice.observe.response_problem import Response
 
 Array = NDArray[np.float64]
@@ -102,7 +103,7 @@ def _together(
                for name, _ in more}  # fmt: skip
     usual, everywhere = {**usual, **scatter}, [*everywhere, *more]
     problem = Response(
-        base=Predicted(data, Errors.none(data)).bend(),
+        base=Predicted(data, errors_beside(data, diagnosis.dispersion)).bend(),
         used=np.isfinite(data.orbits) & view.good[:, None],
         places={},
         fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),

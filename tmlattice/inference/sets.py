@@ -9,7 +9,7 @@ little. So it begins anew without each of those that were chosen, and from all e
 them are looked at (one more, one less, one exchanged; the likeliest first, as in the search of
 Hans, Dobra and West, J. Am. Stat. Assoc. 102, 507, 2007, without its draws). All are weighed, and
 an amount's error is told over all sets that hold it. Sets that span the same are one: a whole and a
-part are told as the two parts.
+part, each of several numbers, are told as the two parts.
 """
 
 from collections.abc import Sequence
@@ -68,15 +68,12 @@ def likely_sets(levels: Levels, most: int, clear: float = CLEAR) -> list[LikelyS
         clear: chi-square.
     """
     rests = _rests(levels.candidates)
-    starts = _starts(levels, most, clear)
     chances: dict[frozenset[int], float] = {}
-    for one in _likely(levels, starts, most):
-        for told in (_in_parts(rests, one), one):
-            if (levels.squares(sorted(told)) >= clear).all():
-                chance = levels.log_evidence(sorted(one))
-                chances[told] = max(chance, chances.get(told, -np.inf))
-                break
-    chances = chances or {starts[0]: 0.0}  # all that are likelier are not clear
+    for one in _likely(levels, _starts(levels, most, clear), most, clear):
+        parts = _in_parts(rests, one)
+        told = parts if (levels.squares(sorted(parts)) >= clear).all() else one
+        chance = levels.log_evidence(sorted(one))
+        chances[told] = max(chance, chances.get(told, -np.inf))
     sets = list(chances)
     logs = np.array([chances[one] for one in sets])
     shares = np.exp(logs - logs.max())
@@ -135,42 +132,43 @@ def _starts(levels: Levels, most: int, clear: float) -> list[frozenset[int]]:
     return sorted(likely, key=lambda one: (-ends[one], sorted(one)))
 
 
-def _likely(levels: Levels, starts: Sequence[frozenset[int]], most: int) -> list[frozenset[int]]:
-    """All that are reached from the starts over sets that are likely, by one candidate more, less
-    or exchanged at a time; the likeliest are looked at first, `STEPS` of them."""
+def _likely(
+    levels: Levels, starts: Sequence[frozenset[int]], most: int, clear: float
+) -> list[frozenset[int]]:
+    """All that are reached from the starts over clear sets that are likely, by one candidate more,
+    less or exchanged at a time; the likeliest are looked at first, `STEPS` of them."""
     met = {one: levels.log_evidence(sorted(one)) for one in starts}
     best = max(met.values())
     waiting = [(-value, sorted(one)) for one, value in met.items()]
     heapify(waiting)
+    found: list[frozenset[int]] = []
 
     def meet(one: frozenset[int], value: float) -> None:
         if value > best - BEHIND and one not in met:
             met[one] = value
             heappush(waiting, (-value, sorted(one)))
 
-    for _ in range(STEPS):
-        if not waiting or -waiting[0][0] < best - BEHIND:
-            break
+    while waiting and len(found) < STEPS and -waiting[0][0] > best - BEHIND:
         negative, here = heappop(waiting)
-        # with one more: of each such set the log probability with any candidate
-        more = []
-        if len(here) < most:
-            more.append((frozenset(here), levels.gains(here)[0] - negative))
-        for own in here:
+        if not (levels.squares(here) >= clear).all():
+            continue
+        found.append(frozenset(here))
+        best = max(best, -negative)
+        # of each set that is left the log probability, and that with any one candidate more
+        for own in [None, *here] if len(here) < most else here:
             others = [c for c in here if c != own]
-            gain, _ = levels.gains(others)
-            meet(frozenset(others), float(-negative - gain[own]))
-            more.append((frozenset(others), gain - gain[own] - negative))
-        best = max([best, *(float(values.max()) for _, values in more)])
-        for other, values in more:
+            gain, square = levels.gains(others)
+            left = -negative if own is None else -negative - float(gain[own])
+            meet(frozenset(others), left)
+            values = np.where(square >= clear, left + gain, -np.inf)
             for candidate in np.flatnonzero(values > best - BEHIND).tolist():
-                meet(other | {candidate}, float(values[candidate]))
-    return [one for one, value in met.items() if value > best - BEHIND]
+                meet(frozenset([*others, candidate]), float(values[candidate]))
+    return [one for one in found if met[one] > best - BEHIND]
 
 
 def _rests(candidates: Array) -> dict[tuple[int, int], int]:
     """Of a candidate and one that moves a part of its numbers, the one that moves the rest of them,
-    where there is one; each several numbers."""
+    where there is one; each several numbers, for a whole with one number apart is simpler."""
     several = np.flatnonzero(np.count_nonzero(candidates, axis=0) > 1)
     columns = {candidates[:, c].tobytes(): int(c) for c in several}
     own = candidates[:, several]

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import Columns, ResponseModel
+from tmlattice.beam.closed_orbit import CORRECTORS, Columns, ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.effects import CATALOGUE, Cause, apply, check, find, monitors_with
-from tmlattice.errors import EffectError, TmlatticeError
+from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import located, read_document
@@ -56,14 +56,31 @@ def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
         ring: that it is of.
 
     Raises:
-        MeasurementError: no such file, or not a calibration.
+        MeasurementError: no such file, not a calibration, a row that is no number or of nothing
+            that is read or kicks.
         UnknownNameError: of another ring.
     """
     path = Path(path)
     document = read_document(path, "calibration", FORMAT)
-    rows = document.get("dispersion", [])
-    with located(path):
-        return {ring[e["element"]].name: (float(e["x"]), float(e["y"])) for e in rows}
+    found: dict[str, tuple[float, float]] = {}
+    for row in document.get("dispersion", []):
+        with located(path):
+            element = ring[row["element"]]
+        both = float(row["x"]), float(row["y"])
+        if element.kind != "monitor" and element.kind not in CORRECTORS:
+            wrong = f"is a {element.kind}, and has no place there"
+        elif element.name in found:
+            wrong = "stands twice"
+        elif not np.isfinite(both).all():
+            wrong = "is no number"
+        else:
+            found[element.name] = both
+            continue
+        raise MeasurementError(
+            f"{path}: the dispersion of '{element.name}' {wrong}; write the calibration anew "
+            "(diagnose --lattice-out)"
+        )
+    return found
 
 
 def write_calibration(

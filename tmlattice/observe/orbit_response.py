@@ -272,20 +272,13 @@ class Predicted:
         data = self.data
         steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
         whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
-        whole[-1] += self.errors.dispersion
         if np.any(self.errors.dispersion):
-            whole[:-1] += self.by_energy(model) * data.kicks[:-1, None, None]
+            at_monitors = np.asarray(self.errors.dispersion) / data.energy_of_rf
+            names, at_correctors = data.measured.correctors, np.asarray(self.errors.at_correctors)
+            more = by_energy(model, names, data.at, at_monitors, at_correctors)
+            whole[:-1] += more * data.kicks[:-1, None, None]
+            whole[-1] += self.errors.dispersion
         return np.asarray(whole + self.bent)
-
-    def by_energy(self, model: ResponseModel) -> Array:
-        """What the kicks' dispersion adds to the correctors' orbits, m/rad, [column, monitor, 2]:
-        see `beam.kicks.by_energy`."""
-        data = self.data
-        at_monitors = np.asarray(self.errors.dispersion) / data.energy_of_rf
-        return by_energy(
-            model, data.measured.correctors, data.at, at_monitors,
-            np.broadcast_to(self.errors.at_correctors, len(data.measured.correctors)),
-        )  # fmt: skip
 
     def bend(self) -> "Predicted":
         """With the third order of the correctors' two-sided steps.

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from tmlattice.diagnosis.dense import Step
+from tmlattice.diagnosis.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.report.text import amount_text, columns, words, wrapped
 
@@ -82,6 +83,8 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
     return rows
 
 
+SURE = 0.95
+"""Probability of a reason from which on no doubt is told."""
 REASON = ("what shares an error", "gradients", "magnets", "chi2", "which would be made by")
 
 
@@ -90,7 +93,7 @@ def reason_rows(result: Diagnosis) -> list[tuple[str, ...]]:
     found = () if result.reasons is None else result.reasons.reasons
     return [
         (
-            own.name + "".join(f" (or {name}, {100 * p:.0f} %)" for name, p in own.rivals[:1]),
+            own.name + _doubted(own),
             f"{100 * own.amount:+.2f} ± {100 * own.amount_sigma:.2f} %",
             str(len(own.members)),
             f"{own.statistic:.3g}",
@@ -100,20 +103,28 @@ def reason_rows(result: Diagnosis) -> list[tuple[str, ...]]:
     ]
 
 
+def _doubted(own: Reason) -> str:
+    """What may stand in a reason's place, or else how likely it is there."""
+    if own.rivals:
+        name, probability = own.rivals[0]
+        return f" (or {name}, {100 * probability:.0f} %)"
+    return "" if own.probability > SURE else f" (likely to {100 * own.probability:.0f} %)"
+
+
 def reasons_sentence(result: Diagnosis) -> str:
     """How much they hold, and what is left; empty where no gradients were fitted."""
     own = result.reasons
     if own is None:
         return ""
     families = (
-        f" Families differ by {100 * own.between:.2g} % (rms): each has a calibration of its own, "
-        "told where it is known to five standard deviations."
+        f" Families differ by {100 * own.between:.2g} % (rms), each by a calibration of its own; "
+        "those are told that stand out by five standard deviations."
         if own.between
         else ""
     )
     if not own.reasons:
         return (
-            "Nothing that magnets share explains their gradients, which scatter by "
+            "Nothing stands out that magnets share; beside it their gradients scatter by "
             f"{100 * own.scatter:.2g} % (rms).{families}"
         )
     return (
@@ -139,6 +150,8 @@ def instead_texts(result: Diagnosis) -> list[str]:
             if name not in first or abs(first[name] - amount) > sigma
         ]
         gone = [name for name in first if name not in {name for name, _, _ in one.amounts}]
+        if not other and not gone:
+            continue
         parts = [", ".join(other)] * bool(other) + ["without " + ", ".join(gone)] * bool(gone)
         said.append(f"{'; '.join(parts)} ({100 * one.probability:.0f} %)")
     return said
