@@ -192,8 +192,7 @@ class Errors:
         ring: causes in the ring.
         spread: mean square energy deviation, in units of `DELTA` squared.
         dispersion: what the RF's orbit has of kicks, see `beam.kicks`, m, [monitor, 2].
-        at_correctors: what they make of the dispersion at correctors, in the plane of each, m per
-            relative energy, [corrector].
+        at_correctors: the dispersion of these kicks in each one's plane, m, [corrector].
     """
 
     monitors: Array
@@ -274,9 +273,10 @@ class Predicted:
         whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
         if np.any(self.errors.dispersion):
             at_monitors = np.asarray(self.errors.dispersion) / data.energy_of_rf
-            names, at_correctors = data.measured.correctors, np.asarray(self.errors.at_correctors)
-            more = by_energy(model, names, data.at, at_monitors, at_correctors)
-            whole[:-1] += more * data.kicks[:-1, None, None]
+            names = data.measured.correctors
+            at_correctors = np.broadcast_to(self.errors.at_correctors, len(names))
+            slope = by_energy(model, names, data.at, at_monitors, at_correctors)
+            whole[:-1] += slope * data.kicks[:-1, None, None]
             whole[-1] += self.errors.dispersion
         return np.asarray(whole + self.bent)
 

@@ -124,7 +124,7 @@ def reasons_sentence(result: Diagnosis) -> str:
     )
     if not own.reasons:
         return (
-            "Nothing stands out that magnets share; beside it their gradients scatter by "
+            "Nothing stands out that magnets share; their gradients scatter by "
             f"{100 * own.scatter:.2g} % (rms).{families}"
         )
     return (
