@@ -1,6 +1,7 @@
 """The few numbers behind many gradients, on simulated responses whose errors are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,13 +9,14 @@ import pytest
 from tmlattice.diagnosis.families import CorrectorCalibration, MonitorGain
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import magnets
-from tmlattice.diagnosis.reasons import explain_gradients, weighed
+from tmlattice.diagnosis.reasons import Instead, Reason, Reasons, explain_gradients, weighed
 from tmlattice.diagnosis.rounds import settle
 from tmlattice.diagnosis.sharing import Candidates, candidates
 from tmlattice.diagnosis.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.report.response_text import instead_texts, reason_rows, reasons_sentence
 
 SINGLE = QuadrupoleGradient()
 
@@ -124,3 +126,29 @@ def test_families_that_share_all_are_alike():
     between, _, sets = of_families([0, 0, 0, 0.01, 0, 0])
     assert between == 0
     assert sets[0].chosen == (5,)
+
+
+def test_other_sets_are_told_by_what_is_otherwise_in_them():
+    def reason(name, amount, probability, rivals=()):
+        return Reason("family", name, (), amount, 1e-3, probability, 30.0, "", rivals)
+
+    found = Reasons(
+        (reason("qa", 0.01, 1.0), reason("qb", 0.02, 0.6), reason("qc", 0.03, 0.5, (("qd", 0.4),))),
+        (
+            Instead(0.3, (("qa", 0.0102, 1e-3), ("qb", 0.05, 1e-3), ("qc", 0.03, 1e-3))),
+            Instead(0.2, (("qa", 0.01, 1e-3), ("qd", -0.01, 2e-3))),
+            Instead(0.1, (("qa", 0.01, 1e-3), ("qb", 0.02, 1e-3), ("qc", 0.03, 1e-3))),
+        ),
+        (), 0.5, 1e-3, 0.005,
+    )  # fmt: skip
+    told = SimpleNamespace(reasons=found)
+    assert [row[0] for row in reason_rows(told)] == [
+        "qa",
+        "qb (likely to 60 %)",
+        "qc (or qd, 40 %)",
+    ]
+    assert instead_texts(told) == [
+        "qb +5.00 ± 0.10 % (30 %)",
+        "qd -1.00 ± 0.20 %; without qb, qc (20 %)",
+    ]
+    assert "Families differ by 0.5 % (rms)" in reasons_sentence(told)
