@@ -10,6 +10,7 @@ from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.steady import NOTHING
+from tmlattice.report.amounts import all_of, numbers
 
 
 def measured(ring, causes, **options):
@@ -154,3 +155,16 @@ def test_a_ring_without_a_closed_orbit_is_said(small_ring):
     point = problem.at(strong, NOTHING)
     assert "closed orbit" in point.lost
     assert point.chi2 == np.inf
+
+
+def test_one_number_of_several_places_is_told_once():
+    told = [
+        (Cause("vertical_focusing", "b::1", 1e-3), 1e-4),
+        (Cause("vertical_focusing", "b::2", 1e-3), 1e-4),
+        (Cause("vertical_focusing", "c::1", 1e-3), 2e-4),
+        (Cause("vertical_focusing", "c::2", 0.0), 0.0),
+        (Cause("vertical_focusing", "c::3", 0.0), 0.0),
+    ]
+    rows = numbers(told)
+    assert [all_of(places) for places, _ in rows] == ["b::1 and 1 alike", "c::1", "c::2", "c::3"]
+    assert [sigma for _, sigma in rows] == [1e-4, 2e-4, 0.0, 0.0]

@@ -1,8 +1,10 @@
 """Amounts, probabilities and effects in words."""
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
-from tmlattice.effects import CATALOGUE, find
+from tmlattice.effects import CATALOGUE, Cause, find
 
 _SCALES = {
     "relative": ((0.0, 100.0, "%"),),
@@ -58,3 +60,26 @@ def probability_text(probability: float) -> str:
     if probability > 0.9995:
         return "> 99.9 %"
     return f"{100 * probability:.1f} %" if probability > 0.001 else "< 0.1 %"
+
+
+def numbers(
+    told: Iterable[tuple[Cause, float]],
+) -> list[tuple[tuple[Cause, ...], float]]:
+    """Amounts with their errors, those that are one number of several places (a magnet's pieces,
+    all dipoles of a type) together."""
+    found: dict[tuple[float, float], list[Cause]] = {}
+    sigmas: list[float] = []
+    for cause, sigma in told:
+        one = bool(cause.amount) and sigma > 0
+        own = (round(cause.amount / sigma, 9), sigma) if one else (float(len(found)), -1.0)
+        if own not in found:
+            found[own] = []
+            sigmas.append(sigma)
+        found[own].append(cause)
+    return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
+
+
+def all_of(places: Sequence[Cause]) -> str:
+    """What a number is of, in words."""
+    first = places[0].element or "the beam"
+    return first if len(places) == 1 else f"{first} and {len(places) - 1} alike"

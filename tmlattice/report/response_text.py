@@ -7,7 +7,8 @@ import numpy as np
 from tmlattice.diagnosis.dense import Step
 from tmlattice.diagnosis.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.report.text import amount_text, columns, words, wrapped
+from tmlattice.report.amounts import all_of, amount_text, numbers, words
+from tmlattice.report.text import columns, wrapped
 
 SHOWN = 8
 """Largest errors of each effect that are listed."""
@@ -65,10 +66,12 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
 
 def largest(result: Diagnosis, effect: str) -> list[str]:
     """The errors of an effect that are furthest from zero, with their posterior rms."""
-    rows = [(c, s) for c, s in zip(result.causes, result.errors, strict=True) if c.effect == effect]
-    rows.sort(key=lambda row: -abs(row[0].amount))
+    told = zip(result.causes, result.errors, strict=True)
+    rows = numbers((cause, sigma) for cause, sigma in told if cause.effect == effect)
+    rows.sort(key=lambda row: -abs(row[0][0].amount))
     return [
-        f"{c.element or 'the beam'} {amount_text(c.effect, c.amount, s)}" for c, s in rows[:SHOWN]
+        f"{all_of(places)} {amount_text(effect, places[0].amount, sigma)}"
+        for places, sigma in rows[:SHOWN]
     ]
 
 
@@ -76,7 +79,9 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
     """By effect: how many amounts with their rms, and the largest."""
     rows = []
     for effect in dict.fromkeys(cause.effect for cause in result.causes):
-        amounts = [c.amount for c in result.causes if c.effect == effect]
+        told = zip(result.causes, result.errors, strict=True)
+        rows_of = numbers((cause, sigma) for cause, sigma in told if cause.effect == effect)
+        amounts = [places[0].amount for places, _ in rows_of]
         rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
         said = f"{words(effect)}: {len(amounts)}, rms {rms}; largest:"
         rows.append((said, "; ".join(largest(result, effect))))

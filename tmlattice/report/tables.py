@@ -13,7 +13,7 @@ from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
-from tmlattice.report.amounts import amount_text, scaled, words
+from tmlattice.report.amounts import all_of, amount_text, numbers, scaled, words
 from tmlattice.report.text import HARDLY, NOT_HELD_OUT
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
@@ -103,19 +103,19 @@ def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     named = {(finding.effect, finding.element) for finding in diagnosis.findings}
     told = list(zip(diagnosis.causes, diagnosis.errors, strict=True))
     for effect in dict.fromkeys(cause.effect for cause, _ in told):
-        own = [(c, sigma) for c, sigma in told if c.effect == effect and c.element is not None]
+        own = numbers((c, s) for c, s in told if c.effect == effect and c.element is not None)
         if len(own) < ENOUGH:
             continue
-        amounts = np.array([cause.amount for cause, _ in own])
+        amounts = np.array([places[0].amount for places, _ in own])
         off = amounts - np.median(amounts)
         scatter = 1.4826 * float(np.median(abs(off)))
-        for (cause, sigma), distance in zip(own, abs(off), strict=True):
+        for (places, sigma), distance in zip(own, abs(off), strict=True):
             times = float(distance / max(scatter, sigma, 1e-30))
-            if times > STANDS_OUT and (effect, cause.element) not in named:
-                kind = diagnosis.ring[cause.element or ""].kind
-                what = f"{words(effect)} {amount_text(effect, cause.amount, sigma)}"
+            if times > STANDS_OUT and not any((c.effect, c.element) in named for c in places):
+                kind = diagnosis.ring[places[0].element or ""].kind
+                what = f"{words(effect)} {amount_text(effect, places[0].amount, sigma)}"
                 said = f"{what}, {times:.0f} times the scatter of its kind"
-                found.append((times, (kind, cause.element or "", said)))
+                found.append((times, (kind, all_of(places), said)))
     return [row for _, row in sorted(found, key=lambda row: -row[0])[:MOST]]
 
 
