@@ -50,14 +50,20 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
     """What a step of the RF adds to the orbit at the monitors by a kick of 1 rad behind each magnet
     that kicks in a plane, m, [monitor, source].
 
+    A particle of more energy is kicked less; and as it passes beside the axis its way is longer
+    there by as much, so that another energy belongs to the step.
+
     Args:
         model: of the ring, six coordinates.
         step: relative, of the frequency.
         plane: 0 or 1.
     """
+    rows = model.reading_slopes[:, plane]
     sources = kicking(model.ring, plane)
-    orbits = orbits_of_kicks(model, sources, model.maps.at, model.reading_slopes[:, plane], plane)
-    return np.asarray(-step * model.rf_start[5] * orbits)
+    orbits = orbits_of_kicks(model, sources, model.maps.at, rows, plane)
+    own = rows @ model.rf_start / model.rf_start[5]
+    whole = orbits + own[:, None] * _energies(model, plane)
+    return np.asarray(-step * model.rf_start[5] * whole)
 
 
 def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, plane: int) -> Array:
@@ -70,15 +76,16 @@ def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, pla
         plane: 0 or 1.
     """
     behind = np.asarray(layers) + 1
-    sources = kicking(model.ring, plane)
     rows = model.tangents[behind][:, 2 * plane]
-    orbits = orbits_of_kicks(model, sources, behind, rows, plane)
-    # the energy that a kick makes is no dispersion of it: what it does to the RF's orbit, by which
-    # energy a step makes, stands in that at the monitors
-    start, last = np.zeros(1, dtype=int), np.eye(model.dimension)[[5]]
-    energy = orbits_of_kicks(model, sources, start, last, plane)
+    orbits = orbits_of_kicks(model, kicking(model.ring, plane), behind, rows, plane)
     own = rows @ model.rf_start / model.rf_start[5]
-    return np.asarray(own[:, None] * energy - orbits)
+    return np.asarray(own[:, None] * _energies(model, plane) - orbits)  # at a fixed energy
+
+
+def _energies(model: ResponseModel, plane: int) -> Array:
+    """Relative energy by a kick of 1 rad behind each magnet that kicks in a plane, [1, source]."""
+    start, last = np.zeros(1, dtype=int), np.eye(model.dimension)[[5]]
+    return orbits_of_kicks(model, kicking(model.ring, plane), start, last, plane)
 
 
 def by_energy(
