@@ -88,6 +88,12 @@ def _energies(model: ResponseModel, plane: int) -> Array:
     return orbits_of_kicks(model, kicking(model.ring, plane), start, last, plane)
 
 
+def energy_of_way(model: ResponseModel) -> float:
+    """Relative energy that a fixed frequency asks for, of a way that is longer by a metre, 1/m: a
+    kick of 1 rad lengthens it by the dispersion where it stands."""
+    return float(-model.rf_start[5] / model.slip)
+
+
 def by_energy(
     model: ResponseModel,
     names: Sequence[str],
@@ -112,5 +118,5 @@ def by_energy(
     """
     own = model.rf_response()[at] / model.rf_start[5]
     energy = model.columns(names).start[:, 5]
-    more = -model.rf_start[5] / model.slip * at_correctors
+    more = energy_of_way(model) * at_correctors
     return np.asarray((energy + more)[:, None, None] * at_monitors + more[:, None, None] * own)

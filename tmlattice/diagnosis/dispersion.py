@@ -13,7 +13,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.kicks import dispersion_behind, dispersion_of_kicks
+from tmlattice.beam.kicks import dispersion_behind, dispersion_of_kicks, energy_of_way
 from tmlattice.diagnosis.family import Family, Told
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
@@ -84,7 +84,7 @@ class _Kicks(Family):
         data, model, patterns = at.data, at.model, self.patterns(at.data)
         names = data.measured.correctors
         read = data.plane_of(self.block)[:-1]
-        more = -model.rf_start[5] / model.slip
+        more = energy_of_way(model)
         energy = model.columns(names).start[:, 5] + more * at.errors.at_correctors
         dispersion = model.rf_response()[data.at] / model.rf_start[5]
         dispersion = dispersion + at.errors.dispersion / data.energy_of_rf

@@ -7,6 +7,7 @@ import numpy as np
 from tmlattice.diagnosis.dense import Step
 from tmlattice.diagnosis.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.effects import Cause
 from tmlattice.report.amounts import all_of, amount_text, numbers, words
 from tmlattice.report.text import columns, wrapped
 
@@ -66,22 +67,23 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
 
 def largest(result: Diagnosis, effect: str) -> list[str]:
     """The errors of an effect that are furthest from zero, with their posterior rms."""
-    told = zip(result.causes, result.errors, strict=True)
-    rows = numbers((cause, sigma) for cause, sigma in told if cause.effect == effect)
-    rows.sort(key=lambda row: -abs(row[0][0].amount))
+    rows = sorted(_numbers_of(result, effect), key=lambda row: -abs(row[0][0].amount))
     return [
         f"{all_of(places)} {amount_text(effect, places[0].amount, sigma)}"
         for places, sigma in rows[:SHOWN]
     ]
 
 
+def _numbers_of(result: Diagnosis, effect: str) -> list[tuple[tuple[Cause, ...], float]]:
+    told = zip(result.causes, result.errors, strict=True)
+    return numbers((cause, sigma) for cause, sigma in told if cause.effect == effect)
+
+
 def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
     """By effect: how many amounts with their rms, and the largest."""
     rows = []
     for effect in dict.fromkeys(cause.effect for cause in result.causes):
-        told = zip(result.causes, result.errors, strict=True)
-        rows_of = numbers((cause, sigma) for cause, sigma in told if cause.effect == effect)
-        amounts = [places[0].amount for places, _ in rows_of]
+        amounts = [places[0].amount for places, _ in _numbers_of(result, effect)]
         rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
         said = f"{words(effect)}: {len(amounts)}, rms {rms}; largest:"
         rows.append((said, "; ".join(largest(result, effect))))
