@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.chain import NO_ORBIT, Chain, closing
 from tmlattice.beam.settle import settle
+from tmlattice.beam.threads import share
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
@@ -73,7 +74,6 @@ class ResponseModel:
         state: the closed orbit at the start of the ring, [n].
         path: at the start, at the layers' exits and at the end of the ring, [layer + 2, n].
         tangents: matrices from the start to there, [layer + 2, n, n].
-        inverse: their inverses.
         free: the coordinates that are free at the start: all but tau.
         readings: the closed orbit at the monitors, m, [monitor, 2].
         reading_slopes: d reading / d launch, [monitor, 2, n].
@@ -101,8 +101,7 @@ class ResponseModel:
             UnstableRingError: no closed orbit.
         """
         other = copy(self)
-        for name in ("closing", "rf_start"):  # cached for this orbit
-            other.__dict__.pop(name, None)
+        other._forget()
         other._close(frequency)
         return other
 
@@ -114,14 +113,18 @@ class ResponseModel:
             UnstableRingError: no closed orbit.
         """
         other = copy(self)
-        for name in ("closing", "rf_start"):  # cached for this orbit
-            other.__dict__.pop(name, None)
+        other._forget()
         other.ring = ring
         other.layers, touched = self.layers.changed_to(ring)
         other.maps = changed_maps(self.maps, other.layers, touched)
         other._chain = Chain(other.maps)
         other._close(self.frequency)
         return other
+
+    def _forget(self) -> None:
+        """What is cached is of this orbit."""
+        for name in ("closing", "inverse", "rf_start"):
+            self.__dict__.pop(name, None)
 
     def _close(self, frequency: float) -> None:
         dimension = self.dimension
@@ -135,16 +138,20 @@ class ResponseModel:
             free=self.free, turn=self._turn, tolerance=1e-15
         )
         self.state = self.path[0]
-        try:
-            self.inverse = np.linalg.inv(self.tangents)
-        except np.linalg.LinAlgError:  # the matrices have grown beyond all bounds
-            raise UnstableRingError(NO_ORBIT) from None
         self._solve = closing(self.tangents[-1], self.free, np.arange(len(self.free)))
 
         at, maps = self.maps.at, self.maps
         bent = np.einsum("maij,mj->mai", second_derivatives(maps.R2), self.path[at])
         self.readings = self._read(self.path[at])
         self.reading_slopes = (maps.R1 + bent) @ self.tangents[at]
+
+    @cached_property
+    def inverse(self) -> Array:
+        """Of the tangents: matrices from there to the start, [layer + 2, n, n]."""
+        try:
+            return np.asarray(np.linalg.inv(self.tangents))
+        except np.linalg.LinAlgError:  # the matrices have grown beyond all bounds
+            raise UnstableRingError(NO_ORBIT) from None
 
     @property
     def dimension(self) -> int:
@@ -255,10 +262,12 @@ class ResponseModel:
             changed = element.changed(angle=element.angle + float(kick))
             replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
         V0, V1, V2 = (np.stack(v) for v in zip(*replaced, strict=True))
-        good = settle(
-            *turn.W, turn.curved, layer, V0, V1, V2, self._solve, self._turn, 1e-14, paths
+        good = np.zeros(len(paths), dtype=bool)
+        share(
+            settle, len(paths), *turn.W, turn.curved, layer, V0, V1, V2, self._solve, self._turn,
+            1e-14, paths, good,
         )  # fmt: skip
-        if not all(good):
+        if not good.all():
             raise UnstableRingError(NO_ORBIT)
         return self._read(paths[:, self.maps.at])
 

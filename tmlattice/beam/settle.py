@@ -5,10 +5,13 @@ import numpy as np
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
-def settle(W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths):  # type: ignore[no-untyped-def]
-    """Broyden's method from a given Jacobian; True where it settled, [orbit].
+def settle(  # type: ignore[no-untyped-def]
+    first, last, W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths, good
+):
+    """Broyden's method from a given Jacobian.
 
     Args:
+        first, last: orbits of this call.
         W0, W1, W2, curved: the ring's maps, its closing way the last, [map, ...].
         layer: the map that is replaced, [orbit].
         V0, V1, V2: what stands there instead, [orbit, ...].
@@ -16,12 +19,12 @@ def settle(W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths)
         turn: what the turn should change them by, [free].
         tolerance: largest change of the start, m and rad.
         paths: starts with the guess, [orbit, 0]; filled, [orbit, map + 1, n].
+        good: filled: whether it settled, [orbit].
     """
     n, free = paths.shape[2], len(turn)
     miss, before, weight = np.zeros(free), np.zeros(free), np.zeros(free)
     change, error = np.zeros(n), np.zeros(n)
-    good = [False] * paths.shape[0]
-    for orbit in range(paths.shape[0]):
+    for orbit in range(first, last):
         inverse = solve.copy()
         for step in range(60):
             for k in range(paths.shape[1] - 1):
@@ -69,4 +72,3 @@ def settle(W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths)
             if largest < tolerance:
                 good[orbit] = True
                 break
-    return good

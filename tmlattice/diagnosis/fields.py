@@ -45,12 +45,17 @@ class _Magnets(Family):
         shares = self.shares(at.data)
         pairs = [(self.effect, place) for pieces in shares for place in pieces]
         gain, slopes = at.gain(self.block), at.slopes_of(self.block, pairs)
-        out = np.zeros((len(shares), *at.data.shape))
-        for i, pieces in enumerate(shares):
-            for share in pieces.values():
-                out[i] += share * next(slopes)
-            out[i] *= gain
+        out = np.empty((len(shares), *at.data.shape))
+        for own, pieces, unit in zip(out, shares, self.units(values), strict=True):
+            first, *others = pieces.values()
+            np.multiply(next(slopes), first * unit * gain, out=own)
+            for share in others:
+                np.add(own, next(slopes) * (share * unit * gain), out=own)
         return out
+
+    def units(self, values: Array) -> Array:
+        """Of each number: of how much of what the effect is relative to."""
+        return np.ones(len(values))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         causes = tuple(
@@ -93,9 +98,9 @@ class QuadrupoleGradient(_Magnets):
         eye = np.eye(self.size(data))
         return [Group(self.name, eye, 3e-3, TAILS, most=LARGEST_GRADIENT)]
 
-    def rows(self, at: Predicted, values: Array) -> Array:
+    def units(self, values: Array) -> Array:
         """Relative to the design's strength, not to the one found."""
-        return super().rows(at, values) / (1 + values)[:, None, None]
+        return np.asarray(1 / (1 + values))
 
 
 class FamilyGradient(QuadrupoleGradient):

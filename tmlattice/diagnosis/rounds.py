@@ -18,6 +18,7 @@ from tmlattice.diagnosis.weights import log_scale, look, taken, weighed, weight
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Normal, Posterior, normal_equations, solve
 from tmlattice.inference.priors import Group
+from tmlattice.inference.slopes import Slopes, whole
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -94,11 +95,16 @@ class Linear(NamedTuple):
     trust: Array
     by_monitor: Array
     by_column: Array
-    by_ring: Array
+    ring: tuple[Slopes, ...]
     where: Mapping[str, slice]
     groups: tuple[Group, ...]
     kept: Mapping[str, Kept]
     lowest: Array
+
+    @property
+    def by_ring(self) -> Array:
+        """The ring's rows in one array, [error, column, monitor]: a copy of them."""
+        return whole(self.ring, self.by_monitor.shape)
 
 
 def linear(state: State, block: int) -> Linear:
@@ -108,7 +114,7 @@ def linear(state: State, block: int) -> Linear:
     families = state.of_block(block)
     where: dict[str, slice] = {}
     rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
-    ring: list[Array] = []
+    ring: list[Slopes] = []
     kept: dict[str, Kept] = {}
     end = 2 * monitors + columns
     start, trust = [np.zeros(end)], [np.ones(end)]
@@ -117,22 +123,20 @@ def linear(state: State, block: int) -> Linear:
         if family.per == "ring":
             stands = kept[family.variable] = _rows(state, family)
             share = _now(stands, at.gain(block), 1 + at.errors.calibration)
-            slopes = stands.rows if share is None else stands.rows * share
             where[family.variable] = slice(end, end + len(values))
             end += len(values)
             start.append(values)
             trust.append(np.full(len(values), family.trust))
-            ring.append(slopes)
+            ring.append(Slopes(stands.rows, share))
         else:
             slopes = family.rows(at, values)
             low = 0 if family.per == "monitor" else 2 * monitors
             mine = where[family.variable] = slice(low, low + len(values))
             start[0][mine], trust[0][mine] = values, family.trust
             rows[family.per] = slopes
-    by_ring = ring[0] if len(ring) == 1 else np.concatenate([np.zeros((0, *data.shape)), *ring])
     normal = normal_equations(
         data.pick(at.left, block), weight(state, block), data.plane_of(block), rows["monitor"],
-        rows["column"], by_ring, taken(state, block),
+        rows["column"], ring, taken(state, block),
     )  # fmt: skip
     groups = []
     lowest = np.full(end, -np.inf)
@@ -155,8 +159,8 @@ def linear(state: State, block: int) -> Linear:
         basis[where[one.variable], 0] = one.members
         groups.append(Group(one.name, basis, one.wide, fixed=True))
     return Linear(
-        normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], by_ring, where,
-        tuple(groups), kept, lowest,
+        normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], tuple(ring),
+        where, tuple(groups), kept, lowest,
     )  # fmt: skip
 
 
@@ -172,15 +176,15 @@ def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
         exp(score x - x information x / 2).
     """
     A = there.normal.matrix
-    pull = there.normal.vector + A @ there.start
+    said = there.normal.vector + A @ there.start
     own = np.concatenate([np.arange(len(A))[there.where[name]] for name in names])
     spread = np.concatenate([group.basis * group.scale for group in there.groups], axis=1)
     spread = spread[:, ~spread[own].any(axis=0)]
     inside = spread.T @ A @ spread + np.eye(spread.shape[1])
     across = A[own] @ spread
-    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ pull]))
+    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ said]))
     information = A[np.ix_(own, own)] - across @ taken[:, :-1]
-    return (information + information.T) / 2, pull[own] - across @ taken[:, -1]
+    return (information + information.T) / 2, said[own] - across @ taken[:, -1]
 
 
 class Moved(NamedTuple):
@@ -231,9 +235,9 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         for name, at in there.where.items():
             moved[at] = values[name] - there.start[at]
         left = state.data.pick(then.at.left, block)
-        pull = _pull(there, state.data.plane_of(block), weighed(state, block, left))
-        pull += there.normal.matrix @ moved
-        aim, before = _aim(there, found, bold * there.trust, pull), aim
+        said = gathered(there, state.data.plane_of(block), weighed(state, block, left))
+        said += there.normal.matrix @ moved
+        aim, before = _aim(there, found, bold * there.trust, said), aim
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
             break  # as straight as the step took it for
@@ -253,13 +257,13 @@ def _within(there: Linear, bold: float) -> Posterior:
     return found
 
 
-def _pull(there: Linear, plane: Indices, weighted: Array) -> Array:
-    """J^T W residual with the slopes of the start, [parameter], of columns read in a plane each."""
-    columns, monitors = weighted.shape
+def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
+    """J^T of weighted readings [column, monitor] with the slopes of the start, [parameter], each
+    column read in a plane."""
     by_monitor = there.by_monitor * weighted
     alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
-    ring = there.by_ring.reshape(len(there.by_ring), columns * monitors) @ weighted.ravel()
-    return np.concatenate([alone.ravel(), (there.by_column * weighted).sum(axis=1), ring])
+    by_column = (there.by_column * weighted).sum(axis=1)
+    return np.concatenate([alone.ravel(), by_column, *(r.times(weighted) for r in there.ring)])
 
 
 def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.fields import QuadrupoleGradient, SkewGradient
-from tmlattice.diagnosis.rounds import Linear, linear
+from tmlattice.diagnosis.rounds import Linear, gathered, linear
 from tmlattice.diagnosis.small_errors import sizes_in
 from tmlattice.diagnosis.state import State
 from tmlattice.diagnosis.weights import weighed, weight
@@ -200,7 +200,7 @@ class Seen:
                 heavy = weighed(state, block, row)
                 it.own[h] = np.sum(heavy * row)
                 it.left[h] = np.sum(heavy * left[block])
-                it.across[:, h] = _across(it.there, heavy, state.data.plane_of(block))
+                it.across[:, h] = gathered(it.there, state.data.plane_of(block), heavy)
 
     def beside(self, without: str | None = None) -> Weighed:
         """Each suspect beside small errors and what is wrong alone.
@@ -225,15 +225,3 @@ class Seen:
         amount = np.where(total > 0, pull / safe, 0.0)
         sigma = np.where(total > 0, 1 / np.sqrt(safe), np.inf)
         return Weighed(amount * pull, amount, sigma, information)
-
-
-def _across(there: Linear, heavy: Array, plane: NDArray[np.int64]) -> Array:
-    """J^T times weighted readings, [number]."""
-    columns, monitors = heavy.shape
-    out = np.empty(len(there.normal.vector))
-    own = heavy * there.by_monitor
-    for p in (0, 1):
-        out[np.arange(monitors) * 2 + p] = own[plane == p].sum(axis=0)
-    out[2 * monitors : 2 * monitors + columns] = (heavy * there.by_column).sum(axis=1)
-    out[2 * monitors + columns :] = there.by_ring.reshape(-1, heavy.size) @ heavy.ravel()
-    return out

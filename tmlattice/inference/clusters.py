@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from tmlattice.inference.common import beside
 from tmlattice.inference.normal import shared_by
+from tmlattice.inference.slopes import Slopes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -162,7 +163,9 @@ def _of_monitors(
     """Of one monitor each, one reading of a column: by the inverse covariance of the column, less
     what its other readings tell."""
     pulled = weight * residual if taken is None else beside(weight, taken, residual)
-    shared = None if taken is None else (taken, shared_by(*rows, taken))
+    shared = (
+        None if taken is None else (taken, shared_by(*rows[:3], (Slopes(rows.by_ring),), taken))
+    )
     for own in _drawn(weight, axis=0):
         column = np.flatnonzero(weight[:, own])
         monitor, alone, others = np.full(len(column), own), weight[column, own], None

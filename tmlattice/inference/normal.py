@@ -14,11 +14,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
-from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotri, dtrtri
 from scipy.sparse import csr_array
 
 from tmlattice.inference.priors import Group
+from tmlattice.inference.slopes import Slopes, weighed_sums
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -46,7 +46,7 @@ def normal_equations(
     plane: Indices,
     by_monitor: Array,
     by_column: Array,
-    by_ring: Array | Sequence[Array],
+    by_ring: Array | Sequence[Slopes],
     taken: Array | None = None,
 ) -> Normal:
     """Sums over all readings.
@@ -57,59 +57,58 @@ def normal_equations(
         plane: in which each column is read, 0 or 1, [column].
         by_monitor: d reading / d monitor's parameter, [column, monitor].
         by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
-        by_ring: d reading / d error, [error, column, monitor]; may be empty.
+        by_ring: d reading / d error, [error, column, monitor], or those of each family; may be
+            empty.
         taken: from the weights by what the readings of a column have in common, L of
             `inference.common.common`, [column, monitor, pattern]; None: they have nothing.
     """
     columns, monitors = residual.shape
-    J = np.asarray(by_ring, dtype=float).reshape(-1, columns, monitors)
-    m, c = 2 * monitors, columns
-    A = np.zeros((m + c + len(J),) * 2)
-    b = np.zeros(len(A))
+    ring = (Slopes(np.asarray(by_ring)),) if isinstance(by_ring, np.ndarray) else tuple(by_ring)
     y = np.where(weight > 0, residual, 0.0)
-    place = np.arange(monitors)
-    rows = [plane == p for p in (0, 1)]
+    sums = weighed_sums(ring, y, weight, plane, by_monitor, by_column)
+    m, end = 2 * monitors, 2 * monitors + columns
+    A = np.zeros((end + len(sums.vector),) * 2)
+    b = np.zeros(len(A))
     wu, wv = weight * by_monitor, weight * by_column
     for p in (0, 1):
-        at = 2 * place + p
-        A[at, at] = (wu * by_monitor)[rows[p]].sum(axis=0)
-        A[np.ix_(at, m + np.flatnonzero(rows[p]))] = (wu * by_column)[rows[p]].T
-        b[at] = (wu * y)[rows[p]].sum(axis=0)
-    own = m + np.arange(c)
+        at, rows = 2 * np.arange(monitors) + p, plane == p
+        A[at, at] = (wu * by_monitor)[rows].sum(axis=0)
+        A[np.ix_(at, m + np.flatnonzero(rows))] = (wu * by_column)[rows].T
+        A[at, end:] = sums.monitors[:, p].T
+        b[at] = (wu * y)[rows].sum(axis=0)
+    own = np.arange(m, end)
     A[own, own] = (wv * by_column).sum(axis=1)
+    A[own, end:] = sums.columns.T
     b[own] = (wv * y).sum(axis=1)
-    root = np.sqrt(weight)
-    flat = np.empty((len(J), residual.size))
-    for i, slope in enumerate(J):
-        both = wu * slope
-        for p in (0, 1):
-            A[2 * place + p, m + c + i] = both[rows[p]].sum(axis=0)
-        A[own, m + c + i] = (wv * slope).sum(axis=1)
-        flat[i] = (root * slope).ravel()
-    if len(J):
-        A[m + c :, m + c :] = dsyrk(1.0, flat.T, trans=1, lower=0)
-        b[m + c :] = flat @ (root * y).ravel()
+    A[end:, end:] = sums.square
+    b[end:] = sums.vector
     if taken is not None:
-        shared = shared_by(plane, by_monitor, by_column, J, taken).reshape(len(A), -1)
+        shared = shared_by(plane, by_monitor, by_column, ring, taken).reshape(len(A), -1)
         A -= shared @ shared.T
         b -= shared @ np.einsum("cm,cmk->ck", y, taken).ravel()
     return Normal(np.triu(A) + np.triu(A, 1).T, b)
 
 
 def shared_by(
-    plane: Indices, by_monitor: Array, by_column: Array, by_ring: Array, taken: Array
+    plane: Indices,
+    by_monitor: Array,
+    by_column: Array,
+    by_ring: Sequence[Slopes],
+    taken: Array,
 ) -> Array:
     """J^T L of every column, [parameter, column, pattern]; see `normal_equations`."""
     columns, monitors, patterns = taken.shape
     m, own = 2 * monitors, np.arange(columns)
-    out = np.zeros((m + columns + len(by_ring), columns, patterns))
+    end = m + columns
+    out = np.zeros((end + sum(len(part.rows) for part in by_ring), columns, patterns))
     for p in (0, 1):
         rows = np.flatnonzero(plane == p)
         alone = by_monitor[rows, :, None] * taken[rows]
         out[np.ix_(2 * np.arange(monitors) + p, rows)] = alone.transpose(1, 0, 2)
     out[m + own, own] = np.einsum("cm,cmk->ck", by_column, taken)
-    if len(by_ring):
-        out[m + columns :] = (by_ring.transpose(1, 0, 2) @ taken).transpose(1, 0, 2)
+    for part in by_ring:
+        out[end : end + len(part.rows)] = part.through(taken)
+        end += len(part.rows)
     return out
 
 

@@ -1,0 +1,130 @@
+"""What readings do for errors of the ring: large, so that they are read once and never copied.
+
+>>> ring = (Slopes(gradients, None), Slopes(edges, now))
+>>> sums = weighed_sums(ring, weight, plane, by_monitor, by_column)
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.blas import dsyrk
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+AT_ONCE = 2048
+"""Readings that are weighed at once: enough for the products of matrices, few for the memory."""
+
+
+class Slopes(NamedTuple):
+    """Of one family of errors.
+
+    Attributes:
+        rows: d reading / d error as they were taken, [error, column, monitor].
+        now: what they are to be multiplied by since, [column, monitor]; None: nothing.
+    """
+
+    rows: Array
+    now: Array | None = None
+
+    def times(self, readings: Array) -> Array:
+        """Readings [column, monitor] times what each error does for them, summed, [error]."""
+        own = readings if self.now is None else self.now * readings
+        return np.asarray(self.rows.reshape(len(self.rows), own.size) @ own.ravel())
+
+    def through(self, patterns: Array) -> Array:
+        """Sums over the monitors of slopes times [column, monitor, pattern], [error, column,
+        pattern]."""
+        own = patterns if self.now is None else self.now[:, :, None] * patterns
+        return np.asarray((self.rows.transpose(1, 0, 2) @ own).transpose(1, 0, 2))
+
+
+class Sums(NamedTuple):
+    """Of all errors of all families, one after another.
+
+    Attributes:
+        square: J^T W J; its upper triangle alone is meant, [error, error].
+        monitors: with the monitors' own slopes, [error, plane, monitor].
+        columns: with the columns' own, [error, column].
+        vector: J^T W residual, [error].
+    """
+
+    square: Array
+    monitors: Array
+    columns: Array
+    vector: Array
+
+
+def whole(ring: Sequence[Slopes], shape: tuple[int, ...]) -> Array:
+    """All of them in one array, [error, column, monitor]: as large as they are."""
+    parts = [own.rows if own.now is None else own.rows * own.now for own in ring]
+    return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, *shape)), *parts])
+
+
+def weighed_sums(
+    ring: Sequence[Slopes],
+    residual: Array,
+    weight: Array,
+    plane: Indices,
+    by_monitor: Array,
+    by_column: Array,
+) -> Sums:
+    """Sums over all readings; see `normal.normal_equations` for the arguments.
+
+    `residual` is finite here. Beside the rows themselves this needs memory for `AT_ONCE` readings.
+    """
+    columns, monitors = residual.shape
+    ends = np.cumsum([0, *(len(own.rows) for own in ring)])
+    errors = int(ends[-1])
+    out = Sums(np.zeros((errors, errors), order="F"), np.zeros((errors, 2, monitors)),
+               np.zeros((errors, columns)), np.zeros(errors))  # fmt: skip
+    if not errors:
+        return out
+    step = min(max(AT_ONCE // monitors, 1), columns)
+    buffer = np.empty(errors * step * monitors)
+    root = np.sqrt(weight)
+    square, by_monitor, by_column = out.square, weight * by_monitor, weight * by_column
+    scales = [
+        [np.ascontiguousarray(a if own.now is None else a * own.now)
+         for a in (root, by_monitor, by_column)]
+        for own in ring
+    ]  # fmt: skip
+    for low in range(0, columns, step):
+        some = slice(low, min(low + step, columns))
+        count = some.stop - low
+        weighed = buffer[: errors * count * monitors].reshape(errors, count, monitors)
+        for own, scale, begin, end in zip(ring, scales, ends, ends[1:], strict=False):
+            mine = slice(begin, end)
+            weights, u, v = (factor[some] for factor in scale)
+            _weigh(own.rows[:, some], weights, u, v, plane[some], weighed[mine],
+                   out.monitors[mine], out.columns[mine, some])  # fmt: skip
+        flat = weighed.reshape(errors, -1)
+        square = dsyrk(1.0, flat.T, beta=1.0, c=square, trans=1, lower=0, overwrite_c=1)
+        out.vector[:] += flat @ (root[some] * residual[some]).ravel()
+    return out._replace(square=square)
+
+
+# The sum over readings (`reassoc`) may follow the vector unit's order.
+@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _weigh(rows, root, by_monitor, by_column, plane, weighed, monitors, columns):  # type: ignore[no-untyped-def]
+    """One pass over the slopes of one family; `monitors` is added to.
+
+    Args:
+        rows: [error, column, monitor].
+        root, by_monitor, by_column: what slopes are multiplied by, [column, monitor].
+        plane: [column].
+        weighed, monitors, columns: the results, see `Sums`; weighed is root times rows.
+    """
+    for i in range(rows.shape[0]):
+        for c in range(rows.shape[1]):
+            own, into = rows[i, c], weighed[i, c]
+            added, total = monitors[i, plane[c]], 0.0
+            for m in range(rows.shape[2]):
+                slope = own[m]
+                into[m] = root[c, m] * slope
+                added[m] += by_monitor[c, m] * slope
+                total += by_column[c, m] * slope
+            columns[i, c] = total
