@@ -7,13 +7,14 @@ of their own where that was weighed) and of the RF's orbit, in micrometres: of t
 the result; beside them what the experts' own LOCO fit leaves of all the data that it was fitted to
 (its last model, in the file). Then the steps, kept and refused. `--iteration first` takes the
 model as it was before that fit; `--seed N` another split, `--seeds N` that many of them;
-`--families` seeks no single faults among small errors, which takes most of the time; `--json FILE`
-writes the table, `--pictures FOLDER` a picture a ring: what is left before and after, and the
-gradients.
+`--families` seeks no single faults among small errors, which takes most of the time;
+`--pictures FOLDER` makes a picture a ring: what is left before and after, and the gradients.
+`--into FOLDER` writes a file for each ring and seed as it comes; what stands there already is told
+and not measured again, so that a long study can be stopped, and goes on.
 
-Of several seeds each is told as it comes, and at the end of each ring the median and the worst, and
-by how much what was found scatters between them, in units of its stated errors: 0.5 is right where
-errors are those of the readings, of which two seeds share four fifths; 1 where they share none.
+Of several seeds each is told as it comes, and at the end the median and the worst, and by how much
+what was found scatters between them, in units of its stated errors: 0.5 is right where errors are
+those of the readings, of which two seeds share four fifths; 1 where they share none.
 """
 
 import argparse
@@ -35,6 +36,7 @@ import tmlattice
 from tmlattice import read_measurement
 from tmlattice.diagnosis import response
 from tmlattice.errors import TmlatticeError
+from tmlattice.files import write_json
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.plots.response import plot_gradients, plot_left
 from tmlattice.report.page import shrink
@@ -60,16 +62,6 @@ def sources(data):
     return found
 
 
-def command(*words):
-    """A command's end: its exit code, what it printed, its seconds."""
-    begun = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-m", "tmlattice", *map(str, words)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return done, time.perf_counter() - begun
-
-
 def experts(path):
     """What LOCO's last model leaves, in plane and across, micrometres, of what it was fitted to."""
     content = read_mat(path, ["LocoMeasData", "LocoModel", "BPMData", "CMData"])
@@ -89,34 +81,45 @@ def experts(path):
     return [1e3 * float(np.sqrt(np.mean(left[part] ** 2))) for part in (own, ~own)]
 
 
+def imported(name, files, data, place, iteration):
+    """Lattice and folder of a ring, and what its import said of its conventions."""
+    if not files:
+        folder = data / "petra3_orbit_response"
+        return folder / "p3_low_beta.mat", folder, []
+    folder = place / name
+    command = [sys.executable, "-m", "tmlattice", "import", *files]
+    done = subprocess.run(
+        [*command, "--out", folder, "--iteration", iteration],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise TmlatticeError(done.stderr.strip())
+    told = [line for line in done.stdout.splitlines() if line.startswith("!")]
+    return folder / "lattice.json", folder, told
+
+
 def ring(name, files, data, place, options):
-    """One ring: a row of the table."""
-    if files:
-        folder = place / name
-        done, seconds = command("import", *files, "--out", folder, "--iteration", options.iteration)
-        if done.returncode:
-            return {"ring": name, "error": done.stderr.strip(), "seconds": seconds}
-        lattice = folder / "lattice.json"
-        told = [line for line in done.stdout.splitlines() if line.startswith("!")]
-    else:
-        folder, told = data / "petra3_orbit_response", []
-        lattice = folder / "p3_low_beta.mat"
-    row = {"ring": name, "contradicted": told}
-    if files and files[0].name.endswith(".loco.mat"):
-        row["experts"] = experts(files[0])
-    row["noise"] = MICRO * float(np.nanmedian(read_measurement(folder).noise))
-    every = []
+    """One ring: what each seed found."""
+    found = []
+    source = None
     for seed in range(options.seed, options.seed + options.seeds):
-        every.append(_diagnosed(lattice, folder, seed, None if every else options.pictures, name))
-        print(_as_it_comes(name, seed, every[-1]), flush=True)
-    row["seeds"] = [
-        one
-        if "error" in one
-        else one["steps"][-1]
-        | {"amounts": one.pop("amounts"), "kept": _kept(one), "refused": one["refused"]}
-        for one in every
-    ]
-    return row | every[0]
+        path = options.into and options.into / f"{name}-{seed}.json"
+        if path and path.exists():
+            found.append(json.loads(path.read_text(encoding="utf-8")))
+        else:
+            try:
+                source = source or imported(name, files, data, place, options.iteration)
+                one = _diagnosed(*source, seed, None if found else options.pictures, name)
+            except TmlatticeError as error:
+                one = {"error": str(error), "seconds": 0.0}
+            own = {"ring": name, "seed": seed, "tmlattice": tmlattice.__version__}
+            if files and files[0].name.endswith(".loco.mat"):
+                own["experts"] = experts(files[0])
+            found.append(own | one)
+            if path and "error" not in one:
+                write_json(path, found[-1])
+        print(_as_it_comes(found[-1]), flush=True)
+    return found
 
 
 def _kept(found):
@@ -124,10 +127,11 @@ def _kept(found):
     return list(dict.fromkeys(step["effect"] for step in found["steps"] if step["effect"]))
 
 
-def _as_it_comes(name, seed, found):
+def _as_it_comes(found):
     """A line of one seed."""
+    name, seed = found["ring"], found["seed"]
     if "error" in found:
-        return f"{name}, seed {seed}: {found['error']} ({found['seconds']:.0f} s)"
+        return f"{name}, seed {seed}: {found['error']}"
     last = found["steps"][-1]
     refused = ", ".join(step["effect"] for step in found["refused"])
     return (f"{name}, seed {seed}: {_figures(last)}, chi² {last['chi2']:.1f}, {found['verdict']}, "
@@ -143,17 +147,16 @@ def _figures(step):
     return f"{step['in_plane']:.2f}{jump} / {step['coupling']:.2f}{roll} / {rf}"
 
 
-def _diagnosed(lattice, folder, seed, pictures, name):
+def _diagnosed(lattice, folder, told, seed, pictures, name):
     begun = time.process_time()
-    try:
-        ring = tmlattice.load_ring(lattice)
-        found = tmlattice.diagnose(ring, read_measurement(folder), seed=seed)
-    except TmlatticeError as error:
-        return {"error": str(error), "seconds": time.process_time() - begun}
+    ring, measurement = tmlattice.load_ring(lattice), read_measurement(folder)
+    found = tmlattice.diagnose(ring, measurement, seed=seed)
     seconds = time.process_time() - begun
     if pictures:
         picture(found, pictures / f"real-{name}.png")
     return {
+        "contradicted": told,
+        "noise": MICRO * float(np.nanmedian(measurement.noise)),
         "verdict": found.verdict,
         "seconds": seconds,
         "fit": MICRO * found.fit_after.rms,
@@ -210,15 +213,15 @@ def _step(step):
     }
 
 
-def table(rows):
-    """The table, as Markdown."""
+def table(rings):
+    """The first seed of each ring, as Markdown."""
     yield ("| ring | noise | lattice: in-plane (with jump) / coupling / RF | result: in-plane "
            "(with jump) / coupling (with roll) / RF | chi² held out | fitted | experts' fit: "
            "in-plane / coupling | verdict | s |")  # fmt: skip
     yield "|" + "---|" * 9
-    for row in rows:
+    for row in (found[0] for found in rings):
         if "error" in row:
-            yield f"| {row['ring']} | | {row['error']} | | | | | error | {row['seconds']:.0f} |"
+            yield f"| {row['ring']} | | {row['error']} | | | | | error | |"
             continue
         first, last = row["steps"][0], row["steps"][-1]
         own = " / ".join(f"{v:.2f}" for v in row.get("experts", ()))
@@ -229,21 +232,35 @@ def table(rows):
         )
 
 
-def over_seeds(row):
-    """Median and worst of the seeds, and by how much what they found scatters."""
-    good = [one for one in row.get("seeds", ()) if "error" not in one]
-    if len(good) < 2:
-        return
-    said = []
-    for key, unit in (("in_plane", " µm"), ("with_jump", " µm"), ("coupling", " µm"),
-                      ("with_roll", " µm"), ("rf", " µm"), ("chi2", "")):  # fmt: skip
-        values = [one[key] for one in good if one[key] is not None]
-        if values:
-            said.append(f"{key} {np.median(values):.2f}{unit}, at worst {max(values):.2f}")
-    yield f"{row['ring']}, {len(good)} of {len(row['seeds'])} seeds: " + "; ".join(said)
-    for effect in good[0]["amounts"]:
+def table_of_seeds(rings):
+    """Median and worst of the seeds of each ring, and by how much what they found scatters."""
+    keys = {"in_plane": "in plane", "with_jump": "with a jump", "coupling": "across",
+            "with_roll": "with a roll", "rf": "RF", "chi2": "chi²"}  # fmt: skip
+    yield f"| ring | seeds | {' | '.join(keys.values())} | gradients scatter | s |"
+    yield "|" + "---|" * (len(keys) + 4)
+    for found in rings:
+        good = [one for one in found if "error" not in one]
+        if len(good) < FEWEST:
+            continue
+        cells = []
+        for key in keys:
+            values = [one["steps"][-1][key] for one in good]
+            values = [value for value in values if value is not None]
+            cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "")
+        pull = scatter(good).get("quadrupole_gradient")
+        cells.append("" if pull is None else f"{pull[1]:.2f}")
+        cells.append(f"{np.median([one['seconds'] for one in good]):.0f}")
+        name = found[0]["ring"]
+        yield f"| {name} | {len(good)} of {len(found)} | {' | '.join(cells)} |"
+
+
+def scatter(found):
+    """By effect: how many numbers, and by how much they and the worst of them scatter between
+    seeds, in units of their stated errors."""
+    out = {}
+    for effect in found[0]["amounts"]:
         told = {}
-        for one in good:
+        for one in found:
             for place, pair in one["amounts"][effect].items():
                 told.setdefault(place, []).append(pair)
         pulls = [
@@ -252,8 +269,8 @@ def over_seeds(row):
             if len(amounts) >= FEWEST
         ]
         if pulls:
-            yield (f"  {effect}: {len(pulls)} numbers scatter by {np.sqrt(np.mean(pulls)):.2f} of "
-                   f"their stated errors, one by {np.sqrt(max(pulls)):.2f}")  # fmt: skip
+            out[effect] = len(pulls), float(np.sqrt(np.mean(pulls))), float(np.sqrt(max(pulls)))
+    return out
 
 
 def steps(row):
@@ -272,25 +289,29 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--families", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--into", type=Path)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     if options.families:
         response.LARGE = 0
     if not os.environ.get("TMLATTICE_DATA"):
         sys.exit("TMLATTICE_DATA names no folder of measured data")
+    if options.into:
+        options.into.mkdir(parents=True, exist_ok=True)
     data = Path(os.environ["TMLATTICE_DATA"])
-    rows = []
+    rings = []
     with tempfile.TemporaryDirectory() as place:
         for name, files in sources(data).items():
             if options.names and not any(part in name for part in options.names):
                 continue
-            rows.append(ring(name, files, data, Path(place), options))
-            print(name, rows[-1].get("error", ""), flush=True)
-            print(*steps(rows[-1]), *over_seeds(rows[-1]), sep="\n", flush=True)
-            if options.json:
-                options.json.write_text(json.dumps(rows, indent=2), encoding="utf-8")
-    print(*table(rows), *(line for row in rows for line in over_seeds(row)), sep="\n")
+            rings.append(ring(name, files, data, Path(place), options))
+            print(*steps(rings[-1][0]), sep="\n", flush=True)
+    print(*table(rings), "", *table_of_seeds(rings), sep="\n")
+    for found in rings:
+        good = [one for one in found if "error" not in one]
+        for effect, (count, all_of_them, worst) in (scatter(good) if good else {}).items():
+            print(f"{found[0]['ring']}, {effect}: {count} numbers scatter by {all_of_them:.2f} of "
+                  f"their stated errors, one by {worst:.2f}")  # fmt: skip
 
 
 if __name__ == "__main__":
