@@ -65,7 +65,8 @@ def settle(  # type: ignore[no-untyped-def]
                 for i in range(free):
                     change[a] += inverse[a, i] * miss[i]
                 paths[orbit, 0, a] += change[a]
-                largest = max(largest, abs(change[a]))
+                if not abs(change[a]) <= largest:  # what is no number is larger than all
+                    largest = abs(change[a]) if abs(change[a]) < 1.0 else np.inf
             before[:] = miss
             if not largest < 1.0:
                 break

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
+from tmlattice.diagnosis.first_guess import first_guess
 from tmlattice.diagnosis.jitter import MOSTLY, Jitter, sought
 from tmlattice.diagnosis.judges import (
     WORTH,
@@ -53,6 +54,8 @@ LEAST = 5.0
 """Log evidence that a step has to have."""
 SPOILT = 0.05
 """By how much the judges' figures may rise with all families together."""
+ASTRAY = 1.1
+"""So many times what the design leaves of fitted readings no result may leave."""
 SURE = 100.0
 """Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
 FIRST, ROUGH = 4, 0.03
@@ -154,11 +157,12 @@ def fit_steps(
         most: steps that are kept at most.
         progress: called with each step's name.
     """
-    design = state = begin(data, split)
-    stages: dict[Trial, State] = {}
-    for trial, state in one_by_one(design, trials, progress):
-        stages[trial] = replace(state, kept={})
+    design = begin(data, split)
+    stages, state = _in_turn(design, trials, progress)
     odd = odd_steps(state)
+    if odd.alone:  # the families went after them
+        stages, state = _in_turn(beside(design, odd.unread), trials, progress)
+        odd = odd.and_more(odd_steps(state))
     state = beside(state, odd.unread)
     progress("all together")
     state = taken_back(settle(bend(jump(replace(state, independent=np.ones((2, 2)))))))
@@ -189,10 +193,13 @@ def fit_steps(
             again, without = _worth(state, doubted, progress)
             worth |= again
     spoilt = -lost(inner(replace(design, jitter=state.jitter)), inner(state))[0]
+    nothing = DenseFit(
+        design, design, (Step.scored("design", 0, before),),
+        (*refused, *(replace(step, kept=False) for step in steps.values())),
+        (before, before), odd.said,
+    )  # fmt: skip
     if spoilt > SPOILT:  # all together spoil what they should mend
-        refused += [replace(step, kept=False) for step in steps.values()]
-        return DenseFit(design, design, (Step.scored("design", 0, before),), tuple(refused),
-                        (before, before), odd.said)  # fmt: skip
+        return nothing
     progress("result")
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
     state = bend(jump(replace(state, exploring=False), beyond=1.0))
@@ -200,11 +207,32 @@ def fit_steps(
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
+    if _gap(state) > ASTRAY * _gap(design):  # one plane agrees, the other does less than before
+        return nothing
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
     said = odd.said if moving is None else (*odd.said, moving.sentence)
     return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
+
+
+def _gap(state: State) -> float:
+    """rms of what is left in plane of the fitted correctors, m, at the monitors that are good."""
+    left = state.data.pick(state.at.left)[:-1][state.fitted[:-1]][:, state.good]
+    return float(np.sqrt(np.nanmean(left**2)))
+
+
+def _in_turn(
+    design: State, trials: Sequence[Trial], progress: Callable[[str], Any]
+) -> tuple[dict[Trial, State], State]:
+    """The state with each trial's families, of those that there are, and the last of them."""
+    stages: dict[Trial, State] = {}
+    state = design
+    fitted = {family.variable for trial in trials for family in trial.families}
+    guess = {name: own for name, own in first_guess(design).items() if name in fitted}
+    for trial, state in one_by_one(replace(design, values=guess), trials, progress):
+        stages[trial] = replace(state, kept={})
+    return stages, state
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:

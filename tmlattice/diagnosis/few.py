@@ -19,7 +19,7 @@ from tmlattice.diagnosis.judges import score
 from tmlattice.diagnosis.left_open import Blur, LeftOpen
 from tmlattice.diagnosis.one_change import OneChange
 from tmlattice.diagnosis.result import Finding
-from tmlattice.diagnosis.state import begin
+from tmlattice.diagnosis.state import begin, bend
 from tmlattice.effects import find, rare
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import UnstableRingError
@@ -111,7 +111,7 @@ def few_causes(
     design = begin(data, split)
     places = {name: sum(h[0] == name for h in hypotheses) for name in {h[0] for h in hypotheses}}
     problem = Response(
-        base=design.at.bend(),
+        base=bend(design).at,
         used=_used(data, split),
         places=places,
         rare=rare(data.ring, list(places)),

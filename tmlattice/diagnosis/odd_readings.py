@@ -17,10 +17,11 @@ from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 GROSS = 20.0
-"""So many times what the design leaves of the typical reading, both of its corrector and of its
-monitor, no error of a ring makes of one reading alone: it went wrong."""
+"""So many times what the design, or a fit, leaves of the typical reading, both of its corrector and
+of its monitor, no error of a ring makes of one reading alone: it went wrong."""
 OUT = 5.0
 """A reading sticks out from so many times what is left of its column's typical one."""
 NAMED = 3
@@ -39,26 +40,51 @@ def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitRes
         measured: the response.
         data: the same, as the ring has it.
     """
-    gap = np.abs(data.orbits - Predicted(data, Errors.none(data)).read)[:-1]
-    plane = data.plane[:-1]
-    wrong = np.zeros(gap.shape, dtype=bool)
-    for kicked, read in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        left = gap[plane == kicked, :, read]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # what was not read at all
-            column, monitor = (np.nanmedian(left, axis=own, keepdims=True) for own in (1, 0))
-        usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
-        wrong[plane == kicked, :, read] = np.nan_to_num(left) > GROSS * _MAD * usual
+    wrong = gross(data, data.orbits - Predicted(data, Errors.none(data)).read)
     if not wrong.any():
         return measured, []
     response = data.measured.response.copy()
-    response[wrong] = np.nan
+    response[wrong[:-1]] = np.nan
+    return replace(data.measured, response=response), told_gross(data, wrong, "the design")
+
+
+def gross(data: ResponseData, left: Array) -> Flags:
+    """Readings of the correctors that went wrong, by what something leaves of them, [column,
+    monitor, 2].
+
+    Args:
+        data: the response.
+        left: m, NaN where nothing was read, [column, monitor, 2].
+    """
+    gap, plane = np.abs(left[:-1]), data.plane[:-1]
+    wrong = np.zeros(left.shape, dtype=bool)
+    for kicked, read in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        rows = np.flatnonzero(plane == kicked)
+        own = gap[rows, :, read]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # what was not read at all
+            column, monitor = (np.nanmedian(own, axis=k, keepdims=True) for k in (1, 0))
+        usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
+        wrong[rows, :, read] = np.nan_to_num(own) > GROSS * _MAD * usual
+    return wrong
+
+
+def told_gross(data: ResponseData, wrong: Flags, what: str) -> list[str]:
+    """A sentence of readings that went wrong, where there are any.
+
+    Args:
+        data: the response.
+        wrong: which, [column, monitor, 2].
+        what: they differ from.
+    """
+    if not wrong.any():
+        return []
     columns, monitors, _ = np.nonzero(wrong)
     names = data.measured
     most = _most(Counter(names.monitors[i] for i in monitors.tolist()),
                  Counter(names.correctors[i] for i in columns.tolist()))  # fmt: skip
-    return replace(names, response=response), [
-        f"single readings that differ from the design by {GROSS:g} times what is usual of their "
+    return [
+        f"single readings that differ from {what} by {GROSS:g} times what is usual of their "
         f"corrector and of their monitor, left out: {len(columns)}{most}"
     ]
 

@@ -1,5 +1,5 @@
-"""Steps of correctors that went wrong, by what a fit leaves of them: they are not fitted, and judge
-nobody.
+"""Steps of correctors, and single readings, that went wrong, by what a fit leaves of them: they are
+not fitted, and judge nobody.
 
 >>> odd = odd_steps(state)
 >>> state = beside(state, odd.unread)
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.exchanged import exchanged
+from tmlattice.diagnosis.odd_readings import gross, told_gross
 from tmlattice.diagnosis.other_kicks import OtherKick, left_in_plane, other_kicks
 from tmlattice.diagnosis.state import State
 from tmlattice.diagnosis.torn_steps import torn
@@ -28,30 +29,37 @@ class OddSteps:
     """What went wrong.
 
     Attributes:
-        unread: which readings are not used, by plane that is read, [column, 2].
+        unread: which readings are not used, [column, monitor, plane that is read].
         said: sentences of them.
+        alone: whether single readings are among them.
     """
 
     unread: Flags
     said: tuple[str, ...] = ()
+    alone: bool = False
 
     def and_more(self, later: "OddSteps") -> "OddSteps":
         """With those that are found once these are left out."""
-        return OddSteps(self.unread | later.unread, (*self.said, *later.said))
+        return OddSteps(
+            self.unread | later.unread, (*self.said, *later.said), self.alone or later.alone
+        )
 
 
 def odd_steps(state: State) -> OddSteps:
-    """Those whose readings belong to no orbit, and those with another kick in them; none where too
-    few are left to fit and to judge.
+    """Single readings that went wrong; steps whose readings belong to no orbit, and those with
+    another kick in them: none where too few are left to fit and to judge.
 
     Args:
         state: with all families; without monitors' gains nothing is told, for these break triples
             and leave kicks, too.
     """
     data, split = state.data, state.split
-    nothing = np.zeros((len(data.plane), 2), dtype=bool)
+    nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
         return OddSteps(nothing)
+    alone = gross(data, state.at.left)
+    without = told_gross(data, alone, "the fit")
+    state = beside(state, alone)
     broken = torn(state)
     names = data.measured.correctors
     swapped = {name for pair in exchanged(state) for name in pair}  # to be put right, not left out
@@ -60,7 +68,7 @@ def odd_steps(state: State) -> OddSteps:
         for own in other_kicks(state)
         if not broken[own.column] and names[own.column] not in swapped
     ]
-    unread = nothing | broken[:, None]
+    unread = np.zeros((len(data.plane), 2), dtype=bool) | broken[:, None]
     for own in others:
         unread[own.column, own.plane] = True
         if own.plane == data.plane[own.column]:  # its own kick is not known either
@@ -68,8 +76,9 @@ def odd_steps(state: State) -> OddSteps:
     unread[left_in_plane(state, [own.column for own in others])] = True
     gone = unread.all(axis=1)
     if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
-        return OddSteps(nothing)
-    return OddSteps(unread, (*_torn(data, broken), *_kicked(state, others)))
+        return OddSteps(alone, tuple(without), bool(without))
+    said = (*without, *_torn(data, broken), *_kicked(state, others))
+    return OddSteps(unread[:, None] | alone, said, bool(without))
 
 
 def _torn(data: ResponseData, columns: Flags) -> list[str]:
@@ -100,15 +109,15 @@ def _kicked(state: State, others: list[OtherKick]) -> list[str]:
 
 
 def beside(state: State, flags: Flags) -> State:
-    """A state as if nobody had taken these readings, [column, 2]: columns that have none are fitted
-    nowhere, and judge nothing."""
+    """A state as if nobody had taken these readings, [column, monitor, 2]: columns that have none
+    are fitted nowhere, and judge nothing."""
     if not flags.any():
         return state
     data = state.data
-    orbits = np.where(flags[:, None, :], np.nan, data.orbits)
+    orbits = np.where(flags, np.nan, data.orbits)
     measured = replace(data.measured, response=orbits[:-1].copy())
     data = replace(data, orbits=orbits, measured=measured)
-    gone = flags.all(axis=1)
+    gone = flags.all(axis=(1, 2))
     split = replace(state.split, held=state.split.held & ~gone, inner=state.split.inner & ~gone)
     at = Predicted(data, state.at.errors, state.at.bent)
     return replace(state, data=data, split=split, at=at)

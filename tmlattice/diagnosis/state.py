@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import Family
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.priors import GUESSED, Group
 from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
 
@@ -143,18 +144,25 @@ def begin(data: ResponseData, split: Split) -> State:
 
 
 def bend(state: State) -> State:
-    """With the third order of the steps where the fit stands."""
-    return replace(state, at=state.at.bend())
+    """With the third order of the steps where the fit stands. A ring that stores no beam with such
+    a step is far from the one that was measured, and keeps what it has."""
+    try:
+        return replace(state, at=state.at.bend())
+    except UnstableRingError:
+        return state
 
 
 def allow(state: State, families: Sequence[Family]) -> State:
-    """With more families, at zero."""
-    new = {f.variable: np.zeros(f.size(state.data)) for f in families}
+    """With more families, at zero or where they are to begin."""
+    values = {f.variable: np.zeros(f.size(state.data)) for f in families}
+    begun = any(state.values.get(name, new).any() for name, new in values.items())
+    begun &= not {f.variable for f in state.families} >= set(values)
     names = [family.name for family in families]
-    return replace(
-        state, families=(*state.families, *families), values={**new, **state.values},
+    state = replace(
+        state, families=(*state.families, *families), values={**values, **state.values},
         unneeded=tuple(family for family in state.unneeded if family.name not in names),
     )  # fmt: skip
+    return state.moved(state.values) if begun else state
 
 
 def forbid(state: State, families: Sequence[Family]) -> State:

@@ -19,6 +19,8 @@ Flags = NDArray[np.bool_]
 
 BAD = 5.0
 """A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+SPARED = 0.1
+"""Of its readings: a monitor is not bad by the few worst of them alone; these are themselves."""
 FEW = 4
 """Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
 TYPICAL = 10.0
@@ -146,12 +148,16 @@ def good_monitors(state: State, bad: float = BAD) -> Flags:
         rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
-        rms, gain, count = _beside_own_gain(read[rows], orbits[rows])
-        rms[gain < 0.2] = np.inf  # reversed, until gains come in
-        read_at_all = count > 0  # what was never read says nothing of the other plane
-        typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
-        if np.isfinite(typical):  # else the fit is astray, not half of the monitors
-            ratio = np.maximum(ratio, np.where(read_at_all, rms / typical, 0.0))
+        own = np.full(data.shape[1], np.inf)
+        for spared in (0.0, SPARED):
+            rms, gain, count = _beside_own_gain(read[rows], orbits[rows], spared)
+            rms[gain < 0.2] = np.inf  # reversed, until gains come in
+            read_at_all = count > 0  # what was never read says nothing of the other plane
+            typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
+            # else the fit is astray, not half of the monitors
+            share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
+            own = np.minimum(own, np.where(read_at_all, share, 0.0))
+        ratio = np.maximum(ratio, own)
     return np.asarray(ratio <= bad)
 
 
@@ -172,22 +178,34 @@ def _good_across(state: State) -> Flags:
         rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
-        rms, _, count = _beside_own_gain(read[rows], orbits[rows])
-        usual = rms[(count > 0) & state.good]
-        if len(usual):
-            good &= rms <= BAD * np.median(usual)
+        bad = np.ones(data.shape[1], dtype=bool)
+        for spared in (0.0, SPARED):
+            rms, _, count = _beside_own_gain(read[rows], orbits[rows], spared)
+            usual = rms[(count > 0) & state.good]
+            bad &= rms > BAD * np.median(usual) if len(usual) else False
+        good &= ~bad
     return good
 
 
-def _beside_own_gain(read: Array, orbits: Array) -> tuple[Array, Array, Array]:
+def _beside_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
     """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
     and of how many readings, [monitor].
 
     Args:
         read, orbits: by the model and measured, m, [column, monitor].
+        spared: share of a monitor's readings, its worst ones, that do not count.
     """
     seen = np.isfinite(orbits)
-    u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
-    gain = (u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30)
+    if spared:
+        left = np.abs(orbits - read * _gain(read, orbits, seen))
+        worst_last = np.argsort(np.argsort(np.where(seen, left, np.inf), axis=0), axis=0)
+        seen &= worst_last < np.ceil((1 - spared) * seen.sum(axis=0))
+    gain = _gain(read, orbits, seen)
     count = seen.sum(axis=0)
-    return np.sqrt(((d - gain * u) ** 2).sum(axis=0) / np.maximum(count, 1)), gain, count
+    left = np.where(seen, orbits - gain * read, 0.0)
+    return np.sqrt((left**2).sum(axis=0) / np.maximum(count, 1)), gain, count
+
+
+def _gain(read: Array, orbits: Array, seen: Flags) -> Array:
+    u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
+    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30))
