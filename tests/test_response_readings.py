@@ -66,6 +66,28 @@ def test_single_readings_that_stick_out_count_little_and_are_named(small_ring, c
     assert f"{clean.monitors[6]} (" in said
 
 
+def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_stay(
+    small_ring, clean, rng
+):
+    """LNLS with 40 of 1584 readings wrong by 0.2 mm: 34 um held out, three monitors set aside."""
+    response = clean.response.copy()
+    columns, monitors, _ = response.shape
+    places = rng.permutation(columns * monitors)[:12]
+    for place in places:
+        c, m = divmod(int(place), monitors)
+        response[c, m, int(clean.planes[c] == "y")] += 5e-6 * rng.choice([-1, 1])
+    data = response_data(small_ring, replace(clean, response=response))
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    fit = fit_steps(data, split, STEPS[:3])
+    (said,) = fit.said
+    assert said.startswith("single readings that differ from the fit by 20 times")
+    assert "left out: 12" in said
+    assert np.isnan(fit.state.data.orbits).sum() == 12
+    assert fit.state.good.all()
+    assert fit.steps[-1].heldout_chi2_per_dof < 1.5
+    assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
+
+
 def lagging(response, planes, columns, late):
     """Some monitors still average over the time before the step."""
     response = response.copy()

@@ -20,6 +20,8 @@ from tmlattice.observe.orbit_response import Predicted, ResponseData
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+MANY = 0.1
+"""Share of a step's readings from which they are not single ones."""
 GAINS = "monitor_gain"
 """The family of monitors' gains."""
 
@@ -57,10 +59,12 @@ def odd_steps(state: State) -> OddSteps:
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
         return OddSteps(nothing)
-    alone = gross(data, state.at.left)
-    without = told_gross(data, alone, "the fit")
+    alone = gross(data, _beside_own_kick(state))
+    alone[np.mean(alone, axis=(1, 2)) > MANY] = False  # the step went wrong, not single readings
     state = beside(state, alone)
     broken = torn(state)
+    alone[broken] = False  # among all the others
+    without = told_gross(data, alone, "the fit")
     names = data.measured.correctors
     swapped = {name for pair in exchanged(state) for name in pair}  # to be put right, not left out
     others = [
@@ -79,6 +83,22 @@ def odd_steps(state: State) -> OddSteps:
         return OddSteps(alone, tuple(without), bool(without))
     said = (*without, *_torn(data, broken), *_kicked(state, others))
     return OddSteps(unread[:, None] | alone, said, bool(without))
+
+
+def _beside_own_kick(state: State) -> Array:
+    """What is left with the kick that each column's readings have, for held-out ones have not been
+    fitted, m, [column, monitor, 2]: the one of least absolute deviations, of which a few wrong
+    readings move nothing."""
+    data, read = state.data, state.at.read
+    model, orbits = data.pick(read), data.pick(data.orbits)
+    kick = np.ones(len(model))
+    for c, (u, d) in enumerate(zip(model, orbits, strict=True)):
+        use = np.isfinite(d) & state.good & (u != 0)
+        ratio, size = (d[use] / u[use]), np.abs(u[use])
+        order = np.argsort(ratio)
+        half = np.searchsorted(np.cumsum(size[order]), size.sum() / 2)
+        kick[c] = ratio[order][half] if use.any() else 1.0
+    return np.asarray(data.orbits - kick[:, None, None] * read)
 
 
 def _torn(data: ResponseData, columns: Flags) -> list[str]:
