@@ -253,6 +253,15 @@ def test_a_scale_is_named_of_a_ring_far_from_its_design(small_ring, steps, name,
     assert any(name in check.sentence for check in checks), checks
 
 
+def test_an_rf_orbit_in_millimetres_is_told(small_ring):
+    """`no closed orbit` had been all that was said."""
+    steps = simulate_response(small_ring, rf_step=-3000.0, engine="ocelot", seed=1).measured
+    assert told(check_data(small_ring, steps)) == []
+    scaled = replace(steps, rf=replace(steps.rf, orbit=1e3 * steps.rf.orbit))
+    (check,) = told(check_data(small_ring, scaled))
+    assert check.sentence.startswith("the RF's orbit is 1e+03 times what its step makes")
+
+
 def test_a_bad_corrector_or_monitor_is_no_global_error(small_ring, steps):
     assert check_data(small_ring, steps).told == ()
     response = steps.response.copy()

@@ -13,8 +13,9 @@ from tmlattice.diagnosis.state import begin
 from tmlattice.effects import Cause
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 from tmlattice.observe.response_problem import Response
+from tmlattice.observe.split import split_columns
 
 
 def machine(ring, changes=(), seed=1):

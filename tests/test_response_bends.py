@@ -12,7 +12,8 @@ from tmlattice.diagnosis.state import allow
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.split import split_columns
 
 GRADIENT = -0.05
 WRONG = {"QD::5": 0.003, "QF::9": -0.003, "QF::3": 0.002, "QD::12": 0.003}

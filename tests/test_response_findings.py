@@ -7,8 +7,9 @@ from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data, split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 from tmlattice.observe.response_problem import Response, single_causes
+from tmlattice.observe.split import split_columns
 from tmlattice.observe.steady import NOTHING
 from tmlattice.report.amounts import all_of, numbers
 

@@ -19,7 +19,8 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Normal, normal_equations, solve
 from tmlattice.inference.priors import Group
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.split import split_columns
 
 
 @pytest.fixture

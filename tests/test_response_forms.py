@@ -19,7 +19,8 @@ from tmlattice.diagnosis.strangers import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.split import split_columns
 
 GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
 
@@ -41,6 +42,11 @@ def in_plane_alone(data):
     return replace(data, response=response)
 
 
+def y_monitors(data):
+    """Of horizontal steps too: a response that was taken for another ring's."""
+    return replace(data, response=np.where([False, True], data.response, np.nan))
+
+
 def of_plane(plane):
     def only(data):
         names = [n for n, p in zip(data.correctors, data.planes, strict=True) if p == plane]
@@ -54,8 +60,9 @@ def of_plane(plane):
     [
         (in_plane_alone, "no corrector is read in the other plane"),
         (of_plane("y"), "no corrector kicks in x"),
+        (y_monitors, "no monitor reads x"),
     ],
-    ids=["in-plane readings alone", "y alone"],
+    ids=["in-plane readings alone", "y alone", "monitors of y alone"],
 )
 def test_a_response_of_less_is_fitted_and_says_what_is_not_known(
     small_ring, whole, tmp_path, made, said

@@ -19,7 +19,8 @@ from tmlattice.diagnosis.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Predicted, response_data, split_columns
+from tmlattice.observe.orbit_response import Predicted, response_data
+from tmlattice.observe.split import split_columns
 
 WITH_ROLLS = {"corrector_calibration", "monitor_gain", "quadrupole_gradient", "monitor_roll",
               "corrector_roll"}  # fmt: skip

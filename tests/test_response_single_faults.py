@@ -14,8 +14,9 @@ from tmlattice.diagnosis.state import begin
 from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import NOISE, simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
 from tmlattice.observe.response_problem import single_causes
+from tmlattice.observe.split import split_columns
 
 USUAL = background_rms({"all": None})
 

@@ -13,7 +13,8 @@ from tmlattice.diagnosis.state import begin, bend
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.split import split_columns
 
 NOISE = 2e-8
 

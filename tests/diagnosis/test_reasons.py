@@ -15,7 +15,8 @@ from tmlattice.diagnosis.sharing import Candidates, candidates
 from tmlattice.diagnosis.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.split import split_columns
 from tmlattice.report.response_text import instead_texts, reason_rows, reasons_sentence
 
 SINGLE = QuadrupoleGradient()

@@ -19,7 +19,8 @@ from tmlattice import diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.families import MonitorGain, Trial
 from tmlattice.diagnosis.fields import VerticalFocusing
-from tmlattice.observe.orbit_response import response_data, split_columns
+from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.split import split_columns
 
 TURNS = ("diagnose", "ring.json", "turns")
 RESPONSE = ("diagnose", "ring.json", "response")

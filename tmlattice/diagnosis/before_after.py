@@ -43,14 +43,9 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import (
-    Predicted,
-    ResponseData,
-    Split,
-    response_data,
-    split_columns,
-)
+from tmlattice.observe.orbit_response import Predicted, ResponseData, response_data
 from tmlattice.observe.response_change import alike, response_change
+from tmlattice.observe.split import Split, split_columns
 
 Array = NDArray[np.float64]
 

@@ -43,7 +43,8 @@ from tmlattice.diagnosis.state import (
 from tmlattice.diagnosis.stated import stated
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import Posterior, solve
-from tmlattice.observe.orbit_response import ResponseData, Split
+from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

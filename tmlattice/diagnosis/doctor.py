@@ -55,6 +55,8 @@ SPOILT = 3.0
 """Misfit of a section, over the typical one, from which it is not trusted."""
 OVER, UNDER = 2.5, 3.0
 """Factors by which a stated noise may be too large, and too small."""
+SCALED = 3.0
+"""Times what the design makes of it, or as small a part, no RF's orbit is."""
 SPIKE = 20.0
 """Sigma from which one reading is wrong for once, where its neighbours agree without it."""
 
@@ -353,6 +355,13 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
             f"stated, by {after:.0f} % with that undone; {mend}"
         )
         checks.append(wrong(_GLOBAL, said, assume=verdict.names))
+    scale = judge.rf_scale()
+    if max(abs(scale), 1 / abs(scale)) > SCALED:
+        checks.append(wrong(
+            "RF step",
+            f"the RF's orbit is {scale:.3g} times what its step makes of the design's: mend its "
+            "unit (m) or the step's (Hz), or leave it out",
+        ))  # fmt: skip
     said = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
     return [*checks, fine("lattice", said)]
 

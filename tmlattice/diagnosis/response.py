@@ -46,9 +46,10 @@ from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import ResponseData, response_data, split_columns
+from tmlattice.observe.orbit_response import ResponseData, response_data
 from tmlattice.observe.response_noise import learnt_noise
 from tmlattice.observe.response_problem import single_causes
+from tmlattice.observe.split import split_columns
 
 Array = NDArray[np.float64]
 
@@ -230,6 +231,10 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
         )
     for plane in (p for p in "xy" if p not in measured.planes):
         said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")
+    for p, plane in enumerate("xy"):
+        own = data.orbits[:-1][data.plane[:-1] == p, :, p]
+        if len(own) and not np.isfinite(own).any():
+            said.append(f"no monitor reads {plane}: what acts in that plane alone is not known")
     if not np.isfinite(data.pick(data.orbits, 1)[:-1]).any():
         said.append(
             "no corrector is read in the other plane: rolls and skew gradients are not known"

@@ -39,8 +39,9 @@ from tmlattice.inference.priors import Group
 from tmlattice.inference.rivals import Detection, linear_evidence
 from tmlattice.inference.scan import Scan
 from tmlattice.lattice import Ring
-from tmlattice.observe.orbit_response import Hypothesis, ResponseData, Split
+from tmlattice.observe.orbit_response import Hypothesis, ResponseData
 from tmlattice.observe.response_problem import Response
+from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]
 

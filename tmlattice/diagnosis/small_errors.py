@@ -33,7 +33,8 @@ from tmlattice.effects import find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import SMALLEST, Group
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, Split
+from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

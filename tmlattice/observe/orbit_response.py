@@ -20,7 +20,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
-from tmlattice.errors import EffectError, MeasurementError
+from tmlattice.errors import EffectError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_noise import learnt_noise
@@ -36,8 +36,6 @@ DELTA = 1e-3
 the unit in which the spread's is fitted."""
 TURN = 0.1
 """Roll that shows a corrector's kick in the other plane, rad."""
-INNER = 0.2
-"""Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
 NO_RF = 1e-6
 """Relative step of an RF that was not stepped: its orbit is missing."""
 SMALL = 1e-3
@@ -133,53 +131,6 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
         plane=np.append([int(p == "y") for p in measured.planes], 0),
         noise=noise,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Split:
-    """Who is fitted, who chooses, who judges.
-
-    Attributes:
-        held: correctors that are never fitted, [column].
-        inner: correctors that choose among families of errors, [column].
-        half: monitors that give a corrector its kick, or fit the RF, [column, monitor].
-        inner_rf: of the RF's fitted monitors those that choose, [monitor].
-    """
-
-    held: Flags
-    inner: Flags
-    half: Flags
-    inner_rf: Flags
-
-
-def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) -> Split:
-    """Draw them.
-
-    Raises:
-        MeasurementError: too few correctors.
-    """
-    columns, monitors = data.shape
-    count = round(holdout * (columns - 1))
-    inner = round(INNER * (columns - 1 - count))
-    if not (count > 0 and inner > 0 and count + inner < columns - 2):
-        raise MeasurementError(f"{columns - 1} correctors cannot be split; measure more")
-    held, chooses = np.zeros((2, columns), dtype=bool)
-    drawn = rng.permutation(columns - 1)
-    held[drawn[:count]] = True
-    chooses[drawn[count : count + inner]] = True
-    half = np.zeros((columns, monitors), dtype=bool)
-
-    def draw(c: int) -> None:
-        half[c, rng.choice(monitors, monitors // 2, replace=False)] = True
-
-    for c in [*np.flatnonzero(held | chooses), columns - 1]:
-        draw(int(c))
-    near = np.flatnonzero(half[-1])
-    inner_rf = np.zeros(monitors, dtype=bool)
-    inner_rf[rng.choice(near, max(1, round(INNER * len(near))), replace=False)] = True
-    for c in np.flatnonzero(~(held | chooses))[:-1]:
-        draw(int(c))
-    return Split(held, chooses, half, inner_rf)
 
 
 @dataclass(frozen=True, eq=False)

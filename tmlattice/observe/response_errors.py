@@ -36,6 +36,8 @@ SCALES, NEAR, SIMILAR = {"kicks-doubled": 2.0, "kicks-halved": 0.5}, 0.15, 0.8
 and its correlation with the design's, at least."""
 COLUMNS = 2
 """At least, that an assumption about correctors or monitors changes: one may be a bad corrector."""
+SEEN = 1e-3
+"""Share of the design's square, at the monitors that read, from which a column says something."""
 SHARE = 0.8
 """Of the columns that an assumption changes, how many it has to change for the better."""
 ALIKE = 2.0
@@ -94,18 +96,20 @@ class ResponseJudge:
 
     def misfit(self, names: Names) -> Array:
         """Of each column, the RF's last: |measured - design|^2 over the mean of both squares, 0
-        for equal ones, 2 for strangers, 4 for a wrong sign; NaN where nothing was read."""
+        for equal ones, 2 for strangers, 4 for a wrong sign; NaN where nothing was read that the
+        design answers (vertical steps, say, by monitors of x alone)."""
         data = assume(in_beam_order(self.measured, self.monitors), names, self.monitors)
         read, made = [*data.response], [*(data.kicks[:, None, None] * self.design.response)]
         rf, own = data.rf, self.design.rf
         if rf is not None and own is not None and rf.orbit is not None and own.orbit is not None:
             read.append(rf.orbit)
             made.append(own.orbit * (rf.step / rf.frequency / TINY))
-        there = np.isfinite(read)
-        a, b = (np.where(there, values, 0.0) for values in (np.array(read), np.array(made)))
-        size = ((a**2).sum(axis=(1, 2)) + (b**2).sum(axis=(1, 2))) / 2
+        there, whole = np.isfinite(read), np.array(made)
+        a, b = (np.where(there, values, 0.0) for values in (np.array(read), whole))
+        made_there = (b**2).sum(axis=(1, 2))
+        size = ((a**2).sum(axis=(1, 2)) + made_there) / 2
         left = ((a - b) ** 2).sum(axis=(1, 2))
-        seen = there.any(axis=(1, 2)) & (size > 0)
+        seen = (size > 0) & (made_there > SEEN * (whole**2).sum(axis=(1, 2)))
         return np.where(seen, left / np.where(seen, size, 1.0), np.nan)
 
     def scale(self) -> float:
@@ -122,6 +126,21 @@ class ResponseJudge:
             return float("nan")
         alike = float(np.median(both[seen] / np.sqrt(own[seen] * design[seen])))
         return float(np.median(both[seen] / design[seen])) if alike > SIMILAR else float("nan")
+
+    def rf_scale(self) -> float:
+        """Of the RF's orbit over the design's for its step; NaN where none was read, or one that
+        the design's does not resemble."""
+        read, made = self.measured.rf, self.design.rf
+        if read is None or made is None or read.orbit is None or made.orbit is None:
+            return float("nan")
+        own = in_beam_order(self.measured, self.monitors).rf
+        assert own is not None
+        assert own.orbit is not None
+        seen = np.isfinite(own.orbit)
+        a, b = own.orbit[seen], made.orbit[seen] * (own.step / own.frequency / TINY)
+        both = float(a @ b)
+        alike = both**2 > SIMILAR**2 * float(a @ a) * float(b @ b)
+        return both / float(b @ b) if alike and both else float("nan")
 
     def candidates(self) -> list[Names]:
         """What may be assumed of these data."""

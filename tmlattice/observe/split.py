@@ -1,0 +1,72 @@
+"""Which readings of an orbit response fit, which choose, and which judge.
+
+>>> split = split_columns(data, 0.2, np.random.default_rng(0))
+>>> split.held.sum()                               # correctors that are never fitted
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import MeasurementError
+from tmlattice.observe.orbit_response import ResponseData
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+INNER = 0.2
+"""Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Who is fitted, who chooses, who judges.
+
+    Attributes:
+        held: correctors that are never fitted, [column].
+        inner: correctors that choose among families of errors, [column].
+        half: monitors that give a corrector its kick, or fit the RF, [column, monitor].
+        inner_rf: of the RF's fitted monitors those that choose, [monitor].
+    """
+
+    held: Flags
+    inner: Flags
+    half: Flags
+    inner_rf: Flags
+
+
+def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) -> Split:
+    """Draw them among the correctors that are read in the plane that they kick in.
+
+    Raises:
+        MeasurementError: too few correctors.
+    """
+    columns, monitors = data.shape
+    read = np.asarray(np.isfinite(data.pick(data.orbits)[:-1]).any(axis=1))
+    some = int(read.sum())
+    count = round(holdout * some)
+    inner = round(INNER * (some - count))
+    if not (count > 0 and inner > 0 and count + inner < some - 1):
+        raise MeasurementError(
+            f"{some} correctors that are read in the plane that they kick in cannot be split; "
+            "measure more"
+        )
+    held, chooses = np.zeros((2, columns), dtype=bool)
+    drawn = rng.permutation(columns - 1)
+    drawn = drawn[np.argsort(~read[drawn], kind="stable")]  # others judge nothing
+    held[drawn[:count]] = True
+    chooses[drawn[count : count + inner]] = True
+    half = np.zeros((columns, monitors), dtype=bool)
+
+    def draw(c: int) -> None:
+        half[c, rng.choice(monitors, monitors // 2, replace=False)] = True
+
+    for c in [*np.flatnonzero(held | chooses), columns - 1]:
+        draw(int(c))
+    near = np.flatnonzero(half[-1])
+    inner_rf = np.zeros(monitors, dtype=bool)
+    inner_rf[rng.choice(near, max(1, round(INNER * len(near))), replace=False)] = True
+    for c in np.flatnonzero(~(held | chooses))[:-1]:
+        draw(int(c))
+    return Split(held, chooses, half, inner_rf)
