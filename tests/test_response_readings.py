@@ -8,7 +8,12 @@ import pytest
 from tmlattice import diagnose
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.dense import fit_steps, told
-from tmlattice.diagnosis.exchanged import exchanged, put_right
+from tmlattice.diagnosis.exchanged import (
+    exchanged,
+    exchanged_monitors,
+    monitors_back,
+    put_right,
+)
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.odd_readings import odd_readings
 from tmlattice.diagnosis.other_kicks import other_kicks
@@ -282,6 +287,22 @@ def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
     assert exchanged(fitted(small_ring, wrong)) == [pair]
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
     assert any("v5 and v6" in said for said in found.warnings)
+    assert found.steps[-1].heldout_chi2_per_dof < 1.5
+
+
+def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
+    """Anywhere in the ring; without the names both had been left out as strangers. Where nothing is
+    exchanged, and of monitors that are not strangers, nothing is told."""
+    state = fitted(small_ring, clean)
+    assert exchanged_monitors(state, clean.monitors) == []
+    pair = (clean.monitors[4], clean.monitors[20])
+    wrong = monitors_back(clean, [pair])
+    assert not np.array_equal(wrong.rf.orbit, clean.rf.orbit)
+    (told_of,) = exchanged_monitors(fitted(small_ring, wrong), clean.monitors)
+    assert sorted(told_of) == sorted(pair)
+    found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
+    assert any("monitors that answer each as the other one should" in s for s in found.warnings)
+    assert not any("resemble nothing" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
 
 

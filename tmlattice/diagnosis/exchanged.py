@@ -1,12 +1,13 @@
-"""Neighbouring correctors whose columns are exchanged: each answers as the other one should. And
-monitors whose planes are.
+"""Neighbouring correctors whose columns are exchanged: each answers as the other one should.
+Monitors whose readings are; and those whose planes are.
 
 A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
 the model's far too well for a stranger: it seems displaced by the way to its neighbour.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +46,11 @@ def exchanged(state: State) -> list[Pair]:
     return found
 
 
-def told(pairs: Sequence[Pair]) -> str:
+def told(pairs: Sequence[Pair], what: str = "correctors") -> str:
     """In words."""
     both = ", ".join(f"{a} and {b}" for a, b in pairs)
     return (
-        f"correctors that answer each as the other one should, taken as exchanged: {both}; look at "
+        f"{what} that answer each as the other one should, taken as exchanged: {both}; look at "
         "their cables and at the table of names"
     )
 
@@ -63,6 +64,48 @@ def put_right(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
     return replace(
         measured, response=measured.response[order], kicks=np.asarray(measured.kicks)[order]
     )
+
+
+def exchanged_monitors(state: State, among: Collection[str]) -> list[Pair]:
+    """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains; none
+    stands in two.
+
+    Args:
+        state: what the model makes of the readings.
+        among: those that resemble nothing: of a design with another phase advance many others seem
+            to be read one cell further on.
+    """
+    data, read = state.data, state.at.seen(state.at.beam)
+    model, orbits = data.pick(read)[:-1], data.pick(data.orbits)[:-1]
+    left = np.zeros((data.shape[1],) * 2)  # of a's readings as b's, [a, b]
+    for p in (0, 1):
+        rows = data.plane[:-1] == p
+        there = np.isfinite(orbits[rows])
+        d, u = np.where(there, orbits[rows], 0.0), model[rows]
+        both, size = np.maximum(d.T @ u, 0.0), there.T.astype(float) @ u**2
+        left += (d**2).sum(axis=0)[:, None] - both**2 / np.maximum(size, 1e-300)
+    names = data.measured.monitors
+    odd = [m for m, name in enumerate(names) if name in among]
+    stays = np.diagonal(left)
+    found: list[Pair] = []
+    for a, b in combinations(odd, 2):
+        crossed = left[a, b] < SHARE * stays[a] and left[b, a] < SHARE * stays[b]
+        if crossed and not any(names[own] in pair for own in (a, b) for pair in found):
+            found.append((names[a], names[b]))
+    return found
+
+
+def monitors_back(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
+    """The measurement with the readings of monitors exchanged, their noise and the RF's too."""
+    order = np.arange(len(measured.monitors))
+    for pair in pairs:
+        a, b = (measured.monitors.index(name) for name in pair)
+        order[[a, b]] = b, a
+    rf = measured.rf
+    if rf is not None and rf.orbit is not None:
+        rf = replace(rf, orbit=rf.orbit[order])
+    noise = None if measured.noise is None else measured.noise[order]
+    return replace(measured, response=measured.response[:, order], noise=noise, rf=rf)
 
 
 def swapped(state: State) -> list[str]:

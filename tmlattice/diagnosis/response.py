@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.dense import DenseFit, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.dispersion import dispersion_beside, dispersion_by_kicks
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.exchanged import exchanged, planes_back, put_right, swapped
+from tmlattice.diagnosis.exchanged import (
+    exchanged,
+    exchanged_monitors,
+    monitors_back,
+    planes_back,
+    put_right,
+    swapped,
+)
 from tmlattice.diagnosis.exchanged import told as told_exchanged
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
@@ -168,12 +175,19 @@ def _families(
             known += pairs
             measured, fit = put_right(measured, pairs), None
             continue
+        odd = strangers(state)
+        strange = {name for name, _ in odd.monitors}
+        pairs = [pair for pair in exchanged_monitors(state, strange) if pair not in known]
+        if pairs:
+            said.append(told_exchanged(pairs, "monitors"))
+            known += pairs
+            measured, fit = monitors_back(measured, pairs), None
+            continue
         crossed = [name for name in swapped(state) if name not in swaps]
         if crossed:
             swaps += crossed
             measured, fit = planes_back(measured, crossed), None
             continue
-        odd = strangers(state)
         if odd.any:
             said += odd.said
             measured = odd.without(measured)
