@@ -9,8 +9,9 @@ the result; beside them what the experts' own LOCO fit leaves of all the data th
 model as it was before that fit; `--seed N` another split, `--seeds N` that many of them;
 `--families` seeks no single faults among small errors, which takes most of the time;
 `--pictures FOLDER` makes a picture a ring: what is left before and after, and the gradients.
-`--into FOLDER` writes a file for each ring and seed as it comes; what stands there already is told
-and not measured again, so that a long study can be stopped, and goes on.
+`--into FOLDER` writes a file for each ring and seed as it comes; what stands there already, of the
+same options and version, is told and not measured again, so that a long study can be stopped, and
+goes on.
 
 Of several seeds each is told as it comes, and at the end the median and the worst, and by how much
 what was found scatters between them, in units of its stated errors: 0.5 is right where errors are
@@ -36,7 +37,7 @@ import tmlattice
 from tmlattice import read_measurement
 from tmlattice.diagnosis import response
 from tmlattice.errors import TmlatticeError
-from tmlattice.files import write_json
+from tmlattice.files import output_file, write_json
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.plots.response import plot_gradients, plot_left
 from tmlattice.report.page import shrink
@@ -98,26 +99,38 @@ def imported(name, files, data, place, iteration):
     return folder / "lattice.json", folder, told
 
 
+def stands(path, made_with):
+    """What a file of an earlier run says; None where there is none, or one of other options."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (AttributeError, FileNotFoundError, ValueError):
+        return None
+    return found if found.items() >= made_with.items() else None
+
+
 def ring(name, files, data, place, options):
     """One ring: what each seed found."""
     found = []
     source = None
+    made_with = {"tmlattice": tmlattice.__version__, "iteration": options.iteration,
+                 "families": options.families}  # fmt: skip
     for seed in range(options.seed, options.seed + options.seeds):
         path = options.into and options.into / f"{name}-{seed}.json"
-        if path and path.exists():
-            found.append(json.loads(path.read_text(encoding="utf-8")))
-        else:
+        one = stands(path, made_with)
+        if one is None:
+            one = {"ring": name, "seed": seed, **made_with}
             try:
                 source = source or imported(name, files, data, place, options.iteration)
-                one = _diagnosed(*source, seed, None if found else options.pictures, name)
-            except TmlatticeError as error:
-                one = {"error": str(error), "seconds": 0.0}
-            own = {"ring": name, "seed": seed, "tmlattice": tmlattice.__version__}
+                picture_of = None if seed > options.seed else options.pictures
+                one |= _diagnosed(*source, seed, picture_of, name)
+            except (TmlatticeError, np.linalg.LinAlgError) as error:
+                one |= {"error": str(error), "seconds": 0.0}
             if files and files[0].name.endswith(".loco.mat"):
-                own["experts"] = experts(files[0])
-            found.append(own | one)
+                one["experts"] = experts(files[0])
             if path and "error" not in one:
-                write_json(path, found[-1])
+                with output_file(path) as made:
+                    write_json(made, one)
+        found.append(one)
         print(_as_it_comes(found[-1]), flush=True)
     return found
 
@@ -219,7 +232,8 @@ def table(rings):
            "(with jump) / coupling (with roll) / RF | chi² held out | fitted | experts' fit: "
            "in-plane / coupling | verdict | s |")  # fmt: skip
     yield "|" + "---|" * 9
-    for row in (found[0] for found in rings):
+    for found in rings:
+        row = next((one for one in found if "error" not in one), found[0])
         if "error" in row:
             yield f"| {row['ring']} | | {row['error']} | | | | | error | |"
             continue

@@ -260,6 +260,9 @@ def test_an_rf_orbit_in_millimetres_is_told(small_ring):
     scaled = replace(steps, rf=replace(steps.rf, orbit=1e3 * steps.rf.orbit))
     (check,) = told(check_data(small_ring, scaled))
     assert check.sentence.startswith("the RF's orbit is 1e+03 times what its step makes")
+    repeated = np.tile(scaled.rf.orbit[:5], (len(steps.monitors) // 5, 1))  # no monitor read that
+    copied = replace(scaled, rf=replace(scaled.rf, orbit=repeated))
+    assert told(check_data(small_ring, copied)) == []
 
 
 def test_a_bad_corrector_or_monitor_is_no_global_error(small_ring, steps):

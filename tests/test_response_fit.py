@@ -16,8 +16,10 @@ from tmlattice.diagnosis.state import allow, begin
 from tmlattice.diagnosis.weights import good_monitors
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference import slopes
 from tmlattice.inference.normal import Normal, normal_equations, solve
 from tmlattice.inference.priors import Group
+from tmlattice.inference.slopes import Slopes
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data
 from tmlattice.observe.split import split_columns
@@ -63,6 +65,20 @@ def test_fit_vs_dense_least_squares(problem, rng):
     matrix = X.T @ (w[:, None] * X) + np.diag(rms**-2)
     assert_allclose(found.values, np.linalg.solve(matrix, X.T @ (w * y)), atol=1e-9)
     assert_allclose(found.sigma, np.sqrt(np.diag(np.linalg.inv(matrix))), rtol=1e-7)
+
+
+def test_normal_equations_of_several_families_in_several_pieces(problem, rng, monkeypatch):
+    """Two or five columns at once, the last piece shorter; slopes of one family are old ones."""
+    residual, weight, plane, u, v, J = problem
+    X, w = written_out(*problem), weight.ravel()
+    now = rng.uniform(0.5, 2, residual.shape)
+    ring = (Slopes(J[:3]), Slopes(J[3:3]), Slopes(J[3:] / now, now))
+    for columns in (2, 5):
+        monkeypatch.setattr(slopes, "AT_ONCE", columns * residual.shape[1])
+        normal = normal_equations(residual, weight, plane, u, v, ring)
+        assert_allclose(normal.matrix, X.T @ (w[:, None] * X), rtol=1e-12, atol=1e-7)
+        right = X.T @ (w * np.nan_to_num(residual.ravel()))
+        assert_allclose(normal.vector, right, rtol=1e-12, atol=1e-8)
 
 
 def test_a_family_shares_its_error_vs_a_correlated_prior(problem):
@@ -262,8 +278,7 @@ def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
 
     monkeypatch.setattr(dense, "_quickly", lambda *_: ({"gradients": 1.0}, {"gradients": False}))
     monkeypatch.setattr(dense, "_without", lost)
-    monkeypatch.setattr(dense, "inner", lambda state: None)
-    monkeypatch.setattr(dense, "log_evidence", lambda *_: 0.0)
+    monkeypatch.setattr(dense, "weigh", lambda *_: None)
     monkeypatch.setattr(dense, "_title", str)
     state = SimpleNamespace(good=None, independent=None)
     assert dense._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})

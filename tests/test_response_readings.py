@@ -94,6 +94,21 @@ def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_sta
     assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
 
 
+@pytest.mark.parametrize(("wrong", "alone"), [(3, True), (5, False)])
+def test_a_tenth_of_the_readings_that_a_step_has_are_no_single_ones(
+    small_ring, clean, wrong, alone
+):
+    """Of 35 readings in its own plane; the other plane was not read."""
+    response = clean.response.copy()
+    for c, plane in enumerate(clean.planes):
+        response[c, :, int(plane == "x")] = np.nan
+    response[4, ::7][:wrong, int(clean.planes[4] == "y")] += 5e-6
+    data = response_data(small_ring, replace(clean, response=response))
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    fit = fit_steps(data, split, STEPS[:3])
+    assert any(said.startswith("single readings") for said in fit.said) == alone
+
+
 def lagging(response, planes, columns, late):
     """Some monitors still average over the time before the step."""
     response = response.copy()

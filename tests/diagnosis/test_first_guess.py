@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis import dense
-from tmlattice.diagnosis.dense import fit_steps
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.first_guess import first_guess
+from tmlattice.diagnosis import dense, first_guess
+from tmlattice.diagnosis.dense import fit_steps, one_by_one
+from tmlattice.diagnosis.families import STEPS, CorrectorCalibration, Trial
+from tmlattice.diagnosis.judges import score
 from tmlattice.diagnosis.state import begin, bend
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
@@ -41,7 +41,7 @@ def begun(ring, data):
 def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring):
     """All focusing quadrupoles 3 % weak: from the design itself every family was refused."""
     design = begun(small_ring, measured(small_ring, -0.03))
-    (values,) = first_guess(design).values()
+    (values,) = first_guess.first_guess(design).values()
     own = [e.k1 > 0 for e in small_ring.elements if e.kind == "quadrupole"]
     assert (values[own] < 0).all()  # of several that resemble the readings the best one
     fit = fit_steps(design.data, design.split, STEPS[:3])
@@ -52,8 +52,19 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
     assert abs(np.median(gradients[np.logical_not(own)])) < 2e-3
 
 
+def test_magnets_of_no_family_begin_there_too(small_ring):
+    """Families alone had led single magnets back to nothing, and every round astray."""
+    design = begun(small_ring, measured(small_ring, -0.03))
+    alone = Trial((CorrectorCalibration(),), 3, 0)
+    assert first_guess.begun(design, [alone]) is design
+    near = first_guess.begun(design, [alone, STEPS[2]])
+    (_, state), *_ = one_by_one(near, [alone])
+    assert state.values["gradient"].any()
+    assert score(state, state.split.held).in_plane < 2 * NOISE
+
+
 def test_a_near_design_is_where_the_fit_begins(small_ring):
-    assert not first_guess(begun(small_ring, measured(small_ring, 0.005)))
+    assert not first_guess.first_guess(begun(small_ring, measured(small_ring, 0.005)))
 
 
 def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
@@ -72,6 +83,7 @@ def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
     monkeypatch.setattr(dense, "settle", lambda state, *args, **options: state)
     fit = fit_steps(design.data, design.split, STEPS[:1])
     assert len(fit.steps) == 1
+    assert "more of the readings that it was made to" in fit.said[-1]
     assert fit.heldout[0] == fit.heldout[1]
 
 

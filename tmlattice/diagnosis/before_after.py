@@ -26,6 +26,7 @@ from tmlattice.diagnosis.family import Told
 from tmlattice.diagnosis.few import few_causes
 from tmlattice.diagnosis.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import finding_of, with_consequences
+from tmlattice.diagnosis.first_guess import begun
 from tmlattice.diagnosis.judges import score
 from tmlattice.diagnosis.left_open import left_open
 from tmlattice.diagnosis.magnets import families
@@ -208,7 +209,7 @@ def _reference(data: ResponseData, split: Split, steps: Sequence[Trial]) -> Stat
     behind. The design where that goes astray."""
     state = replace(begin(data, _judged_by_nobody(split)), exploring=False)
     try:
-        for _, settled in one_by_one(state, steps):
+        for _, settled in one_by_one(begun(state, steps), steps):
             state = settled
         return settle(bend(jump(state)))
     except (TmlatticeError, np.linalg.LinAlgError):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
-from tmlattice.diagnosis.first_guess import first_guess
+from tmlattice.diagnosis.first_guess import begun, own_kick
 from tmlattice.diagnosis.jitter import MOSTLY, Jitter, sought
 from tmlattice.diagnosis.judges import (
     WORTH,
@@ -30,7 +30,8 @@ from tmlattice.diagnosis.judges import (
 )
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.odd_steps import beside, odd_steps
-from tmlattice.diagnosis.rounds import Linear, linear, linear_evidence, log_evidence, settle
+from tmlattice.diagnosis.rf_by_others import rf_by_others
+from tmlattice.diagnosis.rounds import Linear, Weighed, linear, linear_evidence, settle, weigh
 from tmlattice.diagnosis.set_aside import taken_back
 from tmlattice.diagnosis.state import (
     State,
@@ -160,15 +161,17 @@ def fit_steps(
     """
     design = begin(data, split)
     stages, state = _in_turn(design, trials, progress)
-    odd = odd_steps(state)
-    if odd.alone:  # the families went after them
-        stages, state = _in_turn(beside(design, odd.unread), trials, progress)
-        odd = odd.and_more(odd_steps(state))
+    readings, steps_gone = odd_steps(state)
+    if readings.said:  # the families went after them, and what that made of steps is not known
+        stages, state = _in_turn(beside(design, readings.unread), trials, progress)
+        more, steps_gone = odd_steps(state)
+        readings = readings.and_more(more)
+    odd = readings.and_more(steps_gone)
     state = beside(state, odd.unread)
     progress("all together")
     state = taken_back(settle(bend(jump(replace(state, independent=np.ones((2, 2)))))))
     log.info("independent readings: %s", state.independent)
-    odd = odd.and_more(odd_steps(state))  # what is usual is less now
+    odd = odd.and_more(*odd_steps(state))  # what is usual is less now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
     state, moving = _beside_jitter(state, progress)
     split = state.split
@@ -208,8 +211,13 @@ def fit_steps(
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
-    if _gap(state) > ASTRAY * _gap(design):  # one plane agrees, the other does less than before
-        return nothing
+    then = replace(design, good=state.good, exploring=False)
+    if not _gap(state) <= ASTRAY * _gap(then):  # one plane agrees, the other does less than before
+        astray = (
+            "the fit left more of the readings that it was made to than the design leaves: the "
+            "lattice may be too far from the ring, and no effect is told"
+        )
+        return replace(nothing, said=(*nothing.said, astray))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
@@ -218,9 +226,15 @@ def fit_steps(
 
 
 def _gap(state: State) -> float:
-    """rms of what is left in plane of the fitted correctors, m, at the monitors that are good."""
-    left = state.data.pick(state.at.left)[:-1][state.fitted[:-1]][:, state.good]
-    return float(np.sqrt(np.nanmean(left**2)))
+    """rms of what is left in plane of the fitted correctors with a kick of their own, m, at the
+    monitors that are good."""
+    read, orbits = (
+        state.data.pick(own)[:-1][state.fitted[:-1]][:, state.good]
+        for own in (state.at.read, state.data.orbits)
+    )
+    u, d = (np.where(np.isfinite(orbits), own, 0.0) for own in (read, orbits))
+    left = d - own_kick(u, d)[:, None] * u
+    return float(np.sqrt(np.sum(left**2) / np.isfinite(orbits).sum()))
 
 
 def _in_turn(
@@ -229,9 +243,7 @@ def _in_turn(
     """The state with each trial's families, of those that there are, and the last of them."""
     stages: dict[Trial, State] = {}
     state = design
-    fitted = {family.variable for trial in trials for family in trial.families}
-    guess = {name: own for name, own in first_guess(design).items() if name in fitted}
-    for trial, state in one_by_one(replace(design, values=guess), trials, progress):
+    for trial, state in one_by_one(begun(design, trials), trials, progress):
         stages[trial] = replace(state, kept={})
     return stages, state
 
@@ -289,8 +301,8 @@ def _worth(
     states: dict[Trial, State] = {}
     if not doubtful:
         return worth, states
-    chosen_by, shares = inner(state), state.independent
-    evidence = log_evidence(state, state.good, shares)
+    shares = state.independent
+    whole = weigh(state, state.good, shares)
     for trial in doubtful:
         progress(f"without {_title(trial)}")
         try:
@@ -299,12 +311,20 @@ def _worth(
             worth[trial] = np.inf
             continue
         good = state.good & without.good
-        with_it = evidence if (good == state.good).all() else log_evidence(state, good, shares)
-        gained = with_it - log_evidence(without, good, shares) - LEAST
-        said = lost(inner(without), chosen_by)
+        with_it = whole if (good == state.good).all() else weigh(state, good, shares)
+        other = weigh(without, good, shares)
+        gained = with_it.evidence - other.evidence - LEAST
+        said = lost(inner(without, _of_rf(other)), inner(state, _of_rf(with_it)))
         log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
         worth[trial] = min(gained, said[0]) if _asked(trial) and against(said) else gained
     return worth, states
+
+
+def _of_rf(weighed: Weighed) -> Array | None:
+    """What the RF's fitted monitors leave, each predicted by all others."""
+    if weighed.in_plane is None:
+        return None
+    return rf_by_others(weighed.state, weighed.in_plane, weighed.found)
 
 
 def _priors(trial: Trial, state: State) -> set[str]:
@@ -324,22 +344,25 @@ def _quickly(
     nobody doubts; and whether the judges would rather be without it."""
     worth: dict[Trial, float] = {}
     unwanted: dict[Trial, bool] = {}
-    judged = inner(state)
-    blocks: dict[int, tuple[Linear, float]] = {}
+    blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
+    for block in {trial.families[0].block for trial in trials} | {0}:
+        if state.of_block(block):
+            there = linear(state, block)
+            blocks[block] = there, linear_evidence(there)
+    of_rf = rf_by_others(state, blocks[0][0], blocks[0][1][2]) if 0 in blocks else None
+    judged = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")
         if not any(state.values[family.variable].any() for family in trial.families):
             worth[trial], unwanted[trial] = -LEAST, False  # held at zero: nothing is lost without
             continue
         block = trial.families[0].block
-        if block not in blocks:
-            there = linear(state, block)
-            blocks[block] = there, linear_evidence(there)[0]
-        there, evidence = blocks[block]
-        other, values = linear_evidence(there, _priors(trial, state))
+        there, (evidence, _, _) = blocks[block]
+        other, values, found = linear_evidence(there, _priors(trial, state))
         worth[trial] = evidence - other - LEAST
+        without_it = of_rf if block else rf_by_others(state, there, found)
         try:
-            said = lost(inner(state.moved({**state.values, **values})), judged)
+            said = lost(inner(state.moved({**state.values, **values}), without_it), judged)
         except TmlatticeError:  # no closed orbit without it
             said = np.inf, 0.0
         unwanted[trial] = _asked(trial) and against(said)

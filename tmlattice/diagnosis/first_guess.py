@@ -7,12 +7,14 @@ them together, and the fit begins at what resembles the readings most.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.families import Trial
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import magnets
 from tmlattice.diagnosis.state import State, allow
@@ -29,6 +31,21 @@ BETTER = 0.5
 """Of that share, at most, is left at another beginning: else the design is as good a one."""
 STEPS = np.arange(-3, 4) * 0.01
 """Relative changes that are tried."""
+
+
+def begun(design: State, trials: Sequence[Trial]) -> State:
+    """The design, or the ring that resembles the readings more, with each quadrupole's gradient a
+    number of its own from the first: one of no family would else go back to nothing.
+
+    Args:
+        design: with no families yet.
+        trials: that will be fitted; without quadrupoles' gradients it is the design.
+    """
+    family = QuadrupoleGradient()
+    if not any(own.name == family.name for trial in trials for own in trial.families):
+        return design
+    guess = first_guess(design)
+    return allow(replace(design, values=guess), [family]) if guess else design
 
 
 def first_guess(design: State) -> Mapping[str, Array]:
@@ -66,11 +83,20 @@ def _strange(state: State) -> float:
     seen = np.isfinite(orbits) & state.fitted[:-1, None]
     u, d = np.where(seen, read, 0.0), np.where(seen, orbits, 0.0)
     size = (d**2).sum(axis=1)
-    kick = np.maximum((u * d).sum(axis=1) / np.maximum((u**2).sum(axis=1), 1e-300), 0.0)
-    left = ((d - kick[:, None] * u) ** 2).sum(axis=1)
+    left = ((d - own_kick(u, d)[:, None] * u) ** 2).sum(axis=1)
     shares = [
         np.median(left[rows] / size[rows])
         for rows in ((data.plane[:-1] == p) & (size > 0) for p in (0, 1))
         if rows.any()
     ]
     return float(max(shares, default=0.0))
+
+
+def own_kick(read: Array, orbits: Array) -> Array:
+    """By which each column's model is to be multiplied, least squares, not below zero, [column].
+
+    Args:
+        read, orbits: of the model and measured, m, 0 where nothing was read, [column, monitor].
+    """
+    size = np.maximum((read**2).sum(axis=1), 1e-300)
+    return np.asarray(np.maximum((read * orbits).sum(axis=1) / size, 0.0))

@@ -183,10 +183,15 @@ def _logs(sums: Array) -> Array:
         return np.asarray(0.5 * np.log(sums[..., 0] / sums[..., 1]))
 
 
-def inner(state: State) -> Judged:
+def inner(state: State, by_others: Array | None = None) -> Judged:
     """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
     monitors gives the kick once, and a jitter of the beam that the state has: else one that the
-    judges have themselves would hide what is better."""
+    judges have themselves would hide what is better.
+
+    Args:
+        state: that is judged.
+        by_others: what fitted monitors leave of the RF's orbit, `rf_by_others`: they judge too.
+    """
     other = replace(state, split=replace(state.split, half=~state.split.half))
     said = [
         _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
@@ -198,6 +203,8 @@ def inner(state: State) -> Judged:
         for one in said
     ]  # fmt: skip
     rf = np.zeros((len(state.good), 2))
+    if by_others is not None:
+        rf = np.stack([np.nan_to_num(by_others) ** 2, np.isfinite(by_others)], axis=1)
     rf[said[0].rf_monitors] = np.stack([said[0].rf ** 2, np.ones(len(said[0].rf))], axis=1)
     return Judged(sums[0] + sums[1], rf)
 

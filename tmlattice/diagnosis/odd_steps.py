@@ -1,7 +1,8 @@
 """Steps of correctors, and single readings, that went wrong, by what a fit leaves of them: they are
 not fitted, and judge nobody.
 
->>> odd = odd_steps(state)
+>>> readings, steps = odd_steps(state)
+>>> odd = readings.and_more(steps)
 >>> state = beside(state, odd.unread)
 """
 
@@ -33,22 +34,21 @@ class OddSteps:
     Attributes:
         unread: which readings are not used, [column, monitor, plane that is read].
         said: sentences of them.
-        alone: whether single readings are among them.
     """
 
     unread: Flags
     said: tuple[str, ...] = ()
-    alone: bool = False
 
-    def and_more(self, later: "OddSteps") -> "OddSteps":
+    def and_more(self, *others: "OddSteps") -> "OddSteps":
         """With those that are found once these are left out."""
-        return OddSteps(
-            self.unread | later.unread, (*self.said, *later.said), self.alone or later.alone
-        )
+        unread, said = self.unread, self.said
+        for own in others:
+            unread, said = unread | own.unread, (*said, *own.said)
+        return OddSteps(unread, said)
 
 
-def odd_steps(state: State) -> OddSteps:
-    """Single readings that went wrong; steps whose readings belong to no orbit, and those with
+def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
+    """Single readings that went wrong; and steps whose readings belong to no orbit, and those with
     another kick in them: none where too few are left to fit and to judge.
 
     Args:
@@ -58,13 +58,14 @@ def odd_steps(state: State) -> OddSteps:
     data, split = state.data, state.split
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
-        return OddSteps(nothing)
+        return OddSteps(nothing), OddSteps(nothing)
     alone = gross(data, _beside_own_kick(state))
-    alone[np.mean(alone, axis=(1, 2)) > MANY] = False  # the step went wrong, not single readings
+    read = np.isfinite(data.orbits).sum(axis=(1, 2))
+    alone[alone.sum(axis=(1, 2)) > MANY * read] = False  # the step went wrong, not single readings
     state = beside(state, alone)
     broken = torn(state)
     alone[broken] = False  # among all the others
-    without = told_gross(data, alone, "the fit")
+    single = OddSteps(alone, tuple(told_gross(data, alone, "the fit")))
     names = data.measured.correctors
     swapped = {name for pair in exchanged(state) for name in pair}  # to be put right, not left out
     others = [
@@ -80,9 +81,9 @@ def odd_steps(state: State) -> OddSteps:
     unread[left_in_plane(state, [own.column for own in others])] = True
     gone = unread.all(axis=1)
     if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
-        return OddSteps(alone, tuple(without), bool(without))
-    said = (*without, *_torn(data, broken), *_kicked(state, others))
-    return OddSteps(unread[:, None] | alone, said, bool(without))
+        return single, OddSteps(nothing)
+    whole = np.broadcast_to(unread[:, None], nothing.shape)
+    return single, OddSteps(whole, (*_torn(data, broken), *_kicked(state, others)))
 
 
 def _beside_own_kick(state: State) -> Array:

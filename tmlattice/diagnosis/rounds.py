@@ -106,6 +106,17 @@ class Linear(NamedTuple):
         """The ring's rows in one array, [error, column, monitor]: a copy of them."""
         return whole(self.ring, self.by_monitor.shape)
 
+    def of_column(self, column: int, read: Indices, plane: int) -> Array:
+        """Slopes of some readings of a column that is read in a plane, [reading, parameter]."""
+        columns, monitors = self.by_monitor.shape
+        out = np.zeros((len(read), len(self.start)))
+        out[np.arange(len(read)), 2 * read + plane] = self.by_monitor[column, read]
+        out[:, 2 * monitors + column] = self.by_column[column, read]
+        out[:, 2 * monitors + columns :] = np.concatenate(
+            [np.zeros((0, len(read))), *(own.of(column, read) for own in self.ring)]
+        ).T
+        return out
+
 
 def linear(state: State, block: int) -> Linear:
     """Normal equations where the fit stands, the parameters there, priors, trusted changes."""
@@ -354,9 +365,9 @@ def settle(
 
 def linear_evidence(
     there: Linear, gone: Collection[str] = (), rounds: int = LEARN
-) -> tuple[float, dict[str, Array]]:
+) -> tuple[float, dict[str, Array], Posterior | None]:
     """Log evidence that priors and readings have of one block where the fit stands, linear about
-    it, up to a constant; and the values that are the likeliest.
+    it, up to a constant; the values that are the likeliest; and the fit, if there is one.
 
     Args:
         there: where the fit stands.
@@ -369,31 +380,55 @@ def linear_evidence(
     moved = (nothing if found is None else found.values) - there.start
     total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
     if found is None:
-        return total, {name: nothing[rows] for name, rows in there.where.items()}
+        return total, {name: nothing[rows] for name, rows in there.where.items()}, None
     total += found.occam
     for rows in there.where.values():
         groups = [g for g in found.groups if g.basis[rows].any()]
         if groups:
             total -= 0.5 * _penalty(groups, rows, found.values[rows])
-    return total, {name: found.values[rows] for name, rows in there.where.items()}
+    return total, {name: found.values[rows] for name, rows in there.where.items()}, found
 
 
-def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
-    """Of what is fitted, of the readings of some monitors, both blocks, what the model lacks and
-    the priors at their likeliest; up to a constant of the data.
+class Weighed(NamedTuple):
+    """What the readings say for a state.
+
+    Attributes:
+        evidence: its logarithm, of both blocks.
+        state: with the weights that it was taken with.
+        in_plane: linear where it stands; None where nothing is fitted there.
+        found: the fit of that.
+    """
+
+    evidence: float
+    state: State
+    in_plane: Linear | None
+    found: Posterior | None
+
+
+def weigh(state: State, good: Flags, shares: Array | None = None) -> Weighed:
+    """Evidence of what is fitted, of the readings of some monitors, both blocks, what the model
+    lacks and the priors at their likeliest; up to a constant of the data.
 
     Args:
         state: that is weighed.
         good: the monitors.
         shares: of the readings that are independent: the same for states that are compared.
     """
-    total = 0.0
-    for block in (block for block in (0, 1) if state.reads(block)):
+    total, in_plane, found = 0.0, None, None
+    for block in (block for block in (1, 0) if state.reads(block)):
         state = replace(look(state, block), good=good, independent=shares)
         left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
         total += 0.5 * log_scale(state, block)
         total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
         if state.of_block(block):
             there = linear(state, block)
-            total += linear_evidence(there)[0]
-    return total
+            more, _, last = linear_evidence(there)
+            total += more
+            if block == 0:
+                in_plane, found = there, last
+    return Weighed(total, state, in_plane, found)
+
+
+def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
+    """That of `weigh`."""
+    return weigh(state, good, shares).evidence

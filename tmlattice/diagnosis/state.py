@@ -154,13 +154,14 @@ def bend(state: State) -> State:
 
 
 def allow(state: State, families: Sequence[Family]) -> State:
-    """With more families, at zero or where they are to begin."""
+    """With more families, at zero or where they are to begin; those that are there stay."""
     values = {f.variable: np.zeros(f.size(state.data)) for f in families}
     begun = any(state.values.get(name, new).any() for name, new in values.items())
     begun &= not {f.variable for f in state.families} >= set(values)
     names = [family.name for family in families]
+    more = [family for family in families if not state.allows(family.name)]
     state = replace(
-        state, families=(*state.families, *families), values={**values, **state.values},
+        state, families=(*state.families, *more), values={**values, **state.values},
         unneeded=tuple(family for family in state.unneeded if family.name not in names),
     )  # fmt: skip
     return state.moved(state.values) if begun else state

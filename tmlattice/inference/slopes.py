@@ -1,7 +1,7 @@
 """What readings do for errors of the ring: large, so that they are read once and never copied.
 
 >>> ring = (Slopes(gradients, None), Slopes(edges, now))
->>> sums = weighed_sums(ring, weight, plane, by_monitor, by_column)
+>>> sums = weighed_sums(ring, residual, weight, plane, by_monitor, by_column)
 """
 
 from collections.abc import Sequence
@@ -34,6 +34,11 @@ class Slopes(NamedTuple):
         """Readings [column, monitor] times what each error does for them, summed, [error]."""
         own = readings if self.now is None else self.now * readings
         return np.asarray(self.rows.reshape(len(self.rows), own.size) @ own.ravel())
+
+    def of(self, column: int, monitor: Indices) -> Array:
+        """Of some readings of a column, [error, reading]."""
+        own = self.rows[:, column, monitor]
+        return np.asarray(own if self.now is None else own * self.now[column, monitor])
 
     def through(self, patterns: Array) -> Array:
         """Sums over the monitors of slopes times [column, monitor, pattern], [error, column,

@@ -24,7 +24,7 @@ from tmlattice.errors import EffectError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_noise import learnt_noise
-from tmlattice.observe.response_rf import computed
+from tmlattice.observe.response_rf import read
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -108,11 +108,9 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
     known = {ring[name].name: name for name in measured.monitors}
     measured = measured.select(monitors=[known[name] for name in names if name in known])
     rf = measured.rf
-    if rf is not None and rf.orbit is not None:
-        in_x = [p == "x" for p in measured.planes]
-        if computed(rf.orbit[:, 0], measured.response[in_x, :, 0]):
-            rf = replace(rf, orbit=None)
-            measured = replace(measured, rf=rf)
+    if rf is not None and not read(measured):
+        rf = replace(rf, orbit=None)
+        measured = replace(measured, rf=rf)
     if rf is None or rf.orbit is None or rf.step == 0:
         step, orbit = NO_RF, np.full((len(measured.monitors), 2), np.nan)
     else:

@@ -19,6 +19,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.predict import predict
+from tmlattice.observe.response_rf import read
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
@@ -130,12 +131,11 @@ class ResponseJudge:
     def rf_scale(self) -> float:
         """Of the RF's orbit over the design's for its step; NaN where none was read, or one that
         the design's does not resemble."""
-        read, made = self.measured.rf, self.design.rf
-        if read is None or made is None or read.orbit is None or made.orbit is None:
+        own, made = in_beam_order(self.measured, self.monitors).rf, self.design.rf
+        if own is None or made is None or own.orbit is None or made.orbit is None:
             return float("nan")
-        own = in_beam_order(self.measured, self.monitors).rf
-        assert own is not None
-        assert own.orbit is not None
+        if not read(self.measured):
+            return float("nan")
         seen = np.isfinite(own.orbit)
         a, b = own.orbit[seen], made.orbit[seen] * (own.step / own.frequency / TINY)
         both = float(a @ b)

@@ -7,6 +7,8 @@ equal cells it repeats from cell to cell, to the last digit, where readings have
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.measurement import OrbitResponse
+
 Array = NDArray[np.float64]
 
 SAME = 1e-9
@@ -16,6 +18,14 @@ FEW, ENOUGH = 0.5, 0.75
 orbits, which are read with the same digits."""
 LEAST = 6
 """Monitors that it takes to say so."""
+
+
+def read(measured: OrbitResponse) -> bool:
+    """Whether monitors read an orbit of an RF step."""
+    if measured.rf is None or measured.rf.orbit is None:
+        return False
+    in_x = [plane == "x" for plane in measured.planes]
+    return not computed(measured.rf.orbit[:, 0], measured.response[in_x, :, 0])
 
 
 def computed(orbit: Array, response: Array) -> bool:

@@ -1,0 +1,52 @@
+"""The RF's orbit at each monitor that is fitted, as all other readings predict it.
+
+A few monitors that were kept apart tell little of an orbit that is read once. What all the others
+predict of a reading follows from the fit to all of them: readings y with precision matrix Q miss
+what the others say by (Q y) / Q_ii, and for a linear fit with priors Q y is the weighed residual, Q
+the weights less what the fit takes of them. Families that follow every monitor by itself, and none
+between, are seen by that.
+
+>>> there = linear(state, 0); found = solve(there.normal, there.groups, there.start, rounds=0)
+>>> rf_by_others(state, there, found)
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from tmlattice.diagnosis.rounds import Linear
+from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.weights import taken, weight
+from tmlattice.inference.normal import Posterior
+
+Array = NDArray[np.float64]
+
+LEAST = 1e-9
+"""Share of a reading's weight that a fit leaves, at least: above rounding."""
+
+
+def rf_by_others(state: State, there: Linear, found: Posterior | None) -> Array:
+    """What is left of each reading by a fit to all the others, m, [monitor]; NaN where none is.
+
+    Args:
+        state: where the fit stands.
+        there: `linear` of it, in-plane.
+        found: solved from that; None: nothing is fitted.
+    """
+    column = len(state.data.plane) - 1
+    own = weight(state, 0)[column]
+    read = np.flatnonzero(own > 0)
+    weights = np.diag(own[read])
+    shared = taken(state, 0)
+    if shared is not None:
+        weights -= shared[column, read] @ shared[column, read].T
+    left = state.data.pick(state.at.left)[column, read]
+    precision = weights.diagonal().copy()
+    if found is not None:
+        rows = there.of_column(column, read, int(state.data.plane[column]))
+        left = left - rows @ (found.values - there.start)
+        fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
+        precision -= (fitted**2).sum(axis=0)
+    out = np.full(len(own), np.nan)
+    out[read] = weights @ left / np.maximum(precision, LEAST * weights.diagonal())
+    return out
