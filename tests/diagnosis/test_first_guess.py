@@ -7,6 +7,7 @@ import pytest
 
 from tmlattice.diagnosis import dense, first_guess
 from tmlattice.diagnosis.dense import fit_steps, one_by_one
+from tmlattice.diagnosis.doctor import check_data
 from tmlattice.diagnosis.families import STEPS, CorrectorCalibration, Trial
 from tmlattice.diagnosis.judges import score
 from tmlattice.diagnosis.state import begin, bend
@@ -14,6 +15,7 @@ from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
 from tmlattice.observe.split import split_columns
 
 NOISE = 2e-8
@@ -41,7 +43,7 @@ def begun(ring, data):
 def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring):
     """All focusing quadrupoles 3 % weak: from the design itself every family was refused."""
     design = begun(small_ring, measured(small_ring, -0.03))
-    (values,) = first_guess.first_guess(design).values()
+    (values,) = first_guess.first_guess(design).values.values()
     own = [e.k1 > 0 for e in small_ring.elements if e.kind == "quadrupole"]
     assert (values[own] < 0).all()  # of several that resemble the readings the best one
     fit = fit_steps(design.data, design.split, STEPS[:3])
@@ -50,6 +52,17 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
     gradients = fit.state.values["gradient"]
     assert abs(np.median(gradients[own]) + 0.03) < 2e-3
     assert abs(np.median(gradients[np.logical_not(own)])) < 2e-3
+
+
+def test_a_far_lattice_is_no_wrong_sign_and_no_other_ring(small_ring):
+    """ALS with 3 % on its largest family: y was said to be reversed, or the ring to be another."""
+    data = measured(small_ring, 0.02, 0.06)
+    assert ResponseJudge(small_ring, data).misfit(()).max() > ANOTHER
+    (check,) = check_data(small_ring, data).told
+    assert check.status == "note"
+    assert "is far from the ring that was measured" in check.sentence
+    reversed_ones = dataclasses.replace(data, response=-data.response)
+    assert any(check.status == "wrong" for check in check_data(small_ring, reversed_ones).told)
 
 
 def test_magnets_of_no_family_begin_there_too(small_ring):
@@ -64,7 +77,7 @@ def test_magnets_of_no_family_begin_there_too(small_ring):
 
 
 def test_a_near_design_is_where_the_fit_begins(small_ring):
-    assert not first_guess.first_guess(begun(small_ring, measured(small_ring, 0.005)))
+    assert first_guess.first_guess(begun(small_ring, measured(small_ring, 0.005))) is None
 
 
 def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):

@@ -7,16 +7,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tmlattice.diagnosis.dense import one_by_one
+from tmlattice.diagnosis.dispersion import USUAL, HorizontalKicks
 from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.judges import inner
-from tmlattice.diagnosis.rf_by_others import rf_by_others
+from tmlattice.diagnosis.judges import inner, score
+from tmlattice.diagnosis.rf_by_others import rf_by_others, rf_known_to
 from tmlattice.diagnosis.rounds import linear
 from tmlattice.diagnosis.state import begin
 from tmlattice.diagnosis.weights import taken, weight
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 from tmlattice.observe.split import split_columns
 
 
@@ -78,3 +79,30 @@ def test_they_judge_beside_those_kept_apart(settled):
     assert both.rf[:, 1].sum() == alone.rf[:, 1].sum() + fitted.sum()
     assert_allclose(both.rf[fitted, 0], by_others[fitted] ** 2)
     assert_allclose(both.columns, alone.columns)
+
+
+def test_what_is_known_of_it_is_what_held_out_monitors_miss(small_ring):
+    """Five measurements of a ring with kicks that no gradient makes up for: the fit misses the RF's
+    orbit by more than the noise, and knows that."""
+    rng = np.random.default_rng(11)
+    quadrupoles = [e.name for e in small_ring.elements if e.kind == "quadrupole"]
+    missed, known = [], []
+    for seed in range(5):
+        causes = [Cause("quadrupole_gradient", name, 3e-3 * rng.standard_normal())
+                  for name in quadrupoles]  # fmt: skip
+        measured = simulate_response(
+            small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
+            progress=False, seed=seed,
+        ).measured  # fmt: skip
+        data = response_data(small_ring, measured)
+        split = split_columns(data, 0.2, np.random.default_rng(seed))
+        drawn = rng.standard_normal(len(HorizontalKicks().patterns(data).rf))
+        kicks = HorizontalKicks().put(Errors.none(data), USUAL * drawn, data)
+        orbits = data.orbits.copy()
+        orbits[-1] += kicks.dispersion
+        data = dataclasses.replace(data, orbits=orbits)
+        *_, (_, state) = one_by_one(begin(data, split), (*STEPS[:3], STEPS[-2]))
+        missed.append(score(state, split.held).dispersion)
+        known.append(rf_known_to(state))
+    assert min(known) > 1.5 * 2e-8
+    assert 0.7 < np.sqrt(np.mean(np.square(missed)) / np.mean(np.square(known))) < 1.4

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
+from tmlattice.diagnosis.first_guess import BETTER, Guess, elsewhere
 from tmlattice.diagnosis.stored_doctor import StoredData, stored_checks
 from tmlattice.effects import Cause, expected_radiation
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
@@ -35,6 +36,7 @@ from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.evidence import Names, Verdict, certain
 from tmlattice.observe.global_errors import Judge
 from tmlattice.observe.noise import random_part
+from tmlattice.observe.orbit_response import response_data
 from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
 from tmlattice.observe.sections import Found, Passes
 
@@ -45,6 +47,9 @@ ENERGY = 0.02
 ALIEN = 0.85
 """Share of the orbit that no trajectory of a section explains, of which noise or readings in no
 order leave all and strong errors everywhere 0.7: the data are of another ring."""
+MENDED = 0.1
+"""Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
+the lattice that is wrong."""
 FAR = 100.0
 """Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
 EXACT = 0.01
@@ -338,6 +343,16 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
         judge = judge.mended(verdict.names)
     left = judge.misfit(())
     typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
+    if typical > (MENDED if verdicts else ANOTHER):
+        guess = _far(ring, data)
+        if guess is not None and guess.left < BETTER * typical:
+            return [*checks, note(
+                "lattice",
+                f"the lattice of '{ring.name}' is far from the ring that was measured, which it "
+                f"resembles with all focusing quadrupoles changed by {100 * guess.focusing:+.0f} % "
+                f"and all defocusing ones by {100 * guess.defocusing:+.0f} %; signs, units and the "
+                "order of the data are not looked at",
+            )]  # fmt: skip
     if typical > ANOTHER:  # no wrong sign, unit or order mends that
         return [*checks, wrong(
             "lattice",
@@ -364,6 +379,14 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
         ))  # fmt: skip
     said = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
     return [*checks, fine("lattice", said)]
+
+
+def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
+    """Where the design would resemble the data, if it is far from them."""
+    try:
+        return elsewhere(response_data(ring, data))
+    except TmlatticeError:  # of which more is said by who needs it
+        return None
 
 
 def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,10 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families import Trial
 from tmlattice.diagnosis.fields import QuadrupoleGradient
 from tmlattice.diagnosis.magnets import magnets
-from tmlattice.diagnosis.state import State, allow
+from tmlattice.diagnosis.state import State, allow, begin
 from tmlattice.errors import UnstableRingError
+from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]
 
@@ -45,23 +48,45 @@ def begun(design: State, trials: Sequence[Trial]) -> State:
     if not any(own.name == family.name for trial in trials for own in trial.families):
         return design
     guess = first_guess(design)
-    return allow(replace(design, values=guess), [family]) if guess else design
+    return design if guess is None else allow(replace(design, values=guess.values), [family])
 
 
-def first_guess(design: State) -> Mapping[str, Array]:
-    """Values to begin with, by variable; none where the design is near enough, or nothing better.
+class Guess(NamedTuple):
+    """Where the readings are resembled more than by the design.
+
+    Attributes:
+        focusing, defocusing: relative change of all such quadrupoles.
+        values: the same, by variable.
+        left: share of the typical column's mean square that is left there.
+    """
+
+    focusing: float
+    defocusing: float
+    values: Mapping[str, Array]
+    left: float
+
+
+def elsewhere(data: ResponseData) -> Guess | None:
+    """The first guess by all that was measured."""
+    nobody, everybody = (np.full(data.shape, own) for own in (False, True))
+    split = Split(held=nobody[:, 0], inner=nobody[:, 0], half=everybody, inner_rf=nobody[0])
+    return first_guess(begin(data, split))
+
+
+def first_guess(design: State) -> Guess | None:
+    """Where a fit is to begin; None where the design is near enough, or nothing better.
 
     Args:
         design: with no families yet.
     """
     stands = _strange(design)
     if not stands > FAR:
-        return {}
+        return None
     family = QuadrupoleGradient()
     start = allow(design, [family])
     own = magnets(design.data.ring, ("quadrupole",), True)
     focusing = np.array([pieces[0].k1 > 0 for pieces in own])
-    best, found = BETTER * stands, {}
+    best, found = BETTER * stands, None
     for f, d in product(STEPS, STEPS):
         values = {family.variable: np.where(focusing, f, d)}
         try:
@@ -69,7 +94,7 @@ def first_guess(design: State) -> Mapping[str, Array]:
         except UnstableRingError:
             continue
         if left < best:
-            best, found = left, values
+            best, found = left, Guess(float(f), float(d), values, left)
             log.info("focusing %+.2g, defocusing %+.2g: %.2g of the typical column's square left, "
                      "%.2g by the design", f, d, left, stands)  # fmt: skip
     return found

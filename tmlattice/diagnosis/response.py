@@ -43,6 +43,7 @@ from tmlattice.diagnosis.missing import weigh
 from tmlattice.diagnosis.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.reasons import explain_gradients
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView, ring_tunes
+from tmlattice.diagnosis.rf_by_others import rf_known_to
 from tmlattice.diagnosis.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.state import begin
 from tmlattice.diagnosis.strangers import reversed_ones, strangers
@@ -71,6 +72,8 @@ LARGE = 60_000
 for each of them."""
 TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
 BLOCKS = ("in-plane", "coupling", "RF")
+AS_KNOWN = 1.5
+"""So many times what a fit knows of the RF's orbit where it did not fit it is no sign of more."""
 
 
 def diagnose_response(
@@ -387,6 +390,15 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
         if own.per_reading > MISSING and chi2.sf(own.total, own.readings) < DEFAULT.false_alarm
         and name != "held-out, in-plane"
     }  # fmt: skip
+    rf = f"held-out, {BLOCKS[-1]}"
+    known = rf_known_to(fit.state) if rf in left else float("nan")
+    if heldout.dispersion < AS_KNOWN * known:
+        del left[rf]
+        said.append(
+            "The RF's orbit at monitors that did not fit it is missed by "
+            f"{1e6 * heldout.dispersion:.2g} µm, which is how well the others know it "
+            f"({1e6 * known:.2g} µm): that is no sign of an effect."
+        )
     if left:
         how = ", ".join(f"{name} {np.sqrt(own.per_reading):.1f}" for name, own in left.items())
         refused = "; ".join(step.effect for step in fit.refused)
