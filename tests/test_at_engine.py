@@ -12,7 +12,14 @@ from ocelot.cpbd.elements import Solenoid, Undulator
 from places import THIN, kicked
 
 from tmlattice import TaylorNetwork, load_ring, off_momentum
-from tmlattice.effects import CATALOGUE, Cause, LaunchEffect, ReadingEffect, RingEffect
+from tmlattice.effects import (
+    CATALOGUE,
+    Cause,
+    LaunchEffect,
+    ReadingEffect,
+    RingEffect,
+    expected_spread,
+)
 from tmlattice.effects.build import Build
 from tmlattice.errors import EffectError, LatticeError, UnknownNameError
 from tmlattice.machine.at_elements import Builder
@@ -341,6 +348,18 @@ def test_loss_in_a_bend_moves_the_orbit_as_if_spread_evenly(tmp_path):
         expected = -scale * u * 0.028 * np.array([2.0 / 6, 1.0 / 2])
         np.testing.assert_allclose(moved[:2], expected, rtol=2e-3)
         np.testing.assert_allclose(engine.expected_loss, scale * u * 6e9, rtol=1e-4)
+
+
+def test_energy_spread_by_radiation_vs_at_and_the_published(small_ring, petra3):
+    import at
+
+    _, i2, i3, i4, _ = at.get_radiation_integrals(AtEngine(small_ring).lattice())
+    by_at = np.sqrt(3.832e-13 * small_ring.gamma**2 * i3 / (2 * i2 + i4))
+    assert expected_spread(small_ring) == pytest.approx(by_at, rel=0.02)  # a partition of 2
+    # 1.23e-3 with wigglers; their ends, and their field's shape, are not in their focusing
+    assert expected_spread(petra3) == pytest.approx(1.23e-3, rel=0.06)
+    protons = replace(small_ring, mass=0.938)
+    assert expected_spread(protons) == 0
 
 
 def last_delta(engine):

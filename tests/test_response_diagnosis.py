@@ -524,8 +524,20 @@ def test_command(tmp_path, measured, result):
     assert np.sqrt(np.mean(miss[own] ** 2)) < 0.01 * np.sqrt(np.mean(gap[own] ** 2))
 
 
+def test_more_energy_spread_than_a_beam_has_is_refused(small_ring):
+    """ALS: 0.5 +- 0.08 % of it gained log evidence, where radiation makes 0.09 %."""
+    spread = Cause("energy_spread", None, 4e-3)
+    measured = simulate_response(
+        small_ring, [spread], kick=2e-5, noise=5e-9, engine="ocelot", progress=False, seed=2
+    ).measured
+    found = diagnose(small_ring, measured, seed=1, effects=["energy_spread"])
+    assert [step.effect for step in found.steps] == ["design"]
+    assert [step.effect for step in found.refused] == ["energy_spread"]
+    assert any("where radiation makes 0.11 %" in said for said in found.warnings)
+
+
 def test_predict_reproduces_the_held_out_figure_with_an_energy_spread(tmp_path, small_ring):
-    spread = Cause("energy_spread", None, 2.5e-3)
+    spread = Cause("energy_spread", None, 1.8e-3)
     measured = simulate_response(
         small_ring, [*CAUSES, spread], kick=1e-5, noise=2e-8, engine="ocelot", progress=False,
         seed=3,

@@ -185,9 +185,11 @@ def fit_steps(
     }  # fmt: skip
     stages.clear()
     refused: list[Step] = []
+    doubts: list[str] = []
     worth, without = _worth(state, steps, progress)
     while worth and (min(worth.values()) <= 0 or len(worth) > most):
         least = min(worth, key=lambda trial: worth[trial])
+        doubts += _doubts(state, least)
         state = without[least] if least in without else _without(state, least)
         refused.append(replace(steps.pop(least), kept=False))
         doubted = [trial for trial in steps if worth[trial] <= 0]
@@ -200,7 +202,7 @@ def fit_steps(
     nothing = DenseFit(
         design, design, (Step.scored("design", 0, before),),
         (*refused, *(replace(step, kept=False) for step in steps.values())),
-        (before, before), odd.said,
+        (before, before), (*odd.said, *doubts),
     )  # fmt: skip
     if spoilt > SPOILT:  # all together spoil what they should mend
         return nothing
@@ -221,7 +223,7 @@ def fit_steps(
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
-    said = odd.said if moving is None else (*odd.said, moving.sentence)
+    said = (*odd.said, *doubts, *(() if moving is None else (moving.sentence,)))
     return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
 
 
@@ -297,7 +299,10 @@ def _worth(
     what the model lacks is not.
     """
     worth, judged = _quickly(state, trials, progress)
-    doubtful = [trial for trial in judged if judged[trial] or not worth[trial] > SURE]
+    doubtful = [
+        trial for trial, unwanted in judged.items()
+        if worth[trial] > -np.inf and (unwanted or not worth[trial] > SURE)
+    ]  # fmt: skip
     states: dict[Trial, State] = {}
     if not doubtful:
         return worth, states
@@ -318,6 +323,12 @@ def _worth(
         log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
         worth[trial] = min(gained, said[0]) if _asked(trial) and against(said) else gained
     return worth, states
+
+
+def _doubts(state: State, trial: Trial) -> list[str]:
+    """Why what was found of a trial's families cannot be what they stand for."""
+    doubts = (family.doubt(state.values[family.variable], state.data) for family in trial.families)
+    return [doubt for doubt in doubts if doubt is not None]
 
 
 def _of_rf(weighed: Weighed) -> Array | None:
@@ -355,6 +366,9 @@ def _quickly(
         progress(f"is {_title(trial)} needed")
         if not any(state.values[family.variable].any() for family in trial.families):
             worth[trial], unwanted[trial] = -LEAST, False  # held at zero: nothing is lost without
+            continue
+        if _doubts(state, trial):
+            worth[trial], unwanted[trial] = -np.inf, False
             continue
         block = trial.families[0].block
         there, (evidence, _, _) = blocks[block]

@@ -26,7 +26,7 @@ from tmlattice.diagnosis.fields import (
     VerticalFocusing,
 )
 from tmlattice.diagnosis.magnets import families
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, expected_spread
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import (
     DELTA,
@@ -37,6 +37,10 @@ from tmlattice.observe.orbit_response import (
 )
 
 Array = NDArray[np.float64]
+
+WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
+"""By how much a beam's energy spread may be more than radiation makes it (instabilities, wigglers
+that the lattice has no field of), as rms; and what is usual where radiation says nothing."""
 
 
 class _Monitors(Family):
@@ -208,8 +212,11 @@ class EnergySpread(Family):
         return 1
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Wide."""
-        return [Group(self.name, np.eye(1), 10.0, fixed=True)]
+        """As much as it can be."""
+        return [Group(self.name, np.eye(1), (self._most(data) / DELTA) ** 2, fixed=True)]
+
+    def _most(self, data: ResponseData) -> float:
+        return WIDENED * (expected_spread(data.ring) or UNKNOWN_SPREAD)
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The second derivative by the energy."""
@@ -230,6 +237,16 @@ class EnergySpread(Family):
             return []
         amount = DELTA * float(np.sqrt(values[0]))
         return [(Cause("energy_spread", None, amount), DELTA**2 * float(sigma[0]) / (2 * amount))]
+
+    def doubt(self, values: Array, data: ResponseData) -> str | None:
+        """More than a beam has stands for something else of second order."""
+        rms, most = DELTA * float(np.sqrt(values[0])), self._most(data)
+        if not rms > most:
+            return None
+        return (
+            f"an energy spread of {100 * rms:.2g} % would be asked for, where radiation makes "
+            f"{100 * most / WIDENED:.2g} %: it stands for something else, and is refused"
+        )
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """By the square of the amount."""

@@ -78,3 +78,7 @@ class Family(ABC):
     def lowest(self, data: ResponseData) -> Array | float:
         """The least that each number can be; any can be zero."""
         return -np.inf
+
+    def doubt(self, values: Array, data: ResponseData) -> str | None:
+        """Why numbers that were found cannot be what the family stands for; None: they can."""
+        return None

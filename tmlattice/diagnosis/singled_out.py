@@ -222,6 +222,8 @@ class _Search:
         what each block knows of it."""
         ring = self.state.data.ring
         seen = self.seen(self.state)
+        if not seen.suspects:
+            return []
         own = seen.beside()
         evidence = self.evidence(seen, own)
         worth = [HIDDEN if one.block is None else WORTH for one in seen.suspects]

@@ -41,7 +41,7 @@ from tmlattice.effects.effect import (
     names,
     register,
 )
-from tmlattice.effects.radiation import expected_loss, expected_radiation
+from tmlattice.effects.radiation import expected_loss, expected_radiation, expected_spread
 from tmlattice.effects.reading import Monitors
 from tmlattice.effects.sizes import background_rms, rare
 
@@ -63,6 +63,7 @@ __all__ = [
     "directions",
     "expected_loss",
     "expected_radiation",
+    "expected_spread",
     "find",
     "modelled",
     "monitors_with",
