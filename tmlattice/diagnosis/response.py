@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.dense import DenseFit, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.dispersion import dispersion_beside, dispersion_by_kicks
+from tmlattice.diagnosis.displaced import displaced
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.exchanged import (
     exchanged,
@@ -406,7 +407,8 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    return (*said, *dispersion_by_kicks(fit.state.values, fit.state.data), *odd_readings(fit.state))
+    said += [*dispersion_by_kicks(fit.state.values, fit.state.data), *displaced(fit.state)]
+    return (*said, *odd_readings(fit.state))
 
 
 def _misfit(fit: DenseFit, read: Array) -> Misfit:
