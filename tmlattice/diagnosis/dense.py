@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families import STEPS, Trial
 from tmlattice.diagnosis.family import Told
-from tmlattice.diagnosis.first_guess import begun, own_kick
+from tmlattice.diagnosis.first_guess import begun, strange
 from tmlattice.diagnosis.jitter import MOSTLY, Jitter, sought
 from tmlattice.diagnosis.judges import (
     WORTH,
@@ -56,8 +56,9 @@ LEAST = 5.0
 """Log evidence that a step has to have."""
 SPOILT = 0.05
 """By how much the judges' figures may rise with all families together."""
-ASTRAY = 1.1
-"""So many times what the design leaves of fitted readings no result may leave."""
+ASTRAY, NEAR = 1.2, 0.01
+"""So many times what the design leaves of the typical column's square no result may leave; or this
+share of it, if that is more."""
 SURE = 100.0
 """Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
 FIRST, ROUGH = 4, 0.03
@@ -214,7 +215,7 @@ def fit_steps(
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
     then = replace(design, good=state.good, exploring=False)
-    if not _gap(state) <= ASTRAY * _gap(then):  # one plane agrees, the other does less than before
+    if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         astray = (
             "the fit left more of the readings that it was made to than the design leaves: the "
             "lattice may be too far from the ring, and no effect is told"
@@ -225,18 +226,6 @@ def fit_steps(
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
     said = (*odd.said, *doubts, *(() if moving is None else (moving.sentence,)))
     return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
-
-
-def _gap(state: State) -> float:
-    """rms of what is left in plane of the fitted correctors with a kick of their own, m, at the
-    monitors that are good."""
-    read, orbits = (
-        state.data.pick(own)[:-1][state.fitted[:-1]][:, state.good]
-        for own in (state.at.read, state.data.orbits)
-    )
-    u, d = (np.where(np.isfinite(orbits), own, 0.0) for own in (read, orbits))
-    left = d - own_kick(u, d)[:, None] * u
-    return float(np.sqrt(np.sum(left**2) / np.isfinite(orbits).sum()))
 
 
 def _in_turn(

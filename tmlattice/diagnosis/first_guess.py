@@ -79,7 +79,7 @@ def first_guess(design: State) -> Guess | None:
     Args:
         design: with no families yet.
     """
-    stands = _strange(design)
+    stands = strange(design)
     if not stands > FAR:
         return None
     family = QuadrupoleGradient()
@@ -90,7 +90,7 @@ def first_guess(design: State) -> Guess | None:
     for f, d in product(STEPS, STEPS):
         values = {family.variable: np.where(focusing, f, d)}
         try:
-            left = _strange(start.moved(values))
+            left = strange(start.moved(values))
         except UnstableRingError:
             continue
         if left < best:
@@ -100,28 +100,19 @@ def first_guess(design: State) -> Guess | None:
     return found
 
 
-def _strange(state: State) -> float:
+def strange(state: State) -> float:
     """Share of the typical column's mean square that is left with a kick of its own, in its plane,
     of the worse plane."""
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]
-    seen = np.isfinite(orbits) & state.fitted[:-1, None]
+    seen = np.isfinite(orbits) & state.fitted[:-1, None] & state.good
     u, d = np.where(seen, read, 0.0), np.where(seen, orbits, 0.0)
     size = (d**2).sum(axis=1)
-    left = ((d - own_kick(u, d)[:, None] * u) ** 2).sum(axis=1)
+    kick = np.maximum((u * d).sum(axis=1) / np.maximum((u**2).sum(axis=1), 1e-300), 0.0)
+    left = ((d - kick[:, None] * u) ** 2).sum(axis=1)
     shares = [
         np.median(left[rows] / size[rows])
         for rows in ((data.plane[:-1] == p) & (size > 0) for p in (0, 1))
         if rows.any()
     ]
     return float(max(shares, default=0.0))
-
-
-def own_kick(read: Array, orbits: Array) -> Array:
-    """By which each column's model is to be multiplied, least squares, not below zero, [column].
-
-    Args:
-        read, orbits: of the model and measured, m, 0 where nothing was read, [column, monitor].
-    """
-    size = np.maximum((read**2).sum(axis=1), 1e-300)
-    return np.asarray(np.maximum((read * orbits).sum(axis=1) / size, 0.0))
