@@ -19,6 +19,7 @@ from tmlattice.diagnosis.dense import fit_steps
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.missing import weigh
+from tmlattice.diagnosis.odd_steps import beside
 from tmlattice.diagnosis.state import allow, begin, jump
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
@@ -232,6 +233,34 @@ def test_correctors_that_chose_the_steps_are_fitted_like_all_others(small_ring, 
     start = begin(weak, split)
     state = jump(allow(replace(start, exploring=False), STEPS[0].families), beyond=1.0)
     assert np.abs(state.values["calibration"][split.inner] + 0.2).max() < 0.05
+
+
+def test_a_column_begun_far_off_comes_back_whatever_its_third_order_was(small_ring, measured):
+    """Diamond, 68 % from its design: a corrector began at +153 %, its third order was taken there,
+    and what that left was told as a step whose readings contradict each other."""
+    data = response_data(small_ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    start = allow(replace(begin(data, split), exploring=False), STEPS[0].families)
+    first, other = np.flatnonzero(start.fitted & (data.plane == 1))[:2]
+    values = {name: own.copy() for name, own in start.values.items()}
+    values["calibration"][first] = 1.5
+    bent = np.zeros_like(data.orbits)
+    bent[first] = data.orbits[other]
+    far = replace(start, at=Predicted(data, start.at.errors, bent)).moved(values)
+    assert abs(jump(far, beyond=1.0).values["calibration"][first]) < 0.05
+
+
+def test_a_step_that_is_left_out_has_no_calibration(small_ring, measured):
+    """It was told as +118 +- 53 %."""
+    data = response_data(small_ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    start = allow(begin(data, split), STEPS[0].families)
+    state = start.moved({**start.values, "calibration": np.full(data.shape[0], 0.1)})
+    gone = np.zeros(data.orbits.shape, dtype=bool)
+    gone[2] = True
+    left = beside(state, gone).values["calibration"]
+    assert left[2] == 0
+    assert (np.delete(left, 2) == 0.1).all()
 
 
 def test_an_insertion_device_is_found_where_it_stands(small_ring):

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.exchanged import exchanged
 from tmlattice.diagnosis.odd_readings import gross, told_gross
 from tmlattice.diagnosis.other_kicks import OtherKick, left_in_plane, other_kicks
-from tmlattice.diagnosis.state import State
+from tmlattice.diagnosis.state import State, bend, jump
 from tmlattice.diagnosis.torn_steps import torn
-from tmlattice.observe.orbit_response import Predicted, ResponseData
+from tmlattice.observe.orbit_response import ResponseData
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -59,6 +59,9 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
         return OddSteps(nothing), OddSteps(nothing)
+    # beside a far lattice a column may have begun with a calibration that it has not, and with the
+    # third order of that
+    state = bend(jump(state, beyond=1.0))
     alone = gross(data, _beside_own_kick(state))
     read = np.isfinite(data.orbits).sum(axis=(1, 2))
     alone[alone.sum(axis=(1, 2)) > MANY * read] = False  # the step went wrong, not single readings
@@ -131,7 +134,7 @@ def _kicked(state: State, others: list[OtherKick]) -> list[str]:
 
 def beside(state: State, flags: Flags) -> State:
     """A state as if nobody had taken these readings, [column, monitor, 2]: columns that have none
-    are fitted nowhere, and judge nothing."""
+    are fitted nowhere, judge nothing, and have no numbers of their own."""
     if not flags.any():
         return state
     data = state.data
@@ -140,5 +143,8 @@ def beside(state: State, flags: Flags) -> State:
     data = replace(data, orbits=orbits, measured=measured)
     gone = flags.all(axis=(1, 2))
     split = replace(state.split, held=state.split.held & ~gone, inner=state.split.inner & ~gone)
-    at = Predicted(data, state.at.errors, state.at.bent)
-    return replace(state, data=data, split=split, at=at)
+    values = dict(state.values)
+    for family in state.families:
+        if family.per == "column":
+            values[family.variable] = np.where(gone, 0.0, values[family.variable])
+    return replace(state, data=data, split=split).moved(values)

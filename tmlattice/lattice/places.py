@@ -12,6 +12,8 @@ from tmlattice.lattice.ring import Element, Kind, number_names
 
 log = logging.getLogger(__name__)
 
+NAMED = 3
+"""Octupoles that a warning names."""
 Place = tuple[str, Kind, Any]
 """Family, kind and OCELOT element, before its name has a number."""
 
@@ -115,6 +117,7 @@ def place_elements(
     known = {id(source): source for source in sources}
     for source in known.values():
         _check(source)
+    _warn_of_octupoles(sources)
     if kinds is None:
         by_source = {key: source_kind(source, str(source.id)) for key, source in known.items()}
         kinds = [by_source[id(source)] for source in sources]
@@ -142,16 +145,23 @@ def place_elements(
     return tuple(placed)
 
 
-def _check(source: Any) -> None:
+def _warn_of_octupoles(sources: Sequence[Any]) -> None:
     from tmlattice.lattice.ocelot import elements
 
+    names = [s.id for s in sources if isinstance(s, elements.Octupole) and s.k3 != 0]
+    if names:
+        kinds = list(dict.fromkeys(names))
+        more = ", ..." if len(kinds) > NAMED else ""
+        warnings.warn(
+            "octupoles are drifts in second-order maps, their fields are not modelled: "
+            f"{', '.join(kinds[:NAMED])}{more} ({len(names)})",
+            stacklevel=4,
+        )
+
+
+def _check(source: Any) -> None:
     length = float(source.l)
     if not math.isfinite(length):
         raise LatticeError(f"'{source.id}' has the length {length}; mend it in the lattice file")
-    if isinstance(source, elements.Octupole) and source.k3 != 0:
-        warnings.warn(
-            f"octupole '{source.id}' is a drift in second-order maps: its field is not modelled",
-            stacklevel=4,
-        )
     if length < 0:
         log.debug("element '%s' has the negative length %.3g m", source.id, length)
