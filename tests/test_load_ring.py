@@ -97,7 +97,7 @@ def test_octupoles_are_warned_of_once(tmp_path):
         "octs = [Octupole(l=0.1, k3=50.0, eid='oct') for _ in range(5)]\n"
         "cell = [Quadrupole(l=0.1, k1=1.0, eid='q'), *octs]",
     )
-    with pytest.warns(UserWarning) as said:
+    with pytest.warns(UserWarning, match="octupoles are drifts") as said:
         ring = load_ring(path)
     (octupoles,) = [str(own.message) for own in said if "octupole" in str(own.message)]
     assert octupoles.endswith("not modelled: oct (5)")

@@ -8,7 +8,7 @@ import pytest
 
 from tmlattice.diagnosis.families import CorrectorCalibration, MonitorGain
 from tmlattice.diagnosis.fields import QuadrupoleGradient
-from tmlattice.diagnosis.magnets import magnets
+from tmlattice.diagnosis.magnets import families, magnets, supplied_alike
 from tmlattice.diagnosis.reasons import Instead, Reason, Reasons, explain_gradients, weighed
 from tmlattice.diagnosis.rounds import settle
 from tmlattice.diagnosis.sharing import Candidates, candidates
@@ -86,6 +86,24 @@ def test_arcs_and_straights_are_regions(small_ring):
     inside = {own[i][0].name for i in np.flatnonzero(straight)}
     assert inside == {"QD::2", "QF::3", "QD::3"}
     assert (straight + members[:, names.index("arcs")] == 1).all()
+
+
+def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
+    """BESSY II and MLS: q1m1t1r, q1m2t1r, ... are one supply, and nothing shares a name."""
+    here = magnets(small_ring, ("quadrupole",), powered=True)
+    own = [(replace(first, name=f"q{i}m2r"),) for i, (first,) in enumerate(here)]
+    own[-1] = (replace(own[-1][0], k1=1.01 * own[-1][0].k1),)
+    assert families([pieces[0].name for pieces in own])[0] == []
+    names, members = supplied_alike(own)
+    assert members.sum(axis=0).tolist() == [16, 15]
+    first = own[0][0].name
+    assert names[0] == f"{first} and 15 of its strength"
+    k1 = np.array([pieces[0].k1 for pieces in own])
+    assert all(np.ptp(k1[column > 0]) == 0 for column in members.T)
+    alike = [pieces for pieces in own if pieces[0].k1 == own[0][0].k1]
+    assert supplied_alike(alike[:2])[0] == [f"{first} and {alike[1][0].name}"]
+    # those that share a name stay as they are
+    assert supplied_alike(here)[0] == families([pieces[0].name for pieces in here])[0]
 
 
 def of_families(amounts, seed=0, noise=2e-3):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.family import TAILS, Family, Told
-from tmlattice.diagnosis.magnets import families, magnets, straights
+from tmlattice.diagnosis.magnets import magnets, straights, supplied_alike
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
@@ -111,12 +111,14 @@ class FamilyGradient(QuadrupoleGradient):
 
     def count(self, data: ResponseData) -> int:
         """Families."""
-        return len(families(self.places(data))[0])
+        return len(self._families(data)[0])
 
     def groups(self, data: ResponseData) -> list[Group]:
         """Of families."""
-        kinds = families(self.places(data))[1]
-        return [Group("quadrupole_gradient of families", kinds, 0.01)]
+        return [Group("quadrupole_gradient of families", self._families(data)[1], 0.01)]
+
+    def _families(self, data: ResponseData) -> tuple[list[str], Array]:
+        return supplied_alike(magnets(data.ring, ("quadrupole",), powered=True))
 
 
 class _Thin(_Magnets):

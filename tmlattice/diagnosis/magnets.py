@@ -26,6 +26,28 @@ def families(names: Sequence[str]) -> tuple[list[str], Array]:
     )
 
 
+def supplied_alike(own: Sequence[tuple[Element, ...]]) -> tuple[list[str], Array]:
+    """Families of quadrupoles, and who belongs to them, [magnet, family] of 0 and 1: by name, and
+    where each has a name of its own (BESSY II, MLS), those that the design has alike in length and
+    gradient, for one supply or one setting is behind them.
+
+    Args:
+        own: magnets, each with its pieces.
+    """
+    kinds, members = families([pieces[0].name for pieces in own])
+    alone = np.flatnonzero(members.sum(axis=1) == 0)
+    designs: dict[tuple[float, float], list[int]] = {}
+    for i in alone.tolist():
+        length = sum(e.length for e in own[i])
+        designs.setdefault((round(length, 5), round(own[i][0].k1, 6)), []).append(i)
+    more = [alike for alike in designs.values() if len(alike) > 1]
+    for first, second, *others in more:
+        like = f"{len(others) + 1} of its strength" if others else own[second][0].name
+        kinds.append(f"{own[first][0].name} and {like}")
+    columns = [np.isin(np.arange(len(own)), alike).astype(float)[:, None] for alike in more]
+    return kinds, np.hstack([members, *columns])
+
+
 def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:
     """Magnets of some kinds, each with its pieces; pieces that are edges of other magnets are none.
 
