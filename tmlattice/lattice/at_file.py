@@ -35,6 +35,7 @@ from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.at_child import Tracker, check_methods
 from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
+from tmlattice.lattice.madx_elements import ACTS
 from tmlattice.lattice.mat_file import check_mat
 from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
@@ -192,7 +193,10 @@ def _convert(
     if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
         return "monitor", ocelot.Monitor(l=length, eid=family)  # lattices from before the class
     if isinstance(element, at.M66):
-        return _matrix(np.asarray(element.M66, dtype=float), family, length, energy)
+        matrix = np.asarray(element.M66, dtype=float)
+        if roll:
+            matrix = np.asarray(element.R2) @ matrix @ np.asarray(element.R1)
+        return _matrix(matrix, family, length, energy)
     if isinstance(element, at.ThinMultipole) and not isinstance(element, at.Multipole):
         return thin(element, family, mad, roll, left_out)
     if getattr(element, "BendingAngle", 0.0) or (
@@ -202,11 +206,15 @@ def _convert(
     if isinstance(element, at.Multipole):
         return straight(element, family, length, mad, roll, left_out)
     if isinstance(element, at.Drift | at.Marker | at.Aperture) or "Identity" in element.PassMethod:
+        if mad in ACTS:
+            left_out[f"what {mad.lower()} does"] += 1
         if length:
             return "drift", ocelot.Drift(l=length, eid=family)
         return "marker", ocelot.Marker(eid=family)
     kind, source = _matrix(tracker.matrix(element), family, length, energy)
-    left_out[f"what {type(element).__name__} has beyond its first-order matrix"] += 1
+    name = type(element).__name__
+    name = element.PassMethod.removesuffix("Pass") if name == "Element" else name
+    left_out[f"what {name} has beyond its first-order matrix"] += 1
     if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"
     return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source

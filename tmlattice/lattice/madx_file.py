@@ -2,6 +2,8 @@
 
 import json
 import re
+import warnings
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -12,6 +14,8 @@ from tmlattice.lattice.at_file import quiet_at, ring_from_at
 from tmlattice.lattice.madx_parsers import parser_of
 from tmlattice.lattice.ring import Ring
 
+NAMED = 5
+"""Undefined names that a warning tells."""
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
 
 
@@ -23,7 +27,8 @@ def read_madx(
     Args:
         path: `.seq`, `.madx` or elegant's `.lte`; files that it calls are read too.
         name: of the ring.
-        sequence: of the file's sequences or lines; else `ring`, else the only one.
+        sequence: of the file's sequences or lines; else `ring`, else the only one
+            that stands in no other.
         energy: GeV; else the file's BEAM (elegant's files have none).
 
     Raises:
@@ -36,7 +41,8 @@ def read_madx(
             parser.parse_files(str(path))
     except Exception as error:
         raise _unreadable(path, error) from error
-    use = _chosen(path, [str(s) for s in parser.sequences], sequence)
+    found = [str(s) for s in parser.sequences]
+    use = _chosen(path, found, sequence, _outermost(parser, found))
     if elegant:
         stated = False
     else:
@@ -51,14 +57,39 @@ def read_madx(
             lattice = parser.lattice(use=use)
     except Exception as error:
         raise _unreadable(path, error) from error
+    if parser.undefined:
+        names = parser.undefined
+        more = ", ..." if len(names) > NAMED else ""
+        warnings.warn(
+            f"'{path}' does not define {', '.join(names[:NAMED])}{more} ({len(names)}): taken for "
+            "0, as by MAD-X",
+            stacklevel=2,
+        )
     return ring_from_at(lattice, name, energy)
 
 
-def _chosen(path: Path, found: list[str], wanted: str | None) -> str:
+def _outermost(parser: Any, found: Sequence[str]) -> list[str]:
+    """Sequences and lines that stand in no other one."""
+    inside: set[str] = set()
+    by_id = {id(parser[name]): name for name in found}
+    for name in found:
+        for item in parser[name]:
+            named = isinstance(item, tuple) and item and isinstance(item[0], str)
+            what = parser.get(item[0]) if named else item
+            if id(what) in by_id:
+                inside.add(by_id[id(what)].casefold())
+    return [name for name in found if name.casefold() not in inside]
+
+
+def _chosen(
+    path: Path, found: Sequence[str], wanted: str | None, outermost: Sequence[str] = ()
+) -> str:
     """Of the sequences and lines of a file the one that is the ring."""
     if not found:
         raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
     names = {name.casefold(): name for name in found}
+    if not wanted and "ring" not in names and outermost:
+        found = outermost
     use = wanted.casefold() if wanted else "ring" if "ring" in names else found[-1].casefold()
     if use not in names:
         raise unknown_name(f"sequence in '{path}' named", wanted or "", found)

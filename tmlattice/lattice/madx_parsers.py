@@ -14,7 +14,7 @@ from typing import Any
 
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.expressions import MOST_ITEMS, Arithmetic
-from tmlattice.lattice.madx_matrix import matrix_command
+from tmlattice.lattice.madx_elements import more_elements
 
 LONGEST_STATEMENT = 5000
 """Lines, comments apart: a file without its semicolons is none of MAD-X."""
@@ -35,7 +35,7 @@ def parser_of(elegant: bool) -> Any:
 
     kind = at.ElegantParser if elegant else at.MadxParser
     bounded: type[Any] = abc.ABCMeta("Bounded", (_Bounded, kind), {})
-    parser = bounded(verbose=False) if elegant else bounded(verbose=False, matrix=matrix_command())
+    parser = bounded(verbose=False) if elegant else bounded(verbose=False, **more_elements())
     if elegant:
         parser.rpn.operators.update(
             {sign: (_of_numbers(operate), 2) for sign, operate in _RPN.items()}
@@ -56,6 +56,17 @@ def _of_numbers(operate: Callable[[float, float], float]) -> Callable[[Any, Any]
     return lambda a, b: operate(float(a), float(b))
 
 
+class _Zeros(dict[str, float]):
+    """Has every name that is asked for."""
+
+    def __missing__(self, name: str) -> float:
+        self[name] = 0.0
+        return 0.0
+
+    def __contains__(self, name: object) -> bool:
+        return True
+
+
 class _Bounded:
     """What stands before AT's parser of either language."""
 
@@ -64,6 +75,7 @@ class _Bounded:
 
         self._arithmetic = Arithmetic((*_FUNCTIONS, sinc))
         self._files = 0
+        self._zeros: tuple[_Zeros, ...] = ()
         super().__init__(**options)
 
     # what AT's parsers are asked for; they are known at run time alone
@@ -76,11 +88,16 @@ class _Bounded:
 
     def evaluate(self, expr: str) -> Any:
         """The value of an expression of the file."""
-        return self._arithmetic.value(self._format_command(expr), self, self.env)  # type: ignore[arg-type]
+        names = (self, self.env, *self._zeros)
+        return self._arithmetic.value(self._format_command(expr), *names)  # type: ignore[arg-type]
+
+    @property
+    def undefined(self) -> list[str]:
+        """Names that the file does not define, and that were taken for 0."""
+        return [name for zeros in self._zeros for name in zeros]
 
     def _assign_deferred(self, value: str) -> Any:
         from at.load.parser import StrParameter
-        from at.load.utils import protect, restore
 
         def constant(text: str) -> Any:
             try:
@@ -90,13 +107,16 @@ class _Bounded:
             except Exception:  # of names that are said later, or in the language's own words
                 return StrParameter(self, text)
 
-        if value[:1] == "(" and value[-1:] == ")":
-            inner, matches = protect(value[1:-1], fence=(r"\(", r"\)"))
-            return tuple(constant(part) for part in restore(matches, *inner.split(",")))
-        return constant(value)
+        parts = _list_items(value)
+        return constant(value) if parts is None else tuple(map(constant, parts))
 
     def _statement(self, line: str) -> bool:
         bare = _QUOTED.sub('""', line)
+        if "&" in bare:  # of MAD-8, where a line ends; MAD-X takes it for a blank
+            line = "".join(
+                part if i % 2 else part.replace("&", " ")
+                for i, part in enumerate(re.split(r'("[^"]*")', line))
+            )
         if _CONTROL.match(bare):
             raise LatticeError("control flow and macros are not read; write the lattice out")
         depth = 0
@@ -111,7 +131,12 @@ class _Bounded:
 
     def _raw_command(self, *args: Any, **options: Any) -> Any:
         self._arithmetic.work(20)
-        return super()._raw_command(*args, **options)  # type: ignore[misc]
+        try:
+            return super()._raw_command(*args, **options)  # type: ignore[misc]
+        except TypeError as error:
+            if "is not callable" not in str(error):
+                raise
+            raise LatticeError(f"no element or command '{args[1]}' is known") from error
 
     def parse_files(self, *names: str, **options: Any) -> None:
         """Read files; one that they call may be any regular file."""
@@ -148,9 +173,28 @@ class _Bounded:
         """AT's own prints such a circle."""
 
     def expand(self, key: str) -> Any:
-        """AT's elements of a line or sequence."""
+        """AT's elements of a line or sequence. What no statement has defined by now is 0, as in
+        MAD-X."""
+        if self._delimiter and not self._zeros:
+            self._zeros = (_Zeros(),)
         _length(self[key], {})  # type: ignore[index]
         yield from super().expand(key)  # type: ignore[misc]
+
+
+def _list_items(text: str) -> list[str] | None:
+    """Items of "(a, b)"; None of what is no list: "(a + b)", "(a, b) * (c)", "(a / 3) * (1 - b)".
+    A list of one item is that item, which AT's elements take as well."""
+    if text[:1] != "(":
+        return None
+    items, depth, begin = list[str](), 0, 1
+    for i, sign in enumerate(text):
+        depth += {"(": 1, ")": -1}.get(sign, 0)
+        if depth == 0 and i < len(text) - 1:
+            return None
+        if (sign == "," and depth == 1) or depth == 0:
+            items.append(text[begin:i])
+            begin = i + 1
+    return items if len(items) > 1 else None
 
 
 def _length(value: Any, known: dict[int, int]) -> int:

@@ -148,7 +148,7 @@ def place_elements(
 def _warn_of_octupoles(sources: Sequence[Any]) -> None:
     from tmlattice.lattice.ocelot import elements
 
-    names = [s.id for s in sources if isinstance(s, elements.Octupole) and s.k3 != 0]
+    names = [str(s.id) for s in sources if isinstance(s, elements.Octupole) and s.k3 != 0]
     if names:
         kinds = list(dict.fromkeys(names))
         more = ", ..." if len(kinds) > NAMED else ""
