@@ -101,9 +101,11 @@ def imported(name, files, data, place, iteration):
 
 def stands(path, made_with):
     """What a file of an earlier run says; None where there is none, or one of other options."""
+    if path is None:
+        return None
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (AttributeError, FileNotFoundError, ValueError):
+    except (FileNotFoundError, ValueError):
         return None
     return found if found.items() >= made_with.items() else None
 

@@ -248,6 +248,13 @@ def test_a_column_begun_far_off_comes_back_whatever_its_third_order_was(small_ri
     bent[first] = data.orbits[other]
     far = replace(start, at=Predicted(data, start.at.errors, bent)).moved(values)
     assert abs(jump(far, beyond=1.0).values["calibration"][first]) < 0.05
+    # and where its calibration is no zero
+    weak = replace(
+        data,
+        orbits=data.orbits * np.where(np.arange(data.shape[0]) == first, 0.6, 1.0)[:, None, None],
+    )
+    far = replace(far, data=weak, at=Predicted(weak, far.at.errors, bent))
+    assert abs(jump(far, beyond=1.0).values["calibration"][first] + 0.4) < 0.05
 
 
 def test_a_step_that_is_left_out_has_no_calibration(small_ring, measured):

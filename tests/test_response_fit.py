@@ -278,7 +278,7 @@ def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
 
     monkeypatch.setattr(dense, "_quickly", lambda *_: ({"gradients": 1.0}, {"gradients": False}))
     monkeypatch.setattr(dense, "_without", lost)
-    monkeypatch.setattr(dense, "weigh", lambda *_: None)
+    monkeypatch.setattr(dense, "evidence_of", lambda *_: None)
     monkeypatch.setattr(dense, "_title", str)
     state = SimpleNamespace(good=None, independent=None)
     assert dense._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})

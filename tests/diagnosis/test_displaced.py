@@ -1,6 +1,7 @@
 """Correctors that stand elsewhere than in the lattice."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from tmlattice.diagnosis.dense import one_by_one
 from tmlattice.diagnosis.displaced import displaced
 from tmlattice.diagnosis.families import STEPS
 from tmlattice.diagnosis.state import begin
+from tmlattice.effects import Cause
 from tmlattice.lattice.json_file import save_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data
@@ -47,9 +49,13 @@ def test_a_corrector_that_stands_elsewhere_is_named_with_its_place(small_ring, t
 
 
 def test_nothing_is_said_of_correctors_that_stand_where_they_should(small_ring):
+    """Not of a wrong calibration, nor of wrong readings, though these leave most by far."""
     measured = simulate_response(
-        small_ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=1
-    ).measured
-    data = response_data(small_ring, measured)
+        small_ring, [Cause("corrector_calibration", "v7", 0.1)], kick=1e-5, noise=2e-8,
+        rf_step=-3000.0, engine="ocelot", progress=False, seed=1,
+    ).measured  # fmt: skip
+    response = measured.response.copy()
+    response[measured.correctors.index("v5"), ::6, 1] *= 1.5
+    data = response_data(small_ring, replace(measured, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     assert displaced(begin(data, split)) == []

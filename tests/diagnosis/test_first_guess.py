@@ -65,6 +65,30 @@ def test_a_far_lattice_is_no_wrong_sign_and_no_other_ring(small_ring):
     assert any(check.status == "wrong" for check in check_data(small_ring, reversed_ones).told)
 
 
+def in_mm(data):
+    return dataclasses.replace(rf_in_mm(data), response=1e3 * data.response)
+
+
+def in_mrad(data):
+    return dataclasses.replace(data, kicks=1e3 * data.kicks)
+
+
+def rf_in_mm(data):
+    return dataclasses.replace(data, rf=dataclasses.replace(data.rf, orbit=1e3 * data.rf.orbit))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [(in_mm, "readings-in-mm"), (in_mrad, "kicks-in-mrad"), (rf_in_mm, "the RF's orbit is ")],
+)
+def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
+    """With kicks of their own every unit resembles the readings; the note alone was said."""
+    error, far = check_data(small_ring, change(measured(small_ring, 0.02, 0.06))).told
+    assert "is far from the ring that was measured" in far.sentence
+    assert error.status == "wrong"
+    assert said in error.sentence
+
+
 def test_magnets_of_no_family_begin_there_too(small_ring):
     """Families alone had led single magnets back to nothing, and every round astray."""
     design = begun(small_ring, measured(small_ring, -0.03))
@@ -96,7 +120,7 @@ def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
     monkeypatch.setattr(dense, "settle", lambda state, *args, **options: state)
     fit = fit_steps(design.data, design.split, STEPS[:1])
     assert len(fit.steps) == 1
-    assert "more of the readings that it was made to" in fit.said[-1]
+    assert "more of the readings that it was fitted to" in fit.said[-1]
     assert fit.heldout[0] == fit.heldout[1]
 
 

@@ -71,6 +71,21 @@ def test_each_reading_vs_a_fit_without_it(settled, rng, moving):
         assert_allclose(by_others[read[i]], left[i] - by_noise, rtol=1e-5, atol=1e-13)
 
 
+def test_without_all_that_is_fitted_it_is_the_designs(settled):
+    """The one family in plane: without it stood for what is left with it, by the fit itself."""
+    _, _, with_it = told(settled)
+    design = begin(settled.data, settled.split)
+    one = dataclasses.replace(settled, jitter=None)
+    left = design.data.pick(Predicted(design.data, Errors.none(design.data), settled.at.bent).left)
+    nothing = dataclasses.replace(one, at=Predicted(one.data, Errors.none(one.data), one.at.bent))
+    read = np.isfinite(with_it)
+    assert_allclose(rf_by_others(nothing, None, None)[read], left[-1, read], rtol=1e-9)
+    linearly = rf_by_others(one, linear(one, 0), None)
+    # second order of gradients of 0.3 %, and gains
+    assert np.std(linearly[read] - left[-1, read]) < 0.25 * np.std(left[-1, read])
+    assert np.std(with_it[read]) < 0.1 * np.std(left[-1, read])
+
+
 def test_they_judge_beside_those_kept_apart(settled):
     _, _, by_others = told(settled)
     alone, both = inner(settled), inner(settled, by_others)

@@ -106,7 +106,7 @@ def diagnose_change(
         UnknownNameError: an effect, a monitor or a corrector that does not exist.
         UnstableRingError: no closed orbit.
     """
-    begun = time.perf_counter()
+    started = time.perf_counter()
     trials = trials_of(effects, CHANGES)
     before, after = (mended(ring, one, assume) for one in (before, after))
     said = consulted(ring, after, reference=before)
@@ -147,7 +147,7 @@ def diagnose_change(
             findings=with_consequences(there, few.findings, causes),
             warnings=(*said, *few.said),
             noise_estimated=False,
-            provenance=provenance(ring, options, seed, begun),
+            provenance=provenance(ring, options, seed, started),
         )  # fmt: skip
     fit = _fit_change(data, split, trials, progress)
     progress("what changed")
@@ -165,7 +165,7 @@ def diagnose_change(
         findings=with_consequences(there, found, causes),
         warnings=(*said, *_said(data, fit, whole)),
         noise_estimated=True,
-        provenance=provenance(ring, options, seed, begun),
+        provenance=provenance(ring, options, seed, started),
     )  # fmt: skip
 
 

@@ -31,7 +31,14 @@ from tmlattice.diagnosis.judges import (
 from tmlattice.diagnosis.odd_readings import robust
 from tmlattice.diagnosis.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.rf_by_others import rf_by_others
-from tmlattice.diagnosis.rounds import Linear, Weighed, linear, linear_evidence, settle, weigh
+from tmlattice.diagnosis.rounds import (
+    Evidence,
+    Linear,
+    evidence_of,
+    linear,
+    linear_evidence,
+    settle,
+)
 from tmlattice.diagnosis.set_aside import taken_back
 from tmlattice.diagnosis.state import (
     State,
@@ -56,7 +63,7 @@ LEAST = 5.0
 """Log evidence that a step has to have."""
 SPOILT = 0.05
 """By how much the judges' figures may rise with all families together."""
-ASTRAY, NEAR = 1.2, 0.01
+ASTRAY, NEAR = 1.2, 1e-3
 """So many times what the design leaves of the typical column's square no result may leave; or this
 share of it, if that is more."""
 SURE = 100.0
@@ -214,10 +221,14 @@ def fit_steps(
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
+    for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since it was asked
+        doubts += _doubts(state, trial)
+        state = _without(state, trial)
+        refused.append(replace(steps.pop(trial), kept=False))
     then = replace(design, good=state.good, exploring=False)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         astray = (
-            "the fit left more of the readings that it was made to than the design leaves: the "
+            "the fit left more of the readings that it was fitted to than the design leaves: the "
             "lattice may be too far from the ring, and no effect is told"
         )
         return replace(nothing, said=(*nothing.said, astray))
@@ -296,7 +307,7 @@ def _worth(
     if not doubtful:
         return worth, states
     shares = state.independent
-    whole = weigh(state, state.good, shares)
+    whole = evidence_of(state, state.good, shares)
     for trial in doubtful:
         progress(f"without {_title(trial)}")
         try:
@@ -305,9 +316,9 @@ def _worth(
             worth[trial] = np.inf
             continue
         good = state.good & without.good
-        with_it = whole if (good == state.good).all() else weigh(state, good, shares)
-        other = weigh(without, good, shares)
-        gained = with_it.evidence - other.evidence - LEAST
+        with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
+        other = evidence_of(without, good, shares)
+        gained = with_it.log - other.log - LEAST
         said = lost(inner(without, _of_rf(other)), inner(state, _of_rf(with_it)))
         log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
         worth[trial] = min(gained, said[0]) if _asked(trial) and against(said) else gained
@@ -320,11 +331,9 @@ def _doubts(state: State, trial: Trial) -> list[str]:
     return [doubt for doubt in doubts if doubt is not None]
 
 
-def _of_rf(weighed: Weighed) -> Array | None:
+def _of_rf(own: Evidence) -> Array:
     """What the RF's fitted monitors leave, each predicted by all others."""
-    if weighed.in_plane is None:
-        return None
-    return rf_by_others(weighed.state, weighed.in_plane, weighed.found)
+    return rf_by_others(own.state, own.in_plane, own.found)
 
 
 def _priors(trial: Trial, state: State) -> set[str]:
@@ -349,7 +358,8 @@ def _quickly(
         if state.of_block(block):
             there = linear(state, block)
             blocks[block] = there, linear_evidence(there)
-    of_rf = rf_by_others(state, blocks[0][0], blocks[0][1][2]) if 0 in blocks else None
+    in_plane = blocks.get(0)
+    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
     judged = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")

@@ -76,5 +76,6 @@ def displaced(state: State) -> list[str]:
         return []
     return [
         "correctors that answer as if they stood elsewhere than in the lattice: "
-        f"{'; '.join(told)}; check their places, and which magnet each name is"
+        f"{'; '.join(told)}; check their places, which magnet each name is, and that no other one "
+        "is driven with them"
     ]

@@ -37,7 +37,7 @@ from tmlattice.observe.evidence import Names, Verdict, certain
 from tmlattice.observe.global_errors import Judge
 from tmlattice.observe.noise import random_part
 from tmlattice.observe.orbit_response import response_data
-from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
+from tmlattice.observe.response_errors import ANOTHER, ResponseJudge, ResponseVerdict
 from tmlattice.observe.sections import Found, Passes
 
 Array = NDArray[np.float64]
@@ -60,6 +60,8 @@ SPOILT = 3.0
 """Misfit of a section, over the typical one, from which it is not trusted."""
 OVER, UNDER = 2.5, 3.0
 """Factors by which a stated noise may be too large, and too small."""
+_UNIT = "-in-"
+"""In the names of assumptions about a unit."""
 SCALED = 3.0
 """Times what the design makes of it, or as small a part, no RF's orbit is."""
 SPIKE = 20.0
@@ -346,13 +348,16 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     if typical > (MENDED if verdicts else ANOTHER):
         guess = _far(ring, data)
         if guess is not None and guess.left < BETTER * typical:
-            return [*checks, note(
+            far = note(
                 "lattice",
                 f"the lattice of '{ring.name}' is far from the ring that was measured, which it "
                 f"resembles with all focusing quadrupoles changed by {100 * guess.focusing:+.0f} % "
-                f"and all defocusing ones by {100 * guess.defocusing:+.0f} %; signs, units and the "
-                "order of the data are not looked at",
-            )]  # fmt: skip
+                f"and all defocusing ones by {100 * guess.defocusing:+.0f} %; signs and the order "
+                "of the data are not looked at",
+            )
+            # a wrong unit is seen with any lattice
+            units = [own for own in verdicts if all(_UNIT in name for name in own.names)]
+            return [*checks, *map(_of_all, units), *_rf_step(judge), far]
     if typical > ANOTHER:  # no wrong sign, unit or order mends that
         return [*checks, wrong(
             "lattice",
@@ -362,23 +367,29 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
         )]  # fmt: skip
     if not verdicts:
         checks.append(fine(_GLOBAL, "no global error would make the response agree better"))
-    for verdict in verdicts:
-        words, others, mend = _words(verdict.names, verdict.alike)
-        before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
-        said = (
-            f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
-            f"stated, by {after:.0f} % with that undone; {mend}"
-        )
-        checks.append(wrong(_GLOBAL, said, assume=verdict.names))
-    scale = judge.rf_scale()
-    if max(abs(scale), 1 / abs(scale)) > SCALED:
-        checks.append(wrong(
-            "RF step",
-            f"the RF's orbit is {scale:.3g} times what its step makes of the design's: mend its "
-            "unit (m) or the step's (Hz), or leave it out",
-        ))  # fmt: skip
     said = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
-    return [*checks, fine("lattice", said)]
+    return [*checks, *map(_of_all, verdicts), *_rf_step(judge), fine("lattice", said)]
+
+
+def _of_all(verdict: ResponseVerdict) -> Check:
+    words, others, mend = _words(verdict.names, verdict.alike)
+    before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
+    said = (
+        f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
+        f"stated, by {after:.0f} % with that undone; {mend}"
+    )
+    return wrong(_GLOBAL, said, assume=verdict.names)
+
+
+def _rf_step(judge: ResponseJudge) -> list[Check]:
+    scale = judge.rf_scale()
+    if not max(abs(scale), 1 / abs(scale)) > SCALED:
+        return []
+    said = (
+        f"the RF's orbit is {scale:.3g} times what its step makes of the design's: mend its unit "
+        "(m) or the step's (Hz), or leave it out"
+    )
+    return [wrong("RF step", said)]
 
 
 def _far(ring: Ring, data: OrbitResponse) -> Guess | None:

@@ -243,8 +243,9 @@ class EnergySpread(Family):
         rms, most = DELTA * float(np.sqrt(values[0])), self._most(data)
         if not rms > most:
             return None
+        usual = "radiation makes" if expected_spread(data.ring) else "a beam has usually"
         return (
-            f"an energy spread of {100 * rms:.2g} % would be asked for, where radiation makes "
+            f"an energy spread of {100 * rms:.2g} % would be asked for, where {usual} "
             f"{100 * most / WIDENED:.2g} %: it stands for something else, and is refused"
         )
 

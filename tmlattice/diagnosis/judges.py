@@ -17,9 +17,9 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
-"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: of some
-25 readings), and by how much their sum may fall without a step that stays all the same: evidence
-takes what the model lacks for noise, and gladly fits it."""
+"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
+reading a monitor), and by how much their sum may fall without a step that stays all the same:
+evidence takes what the model lacks for noise, and gladly fits it."""
 SURELY, WORTH = 1.0, 0.05
 """Standard errors of a fall, or a rise, from which on it counts; and how much a rise is at least
 that is a reason by itself, or a fall that refuses what most of the readings ask for."""

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 MANY = 0.1
-"""Share of a step's readings from which they are not single ones."""
+"""Share of a step's readings, and more than one, from which they are not single ones."""
 GAINS = "monitor_gain"
 """The family of monitors' gains."""
 
@@ -40,7 +40,7 @@ class OddSteps:
     said: tuple[str, ...] = ()
 
     def and_more(self, *others: "OddSteps") -> "OddSteps":
-        """With those that are found once these are left out."""
+        """With others."""
         unread, said = self.unread, self.said
         for own in others:
             unread, said = unread | own.unread, (*said, *own.said)
@@ -64,7 +64,8 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
     state = bend(jump(state, beyond=1.0))
     alone = gross(data, _beside_own_kick(state))
     read = np.isfinite(data.orbits).sum(axis=(1, 2))
-    alone[alone.sum(axis=(1, 2)) > MANY * read] = False  # the step went wrong, not single readings
+    many = np.maximum(MANY * read, 1)
+    alone[alone.sum(axis=(1, 2)) > many] = False  # the step went wrong, not single readings
     state = beside(state, alone)
     broken = torn(state)
     alone[broken] = False  # among all the others

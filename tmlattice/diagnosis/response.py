@@ -397,8 +397,8 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
         del left[rf]
         said.append(
             "The RF's orbit at monitors that did not fit it is missed by "
-            f"{1e6 * heldout.dispersion:.2g} µm, which is how well the others know it "
-            f"({1e6 * known:.2g} µm): that is no sign of an effect."
+            f"{1e6 * heldout.dispersion:.2g} µm, and the others know it to {1e6 * known:.2g} µm: "
+            "that is no sign of an effect."
         )
     if left:
         how = ", ".join(f"{name} {np.sqrt(own.per_reading):.1f}" for name, own in left.items())

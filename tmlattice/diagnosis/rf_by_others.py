@@ -25,13 +25,13 @@ LEAST = 1e-9
 """Share of a reading's weight that a fit leaves, at least: above rounding."""
 
 
-def rf_by_others(state: State, there: Linear, found: Posterior | None) -> Array:
+def rf_by_others(state: State, there: Linear | None, found: Posterior | None) -> Array:
     """What is left of each reading by a fit to all the others, m, [monitor]; NaN where none is.
 
     Args:
         state: where the fit stands.
-        there: `linear` of it, in-plane.
-        found: solved from that; None: nothing is fitted.
+        there: `linear` of it, in-plane; None where nothing is fitted.
+        found: solved from that; None: without all that is fitted there.
     """
     column = len(state.data.plane) - 1
     own = weight(state, 0)[column]
@@ -42,9 +42,11 @@ def rf_by_others(state: State, there: Linear, found: Posterior | None) -> Array:
         weights -= shared[column, read] @ shared[column, read].T
     left = state.data.pick(state.at.left)[column, read]
     precision = weights.diagonal().copy()
-    if found is not None:
+    if there is not None:
         rows = there.of_column(column, read, int(state.data.plane[column]))
-        left = left - rows @ (found.values - there.start)
+        values = np.zeros_like(there.start) if found is None else found.values
+        left = left - rows @ (values - there.start)
+    if there is not None and found is not None:
         fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
         precision -= (fitted**2).sum(axis=0)
     out = np.full(len(own), np.nan)

@@ -389,23 +389,23 @@ def linear_evidence(
     return total, {name: found.values[rows] for name, rows in there.where.items()}, found
 
 
-class Weighed(NamedTuple):
+class Evidence(NamedTuple):
     """What the readings say for a state.
 
     Attributes:
-        evidence: its logarithm, of both blocks.
+        log: its logarithm, of both blocks.
         state: with the weights that it was taken with.
         in_plane: linear where it stands; None where nothing is fitted there.
         found: the fit of that.
     """
 
-    evidence: float
+    log: float
     state: State
     in_plane: Linear | None
     found: Posterior | None
 
 
-def weigh(state: State, good: Flags, shares: Array | None = None) -> Weighed:
+def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evidence:
     """Evidence of what is fitted, of the readings of some monitors, both blocks, what the model
     lacks and the priors at their likeliest; up to a constant of the data.
 
@@ -415,8 +415,9 @@ def weigh(state: State, good: Flags, shares: Array | None = None) -> Weighed:
         shares: of the readings that are independent: the same for states that are compared.
     """
     total, in_plane, found = 0.0, None, None
+    state = replace(state, good=good)
     for block in (block for block in (1, 0) if state.reads(block)):
-        state = replace(look(state, block), good=good, independent=shares)
+        state = replace(look(state, block), independent=shares)
         left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
         total += 0.5 * log_scale(state, block)
         total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
@@ -426,9 +427,9 @@ def weigh(state: State, good: Flags, shares: Array | None = None) -> Weighed:
             total += more
             if block == 0:
                 in_plane, found = there, last
-    return Weighed(total, state, in_plane, found)
+    return Evidence(total, state, in_plane, found)
 
 
 def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
-    """That of `weigh`."""
-    return weigh(state, good, shares).evidence
+    """That of `evidence_of`."""
+    return evidence_of(state, good, shares).log

@@ -189,8 +189,11 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     rows = family.rows(state.at, np.zeros(0))
     left = state.data.pick(state.at.left, family.block)
     noise = state.data.noise_of(family.block)
-    bent = np.broadcast_to(state.at.bent, state.data.orbits.shape)
-    flat = left + state.at.gain(family.block) * state.data.pick(bent, family.block)
+    bent = state.data.pick(np.broadcast_to(state.at.bent, state.data.orbits.shape), family.block)
+    bent = state.at.gain(family.block) * bent
+    scale = 1 + state.at.errors.calibration[:, None]
+    # a kick is (1 + calibration) (linear + bent); only in its own plane
+    flat = (rows - bent, left + scale * bent) if family.block == 0 else (rows, left)
     amounts, without, told = np.full((3, len(left)), np.nan)
     for c in np.flatnonzero(~state.split.held[:-1]):
         seen = np.isfinite(left[c]) & state.good
@@ -198,8 +201,8 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
         if not rows[c, near].any():
             continue
         without[c] = np.mean((left[c, far] / noise[c, far]) ** 2)
-        for read in (left[c], flat[c]):
-            (amount,), miss = amplitudes(rows[c][:, None], read, near, far)
+        for own, read in ((rows[c], left[c]), (flat[0][c], flat[1][c])):
+            (amount,), miss = amplitudes(own[:, None], read, near, far)
             mean = np.mean((miss / noise[c, far]) ** 2)
             if not mean >= told[c]:
                 amounts[c], told[c] = amount, mean

@@ -11,7 +11,6 @@ from tmlattice.effects.build import Build
 from tmlattice.effects.cause import Cause
 from tmlattice.effects.effect import CATALOGUE, RingEffect, register
 from tmlattice.lattice import Element, Ring
-from tmlattice.lattice.ring import ELECTRON_GEV
 
 C_GAMMA = 8.846e-5
 """m / GeV^3, of electrons. Source: M. Sands, SLAC-121 (1970)."""
@@ -42,7 +41,7 @@ def expected_spread(ring: Ring) -> float:
     damping partition of 2 (bends with a gradient: by a tenth another); 0 where nothing radiates,
     or other particles do."""
     squares, cubes = np.sum([_integrals(element) for element in ring.elements], axis=0)
-    if not squares > 0 or ring.mass > 2 * ELECTRON_GEV:
+    if not squares > 0 or not ring.radiates:
         return 0.0
     return float(np.sqrt(C_QUANTUM * ring.gamma**2 * cubes / (2 * squares)))
 
