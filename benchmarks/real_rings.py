@@ -35,7 +35,7 @@ import numpy as np
 
 import tmlattice
 from tmlattice import read_measurement
-from tmlattice.diagnosis import response
+from tmlattice.diagnosis.response import procedure
 from tmlattice.errors import TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice.mat_file import read_mat
@@ -309,7 +309,7 @@ def main():
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     if options.families:
-        response.LARGE = 0
+        procedure.LARGE = 0
     if not os.environ.get("TMLATTICE_DATA"):
         sys.exit("TMLATTICE_DATA names no folder of measured data")
     if options.into:

@@ -14,18 +14,18 @@ from tmlattice.beam.kicks import (
     kicking,
 )
 from tmlattice.diagnosis import diagnose
-from tmlattice.diagnosis.dense import fit_steps
-from tmlattice.diagnosis.dispersion import (
+from tmlattice.diagnosis.families.dispersion import (
     HorizontalKicks,
     VerticalKicks,
     dispersion_by_kicks,
     patterns_of_kicks,
 )
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.fields import QuadrupoleGradient
-from tmlattice.diagnosis.hypotheses import HYPOTHESES
-from tmlattice.diagnosis.missing import weigh
-from tmlattice.diagnosis.state import begin
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.dense import fit_steps
+from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
+from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response

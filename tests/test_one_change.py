@@ -5,11 +5,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.dense import one_by_one
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.left_open import Blur, LeftOpen, left_open
-from tmlattice.diagnosis.one_change import OneChange, _Line
-from tmlattice.diagnosis.state import begin
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.dense import one_by_one
+from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, left_open
+from tmlattice.diagnosis.response.one_change import OneChange, _Line
+from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response

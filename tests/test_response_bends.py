@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.dense import fit_steps, told
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.fields import BendGradient, EdgeFocusing
-from tmlattice.diagnosis.state import allow
+from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.dense import fit_steps, told
+from tmlattice.diagnosis.response.state import allow
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response

@@ -15,12 +15,12 @@ from click.testing import CliRunner
 from tmlattice import diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
-from tmlattice.diagnosis.dense import fit_steps
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.hypotheses import HYPOTHESES, Hypothesis
-from tmlattice.diagnosis.missing import weigh
-from tmlattice.diagnosis.odd_steps import beside
-from tmlattice.diagnosis.state import allow, begin, jump
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.dense import fit_steps
+from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
+from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.odd_steps import beside
+from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring

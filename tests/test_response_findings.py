@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose
-from tmlattice.diagnosis.few import few_causes
+from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data

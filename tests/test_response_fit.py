@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
 
-from tmlattice.diagnosis import dense, rounds
-from tmlattice.diagnosis.dense import one_by_one
-from tmlattice.diagnosis.families import STEPS, Trial
-from tmlattice.diagnosis.fields import FocusingChange, QuadrupoleGradient, VerticalFocusing
-from tmlattice.diagnosis.rounds import linear, one_round
-from tmlattice.diagnosis.state import allow, begin
-from tmlattice.diagnosis.weights import good_monitors
+from tmlattice.diagnosis.families.fields import FocusingChange, QuadrupoleGradient, VerticalFocusing
+from tmlattice.diagnosis.families.steps import STEPS, Trial
+from tmlattice.diagnosis.response import dense, rounds
+from tmlattice.diagnosis.response.dense import one_by_one
+from tmlattice.diagnosis.response.rounds import linear, one_round
+from tmlattice.diagnosis.response.state import allow, begin
+from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import slopes

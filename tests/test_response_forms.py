@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
-from tmlattice.diagnosis import few
-from tmlattice.diagnosis.dense import fit_steps
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.hypotheses import HYPOTHESES
-from tmlattice.diagnosis.missing import control, weigh
-from tmlattice.diagnosis.odd_readings import without_gross
-from tmlattice.diagnosis.response import assumed_of
-from tmlattice.diagnosis.strangers import reversed_ones
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response import few
+from tmlattice.diagnosis.response.dense import fit_steps
+from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
+from tmlattice.diagnosis.response.missing import control, weigh
+from tmlattice.diagnosis.response.odd_readings import without_gross
+from tmlattice.diagnosis.response.procedure import assumed_of
+from tmlattice.diagnosis.response.strangers import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response

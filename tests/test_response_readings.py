@@ -7,20 +7,20 @@ import pytest
 
 from tmlattice import diagnose
 from tmlattice.beam.kicks import orbits_of_kicks
-from tmlattice.diagnosis.dense import fit_steps, told
-from tmlattice.diagnosis.exchanged import (
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.dense import fit_steps, told
+from tmlattice.diagnosis.response.exchanged import (
     exchanged,
     exchanged_monitors,
     monitors_back,
     put_right,
 )
-from tmlattice.diagnosis.families import STEPS
-from tmlattice.diagnosis.odd_readings import odd_readings
-from tmlattice.diagnosis.other_kicks import other_kicks
-from tmlattice.diagnosis.response import assumed_of
-from tmlattice.diagnosis.rounds import linear
-from tmlattice.diagnosis.set_aside import taken_back
-from tmlattice.diagnosis.torn_steps import torn
+from tmlattice.diagnosis.response.odd_readings import odd_readings
+from tmlattice.diagnosis.response.other_kicks import other_kicks
+from tmlattice.diagnosis.response.procedure import assumed_of
+from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
@@ -265,7 +265,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     assert size == pytest.approx(np.sqrt(np.mean(amounts**2)) * times * noise, rel=0.4)
     assert error(told.state) < 1.3 * error(still.state)
     if times > 100:
-        monkeypatch.setattr("tmlattice.diagnosis.dense.sought", lambda state: None)
+        monkeypatch.setattr("tmlattice.diagnosis.response.dense.sought", lambda state: None)
         assert error(found(moved).state) > 10 * error(told.state)
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose
-from tmlattice.diagnosis.exchanged import planes_back, swapped
-from tmlattice.diagnosis.few import few_causes
-from tmlattice.diagnosis.orbit_modes import orbit_families
-from tmlattice.diagnosis.rounds import linear
-from tmlattice.diagnosis.singled_out import singled_out
-from tmlattice.diagnosis.small_errors import sizes_in, small_errors
-from tmlattice.diagnosis.state import begin
+from tmlattice.diagnosis.families.orbit_modes import orbit_families
+from tmlattice.diagnosis.response.exchanged import planes_back, swapped
+from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.singled_out import singled_out
+from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
+from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import NOISE, simulate_response

@@ -16,9 +16,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 from inputs import ring, write_all
 
 from tmlattice import diagnose, load_ring, read_measurement
-from tmlattice.diagnosis.dense import fit_steps
-from tmlattice.diagnosis.families import MonitorGain, Trial
-from tmlattice.diagnosis.fields import VerticalFocusing
+from tmlattice.diagnosis.families.fields import VerticalFocusing
+from tmlattice.diagnosis.families.steps import MonitorGain, Trial
+from tmlattice.diagnosis.response.dense import fit_steps
 from tmlattice.observe.orbit_response import response_data
 from tmlattice.observe.split import split_columns
 

@@ -95,14 +95,14 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
     if isinstance(measurement, Measurement):
         return diagnose_trajectories(ring, measurement, **options)
     if isinstance(measurement, OrbitResponse) and options.get("reference") is not None:
-        from tmlattice.diagnosis.before_after import diagnose_change
+        from tmlattice.diagnosis.response.before_after import diagnose_change
 
         before = options.pop("reference")
         if options.pop("missing", False):
             raise MeasurementError("the option 'missing' has no meaning beside a reference")
         return diagnose_change(ring, before, measurement, **options)
     if isinstance(measurement, OrbitResponse):
-        from tmlattice.diagnosis.response import diagnose_response
+        from tmlattice.diagnosis.response.procedure import diagnose_response
 
         options.pop("reference", None)
         return diagnose_response(ring, measurement, **options)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
-from tmlattice.diagnosis.first_guess import BETTER, Guess, elsewhere
+from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
 from tmlattice.diagnosis.stored_doctor import StoredData, stored_checks
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import MeasurementError, TmlatticeError

@@ -11,8 +11,8 @@ from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.remedies import credible as credible_remedies
 from tmlattice.diagnosis.remedies import remedies_of, remedy_of
+from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
-from tmlattice.diagnosis.state import State
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement

@@ -27,9 +27,9 @@ from tmlattice.observe.data import Data
 from tmlattice.optics import matrix_tunes
 
 if TYPE_CHECKING:
-    from tmlattice.diagnosis.dense import Step
-    from tmlattice.diagnosis.missing import Weighed
-    from tmlattice.diagnosis.reasons import Reasons
+    from tmlattice.diagnosis.response.dense import Step
+    from tmlattice.diagnosis.response.missing import Weighed
+    from tmlattice.diagnosis.response.reasons import Reasons
     from tmlattice.diagnosis.suspects import Suspect
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.dispersion import errors_beside
+from tmlattice.diagnosis.families.dispersion import errors_beside
 from tmlattice.diagnosis.result import Diagnosis, JointView, ResponseView
 from tmlattice.effects import Cause, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from tmlattice.diagnosis.dense import Step
-from tmlattice.diagnosis.reasons import Reason
+from tmlattice.diagnosis.response.dense import Step
+from tmlattice.diagnosis.response.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import Cause
 from tmlattice.report.amounts import all_of, amount_text, numbers, words

@@ -1,0 +1,197 @@
+"""Families of the kicks that a closed orbit has: what they add to the dispersion, see `beam.kicks`.
+
+Dispersion that no gradient makes would else draw the gradients astray: the RF's orbit is read as
+well as any, and a step of it is large. One kick looks like another one, so the numbers are those of
+patterns: as many as the monitors tell apart, each as large as independent kicks make it. They are
+taken in the design's optics, for what they stand for is not known any better.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.kicks import dispersion_behind, dispersion_of_kicks, energy_of_way
+from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.inference.priors import Group
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+
+Array = NDArray[np.float64]
+
+LEAST = 3e-3
+"""Share of the strongest pattern below which a weaker one is left out."""
+USUAL = 1e-4
+"""rad: of the kicks of a ring that was aligned to some tenths of a millimetre."""
+
+
+class Patterns(NamedTuple):
+    """Of independent kicks of one size, the strongest first; none where no RF's orbit was read.
+
+    Attributes:
+        rf: of the RF's orbit, m/rad, [pattern, monitor].
+        at_correctors: of the dispersion at those that kick in the plane, 0 at the others, m per
+            relative energy and rad, [pattern, corrector].
+        kicks: that make them, of a size of 1, [pattern, source].
+    """
+
+    rf: Array
+    at_correctors: Array
+    kicks: Array
+
+
+def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
+    """What independent kicks of one size make of the dispersion, as many as monitors tell apart."""
+    data, model = at.data, at.model
+    if not np.isfinite(data.orbits[-1, :, plane]).any():
+        return Patterns(*(np.zeros((0, n)) for n in (len(data.at), len(data.kicks) - 1, 0)))
+    shown = dispersion_of_kicks(model, data.kicks[-1], plane)[data.at]
+    shapes, size, kicks = np.linalg.svd(shown, full_matrices=False)
+    kept = size > LEAST * size[:1]
+    layers = model.columns(data.measured.correctors).layer
+    behind = kicks[kept] @ dispersion_behind(model, layers, plane).T
+    own = behind * (data.plane[:-1] == plane)
+    return Patterns((shapes[:, kept] * size[kept]).T, own, kicks[kept])
+
+
+class _Kicks(Family):
+    per, trust = "ring", 1e-3
+    plane: ClassVar[int]
+
+    def patterns(self, data: ResponseData) -> Patterns:
+        """In the design."""
+        read = bool(np.isfinite(data.orbits[-1, :, self.plane]).any())
+        names = tuple(data.measured.correctors)
+        planes = data.plane.tobytes()
+        key = (self.name, data.at.tobytes(), float(data.kicks[-1]), read, names, planes)
+        memory = data.ring.memory
+        if key not in memory:
+            memory[key] = patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
+        found: Patterns = memory[key]
+        return found
+
+    def size(self, data: ResponseData) -> int:
+        """Of the patterns."""
+        return len(self.patterns(data).rf)
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of independent kicks."""
+        return [Group(self.name, np.eye(self.size(data)), USUAL)]
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """Of the RF's orbit, and of the correctors' by the energy, see `beam.kicks.by_energy`."""
+        data, model, patterns = at.data, at.model, self.patterns(at.data)
+        names = data.measured.correctors
+        read = data.plane_of(self.block)[:-1]
+        more = energy_of_way(model)
+        energy = model.columns(names).start[:, 5] + more * at.errors.at_correctors
+        dispersion = model.rf_response()[data.at] / model.rf_start[5]
+        dispersion = dispersion + at.errors.dispersion / data.energy_of_rf
+        kicks = data.kicks[:-1] * (1 + at.errors.calibration[:-1])
+        out = np.zeros((len(values), *data.shape))
+        out[:, -1] = patterns.rf
+        own = np.flatnonzero(read == self.plane)  # whose orbit is read where the kicks act
+        by_monitors = kicks[own] * energy[own]
+        out[:, own] = by_monitors[:, None] * (patterns.rf / data.energy_of_rf)[:, None]
+        by_correctors = more * kicks * patterns.at_correctors
+        out[:, :-1] += by_correctors[:, :, None] * dispersion.T[read]
+        out *= at.gain(self.block)
+        return out
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """Beside what the ring makes."""
+        patterns = self.patterns(data)
+        more = np.zeros((len(data.at), 2))
+        more[:, self.plane] = values @ patterns.rf
+        return replace(
+            errors,
+            dispersion=errors.dispersion + more,
+            at_correctors=errors.at_correctors + values @ patterns.at_correctors,
+        )
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """Nothing: other kicks make the same dispersion."""
+        return []
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """No effect of the catalogue: kicks that no orbit shows."""
+        return [{} for _ in range(self.size(data))]
+
+
+class HorizontalKicks(_Kicks):
+    """What gradients cannot make of the dispersion."""
+
+    name, effects = "horizontal kicks", ("dipole_field",)
+    block, variable, plane = 0, "horizontal kicks", 0
+    title = "kicks in the dispersion"
+
+
+class VerticalKicks(_Kicks):
+    """What skew gradients cannot make of the vertical dispersion."""
+
+    name, effects = "vertical kicks", ("dipole_roll",)
+    block, variable, plane = 1, "vertical kicks", 1
+    title = "kicks in the vertical dispersion"
+
+
+def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
+    """A sentence for each plane in which the RF's orbit has something that no gradient makes.
+
+    Args:
+        values: that were found, by variable.
+        data: the response.
+    """
+    for family, gradient in ((HorizontalKicks(), "gradient"), (VerticalKicks(), "skew gradient")):
+        own = values.get(family.variable, np.zeros(0))
+        if own.any():
+            size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2))
+            yield (
+                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} no {gradient} "
+                "makes: kicks of the closed orbit do (errors of bends, displaced quadrupoles, "
+                "correctors), which the data do not tell apart"
+            )
+
+
+def dispersion_beside(
+    values: Mapping[str, Array], data: ResponseData
+) -> dict[str, tuple[float, float]]:
+    """What was found beside the lattice's dispersion, at all monitors and correctors of the ring, m
+    per relative energy in x and y; empty where nothing was.
+
+    Args:
+        values: that were found, by variable.
+        data: the response.
+    """
+    found = [
+        (family, values[family.variable])
+        for family in (HorizontalKicks(), VerticalKicks())
+        if values.get(family.variable, np.zeros(0)).any()
+    ]
+    if not found:
+        return {}
+    model = data.design
+    columns = model.columns()
+    names = [*model.monitors, *columns.names]
+    dispersion = np.zeros((len(names), 2))
+    for family, own in found:
+        kicks = own @ family.patterns(data).kicks
+        dispersion[:, family.plane] = np.concatenate([
+            dispersion_of_kicks(model, data.kicks[-1], family.plane) / data.energy_of_rf,
+            dispersion_behind(model, columns.layer, family.plane),
+        ]) @ kicks  # fmt: skip
+    return {name: (float(x), float(y)) for name, (x, y) in zip(names, dispersion, strict=True)}
+
+
+def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
+    """The design with what `dispersion_beside` says, as other correctors and monitors have it."""
+    none = Errors.none(data)
+    if not dispersion:
+        return none
+    ring, nothing = data.ring, (0.0, 0.0)
+    monitors, correctors = (
+        np.array([dispersion.get(ring[name].name, nothing) for name in names])
+        for names in (data.measured.monitors, data.measured.correctors)
+    )
+    own = correctors[np.arange(len(correctors)), data.plane[:-1]]
+    return replace(none, dispersion=monitors * data.energy_of_rf, at_correctors=own)

@@ -1,0 +1,258 @@
+"""Families of errors of fields in the ring: gradients, skew gradients, vertical focusing.
+
+A magnet that stands in pieces is one number of a family.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.family import TAILS, Family, Told
+from tmlattice.diagnosis.families.magnets import magnets, straights, supplied_alike
+from tmlattice.effects import Cause
+from tmlattice.inference.priors import Group
+from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.slices import stem
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+
+Array = NDArray[np.float64]
+
+LARGEST_GRADIENT = 0.02
+"""Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
+LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
+
+
+class _Magnets(Family):
+    per = "ring"
+    effect: ClassVar[str]
+
+    @abstractmethod
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Of each magnet: its pieces, and what each of them has of the magnet's number."""
+
+    def places(self, data: ResponseData) -> list[str]:
+        """Each magnet's first piece."""
+        return [next(iter(pieces)) for pieces in self.shares(data)]
+
+    def size(self, data: ResponseData) -> int:
+        return len(self.shares(data))
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        shares = self.shares(at.data)
+        pairs = [(self.effect, place) for pieces in shares for place in pieces]
+        gain, slopes = at.gain(self.block), at.slopes_of(self.block, pairs)
+        out = np.empty((len(shares), *at.data.shape))
+        for own, pieces, unit in zip(out, shares, self.units(values), strict=True):
+            first, *others = pieces.values()
+            np.multiply(next(slopes), first * unit * gain, out=own)
+            for share in others:
+                np.add(own, next(slopes) * (share * unit * gain), out=own)
+        return out
+
+    def units(self, values: Array) -> Array:
+        """Of each number: of how much of what the effect is relative to."""
+        return np.ones(len(values))
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        causes = tuple(
+            Cause(self.effect, place, share * float(value))
+            for pieces, value in zip(self.shares(data), values, strict=True)
+            for place, share in pieces.items()
+            if value
+        )
+        return replace(errors, ring=(*errors.ring, *causes))
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """Of every piece."""
+        return [
+            (Cause(self.effect, place, share * float(value)), abs(share) * float(error))
+            for pieces, value, error in zip(self.shares(data), values, sigma, strict=True)
+            for place, share in pieces.items()
+        ]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Of every piece."""
+        return [
+            {(self.effect, place): share for place, share in pieces.items()}
+            for pieces in self.shares(data)
+        ]
+
+
+class QuadrupoleGradient(_Magnets):
+    """Gradients of single quadrupoles, relative to the design's."""
+
+    name = effect = "quadrupole_gradient"
+    effects: ClassVar[tuple[str, ...]] = ("quadrupole_gradient",)
+    block, variable, trust = 0, "gradient", 0.01
+
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Those that have a gradient."""
+        return [{e.name: 1.0 for e in own} for own in magnets(data.ring, ("quadrupole",), True)]
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        eye = np.eye(self.size(data))
+        return [Group(self.name, eye, 3e-3, TAILS, most=LARGEST_GRADIENT)]
+
+    def units(self, values: Array) -> Array:
+        """Relative to the design's strength, not to the one found."""
+        return np.asarray(1 / (1 + values))
+
+
+class FamilyGradient(QuadrupoleGradient):
+    """What quadrupoles of a family share: their supply's error."""
+
+    name = "family_gradient"
+    effects: ClassVar[tuple[str, ...]] = ("family_gradient",)
+
+    def count(self, data: ResponseData) -> int:
+        """Families."""
+        return len(self._families(data)[0])
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of families."""
+        return [Group("quadrupole_gradient of families", self._families(data)[1], 0.01)]
+
+    def _families(self, data: ResponseData) -> tuple[list[str], Array]:
+        return supplied_alike(magnets(data.ring, ("quadrupole",), powered=True))
+
+
+class _Thin(_Magnets):
+    """Integrated fields, each piece with its share of the magnet's length."""
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("quadrupole",))
+
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        out = []
+        for own in self._places(data.ring):
+            whole = sum(e.length for e in own)
+            out.append({e.name: e.length / whole if whole else 1 / len(own) for e in own})
+        return out
+
+
+class BendGradient(_Magnets):
+    """Gradients of bends that have one, relative to the design's: one number a type."""
+
+    name = effect = "bend_gradient"
+    effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
+    block, variable, trust = 0, "bend_gradient", 0.01
+
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Of all bends of a type: one alone would run away against the quadrupoles beside it."""
+        types: dict[str, dict[str, float]] = {}
+        for own in magnets(data.ring, ("bend",), powered=True):
+            types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
+        return list(types.values())
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each type."""
+        return [Group(self.name, np.eye(self.size(data)), 3e-3)]
+
+
+class SkewGradient(_Thin):
+    """Skew gradients in quadrupoles."""
+
+    name = effect = "skew_gradient"
+    effects: ClassVar[tuple[str, ...]] = ("skew_gradient",)
+    block, variable, trust = 1, "skew", 3e-4  # 1/m: larger steps move the tunes
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 3e-4, TAILS, most=LARGEST_SKEW)]
+
+
+class OtherGradient(_Thin):
+    """Gradients beside the quadrupoles: of the orbit in sextupoles, of wigglers."""
+
+    name = effect = "gradient_absolute"
+    effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
+    block, variable, trust = 0, "other", 3e-3
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("sextupole", "wiggler"))
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
+
+
+class VerticalFocusing(_Thin):
+    """Of insertion devices, in wigglers and in straights."""
+
+    name = effect = "vertical_focusing"
+    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    block, variable, trust = 0, "device", 3e-3
+
+    @property
+    def title(self) -> str:
+        """Dipoles have it too."""
+        return f"{self.effect} in straights"
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return self._devices(ring, straights(ring))
+
+    def _devices(self, ring: Ring, ways: Sequence[Element]) -> list[tuple[Element, ...]]:
+        devices = [*magnets(ring, ("wiggler",)), *((e,) for e in ways)]
+        return sorted(devices, key=lambda own: own[0].s)
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
+
+    def lowest(self, data: ResponseData) -> Array | float:
+        """A device focuses, whatever its field; only one that the design has may have too little of
+        it. What else would focus here pulls against the quadrupoles beside it."""
+        kinds = [data.ring[place].kind for place in self.places(data)]
+        return np.where([kind == "wiggler" for kind in kinds], -np.inf, 0.0)
+
+
+class FocusingChange(VerticalFocusing):
+    """A device that was opened focuses less, and one that the lattice has as bends has no other
+    number here."""
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return self._devices(ring, straights(ring, beside=True))
+
+    def lowest(self, data: ResponseData) -> Array | float:
+        """Of any sign."""
+        return -np.inf
+
+
+class EdgeFocusing(_Thin):
+    """Vertical focusing of dipoles, by their edges and fringe fields: one number a type.
+
+    Both edges of a rectangular magnet focus by angle^2 / length together, and a sector's not at
+    all: hardly more than that is wrong with them, and next to nothing where angles are small.
+    """
+
+    name, effect = "edge_focusing", "vertical_focusing"
+    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    block, variable, trust = 0, "edge", 3e-3
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("bend",))
+
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """Of all dipoles of a type: what makes one of them alone is no edge, but something beside
+        it that would be made up with."""
+        types: dict[str, dict[str, float]] = {}
+        for pieces in super().shares(data):
+            types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
+        return list(types.values())
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each type, as a share of what the edges of a rectangular one do."""
+        ring = data.ring
+        largest = []
+        for pieces in self.shares(data):
+            bends = [own for own in self._places(ring) if own[0].name in pieces]
+            # magnet by magnet: the poles of a wiggler bend both ways
+            squares = sum(sum(e.angle for e in own) ** 2 for own in bends)
+            length = sum(e.length for own in bends for e in own)
+            largest.append(squares / length if length else 0.0)
+        return [Group(self.name, np.diag(largest), 0.1, most=1.0)]

@@ -1,0 +1,301 @@
+"""Families of errors that a dense fit of an orbit response may have: each is one object.
+
+To add one, write a class with its places, prior, rows, how its values are put among the errors and
+how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`); and
+name it in `STEPS`, which says when it is tried.
+
+Families that move the same numbers (single gradients, and gradients of whole families) share a
+`variable`: their priors add up.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
+from tmlattice.diagnosis.families.family import TAILS, Family, Told
+from tmlattice.diagnosis.families.fields import (
+    BendGradient,
+    EdgeFocusing,
+    FamilyGradient,
+    FocusingChange,
+    OtherGradient,
+    QuadrupoleGradient,
+    SkewGradient,
+    VerticalFocusing,
+)
+from tmlattice.diagnosis.families.magnets import families
+from tmlattice.effects import Cause, expected_spread
+from tmlattice.inference.priors import Group
+from tmlattice.observe.orbit_response import (
+    DELTA,
+    Errors,
+    Hypothesis,
+    Predicted,
+    ResponseData,
+)
+
+Array = NDArray[np.float64]
+
+WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
+"""By how much a beam's energy spread may be more than radiation makes it (instabilities, wigglers
+that the lattice has no field of), as rms; and what is usual where radiation says nothing."""
+
+
+class _Monitors(Family):
+    per = "monitor"
+
+    def size(self, data: ResponseData) -> int:
+        return 2 * len(data.at)
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        return at.data.pick(at.kicked)
+
+    def _own(self, data: ResponseData) -> Group:
+        return Group(self.name, np.eye(self.size(data)), 0.01, TAILS)
+
+
+class MonitorGain(_Monitors):
+    """Gains, x and y of each monitor: free but for a mean of each plane."""
+
+    name, effects = "monitor_gain", ("monitor_gain_x", "monitor_gain_y")
+    block, variable, trust, gross = 0, "gain", 0.01, 0.5
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Each its own, and those of a plane alike."""
+        alike = np.zeros((self.size(data), 2))
+        alike[0::2, 0] = alike[1::2, 1] = 1
+        return [self._own(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """On the diagonals."""
+        monitors = errors.monitors.copy()
+        monitors[:, [0, 1], [0, 1]] = 1 + values.reshape(-1, 2)
+        return replace(errors, monitors=monitors)
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """All of x, then all of y."""
+        names = data.measured.monitors
+        return [
+            (Cause(f"monitor_gain_{p}", name, float(values[2 * i + j])), float(sigma[2 * i + j]))
+            for j, p in enumerate("xy")
+            for i, name in enumerate(names)
+        ]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each its own."""
+        return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
+
+
+class MonitorRoll(_Monitors):
+    """What each plane of a monitor reads of the other: roll and coupling."""
+
+    name, effects = "monitor_roll", ("monitor_roll", "monitor_coupling")
+    block, variable, trust = 1, "mixing", 0.02
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Each its own."""
+        return [self._own(data)]
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """Beside the diagonals."""
+        monitors = errors.monitors.copy()
+        monitors[:, [0, 1], [1, 0]] = values.reshape(-1, 2)
+        return replace(errors, monitors=monitors)
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """x reads (coupling + roll) y, y reads (coupling - roll) x."""
+        gain = np.diagonal(errors.monitors, axis1=1, axis2=2)
+        x, y = (values.reshape(-1, 2) / gain).T
+        spread = np.hypot(*sigma.reshape(-1, 2).T) / 2
+        return [
+            (Cause(effect, name, float(amount[i])), float(spread[i]))
+            for i, name in enumerate(data.measured.monitors)
+            for effect, amount in zip(self.effects, ((x - y) / 2, (x + y) / 2), strict=True)
+        ]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """What x reads of y, and y of x."""
+        roll, coupling = self.effects
+        return [
+            {(roll, name): side / 2, (coupling, name): 0.5}
+            for name in data.measured.monitors
+            for side in (1, -1)
+        ]
+
+
+class _Columns(Family):
+    per = "column"
+
+    def size(self, data: ResponseData) -> int:
+        return len(data.kicks)
+
+    def count(self, data: ResponseData) -> int:
+        return len(data.kicks) - 1  # the RF's step is known
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each its own; of the RF there is none."""
+        own: list[dict[Hypothesis, float]] = [
+            {(self.name, name): 1.0} for name in data.measured.correctors
+        ]
+        return [*own, {}]
+
+    def _told(self, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        names = data.measured.correctors
+        return [
+            (Cause(self.name, name, float(v)), float(s))
+            for name, v, s in zip(names, values, sigma, strict=False)
+        ]
+
+
+class CorrectorCalibration(_Columns):
+    """Each its own, and what correctors of a family share."""
+
+    name, effects = "corrector_calibration", ("corrector_calibration",)
+    block, variable, trust, gross = 0, "calibration", 0.01, 0.3
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each, and of families."""
+        kinds = families([*data.measured.correctors, "\0"])[1]
+        return [
+            Group(self.name, np.eye(self.size(data)), 0.02, TAILS),
+            Group(f"{self.name} of families", kinds, 0.05),
+        ]
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """The column itself."""
+        out = at.gain(0) * at.data.pick(at.beam)
+        out[-1] = 0
+        return out
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """As it stands."""
+        return replace(errors, calibration=values)
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """As it stands."""
+        return self._told(values, sigma, data)
+
+
+class CorrectorRoll(_Columns):
+    """Rolls of correctors."""
+
+    name, effects = "corrector_roll", ("corrector_roll",)
+    block, variable, trust, gross = 1, "roll", 0.02, 0.1
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 0.01, TAILS)]
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """The kick in the other plane."""
+        return np.asarray(at.gain(1) * at.data.pick(at.across, 1))
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """The kick in the other plane, as a share of what the corrector is told."""
+        return replace(errors, roll=values)
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """As a share of what it kicks."""
+        return self._told(values / (1 + errors.calibration), sigma, data)
+
+
+class EnergySpread(Family):
+    """Of the beam: mean square energy deviation, in units of `DELTA` squared."""
+
+    name, effects = "energy_spread", ("energy_spread",)
+    block, per, variable, trust = 0, "ring", "spread", 10.0
+
+    def size(self, data: ResponseData) -> int:
+        """One."""
+        return 1
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """As much as it can be."""
+        return [Group(self.name, np.eye(1), (self._most(data) / DELTA) ** 2, fixed=True)]
+
+    def _most(self, data: ResponseData) -> float:
+        return WIDENED * (expected_spread(data.ring) or UNKNOWN_SPREAD)
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """The second derivative by the energy."""
+        scale = (1 + at.errors.calibration)[:, None, None]
+        return np.asarray((at.gain(0) * at.data.pick(at.curved * scale))[None])
+
+    def lowest(self, data: ResponseData) -> Array | float:
+        """A square is not negative."""
+        return 0.0
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """As it stands."""
+        return replace(errors, spread=float(values[0]))
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """The relative rms; nothing where it is zero."""
+        if not values[0] > 0:
+            return []
+        amount = DELTA * float(np.sqrt(values[0]))
+        return [(Cause("energy_spread", None, amount), DELTA**2 * float(sigma[0]) / (2 * amount))]
+
+    def doubt(self, values: Array, data: ResponseData) -> str | None:
+        """More than a beam has stands for something else of second order."""
+        rms, most = DELTA * float(np.sqrt(values[0])), self._most(data)
+        if not rms > most:
+            return None
+        usual = "radiation makes" if expected_spread(data.ring) else "a beam has usually"
+        return (
+            f"an energy spread of {100 * rms:.2g} % would be asked for, where {usual} "
+            f"{100 * most / WIDENED:.2g} %: it stands for something else, and is refused"
+        )
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """By the square of the amount."""
+        return [{("energy_spread", None): DELTA**2}]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Families that are tried together.
+
+    Attributes:
+        families: the first one's block says who judges.
+        own, across: rounds in-plane, and before them rounds of the other plane.
+    """
+
+    families: tuple[Family, ...]
+    own: int
+    across: int
+
+
+WITHOUT_KICKS = (
+    Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
+    Trial((MonitorGain(),), 2, 0),
+    Trial((QuadrupoleGradient(),), 4, 0),
+    Trial((BendGradient(),), 2, 0),
+    Trial((VerticalFocusing(),), 2, 0),
+    Trial((EdgeFocusing(),), 2, 0),
+    Trial((EnergySpread(),), 2, 0),
+    Trial((MonitorRoll(),), 0, 1),
+    Trial((CorrectorRoll(),), 0, 1),
+    Trial((SkewGradient(),), 2, 2),
+)
+"""What a lattice with its monitors and correctors can have wrong. Skew gradients move the tunes to
+second order, which the gradients then take back."""
+
+STEPS = (
+    *WITHOUT_KICKS,
+    Trial((HorizontalKicks(),), 2, 0),
+    Trial((VerticalKicks(),), 0, 2),
+)
+"""What is tried, one after another."""
+
+CHANGES = (
+    Trial((CorrectorCalibration(),), 3, 0),
+    Trial((MonitorGain(),), 2, 0),
+    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()), 4, 0),
+    Trial((MonitorRoll(),), 0, 1),
+    Trial((CorrectorRoll(),), 0, 1),
+    Trial((SkewGradient(),), 2, 2),
+)
+"""What may have changed between two measurements of one ring."""

@@ -1,0 +1,404 @@
+"""What changed between two orbit responses of one machine, without knowing the machine.
+
+>>> change = diagnose_change(ring, before, after)
+>>> [(own.effect, own.element, own.amount, own.amount_sigma) for own in change.findings]
+
+The ring, its monitors and its correctors are fitted to the first measurement; what that leaves is
+in both and cancels in their difference (`observe.response_change`), which is fitted in turn. Drifts
+of monitors and correctors, whose sizes are learnt, are nuisances. Magnets scatter, too: how far
+those of one supply differ in their change is learnt, and is in the error of every amount. Findings
+are supplies (magnets whose names begin alike), single magnets, gradients in sextupoles and wigglers
+(of the orbit there), and insertion devices: by evidence, see `inference.levels`.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.magnets import families
+from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
+from tmlattice.diagnosis.findings import finding_of, with_consequences
+from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
+from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.first_guess import begun
+from tmlattice.diagnosis.response.judges import score
+from tmlattice.diagnosis.response.left_open import left_open
+from tmlattice.diagnosis.response.procedure import as_diagnosis, assumed_of, provenance, trials_of
+from tmlattice.diagnosis.response.rounds import linear, marginal, settle
+from tmlattice.diagnosis.response.state import State, begin, bend, jump
+from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
+from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
+from tmlattice.effects.effect import FamilyEffect
+from tmlattice.errors import TmlatticeError
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.levels import CLEAR, Levels, Reason
+from tmlattice.inference.normal import solve
+from tmlattice.inference.rivals import Detection
+from tmlattice.lattice import Ring
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.orbit_response import Predicted, ResponseData, response_data
+from tmlattice.observe.response_change import alike, response_change
+from tmlattice.observe.split import Split, split_columns
+
+Array = NDArray[np.float64]
+
+MOST = 40
+"""Findings at most: many supplies may be changed on purpose."""
+REPRODUCED = 1e-4
+"""Relative: as well a magnet comes back, and half of it a supply; a smaller change is none."""
+STRAY = 3e-5
+"""1/m: as well a gradient beside the quadrupoles comes back: the orbit in a sextupole moves."""
+USUAL = 1e-2
+"""Prior rms of a change: relative, or of integrated gradients in 1/m."""
+ANY = 6.0
+"""rms of the logarithm of a change's size about its first guess: most families did not change."""
+EVERYWHERE = 5e-4
+"""Relative scatter of magnets from which a change of all of them is told though none stands out."""
+ALONE = 2.0
+"""Log odds of a supply that changed against one of its magnets alone, or a field elsewhere."""
+LEAST_NOISE = 0.2
+"""Share of the stated noise that two measurements differ by at least."""
+DRIFT, OUTSTANDING = 0.03, 8.0
+"""A monitor or a corrector is told where it changed by more than this, and by so many times as much
+as others do."""
+
+
+def diagnose_change(
+    ring: Ring,
+    before: OrbitResponse,
+    after: OrbitResponse,
+    *,
+    holdout: float = 0.2,
+    effects: Sequence[str] | None = None,
+    max_effects: int = MOST,
+    false_alarm: float = DEFAULT.false_alarm,
+    assume: Sequence[str] = (),
+    seed: int = 0,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> Diagnosis:
+    """What changed from one response to the other.
+
+    Args:
+        ring: the design.
+        before, after: of the same machine; correctors and monitors that one of them lacks are left
+            out.
+        holdout: share of the correctors that judge the gap; amounts are fitted to all of them.
+        effects: only changes of these are looked for.
+        max_effects: findings at most.
+        false_alarm: chance that two measurements of an unchanged machine are said to differ.
+        assume: what was written down wrongly everywhere in both, see `measurement.assume`.
+        seed: of the split.
+        progress: called with the name of each stage.
+
+    Returns:
+        Its ring is the one fitted to the first measurement, its steps are of the change.
+
+    Raises:
+        MeasurementError: data that cannot be used, or that are not of one machine.
+        UnknownNameError: an effect, a monitor or a corrector that does not exist.
+        UnstableRingError: no closed orbit.
+    """
+    started = time.perf_counter()
+    trials = trials_of(effects, CHANGES)
+    before, after = (mended(ring, one, assume) for one in (before, after))
+    said = consulted(ring, after, reference=before)
+    said += _lost(before, after)
+    before, after = alike(ring, before, after)
+    first, second = response_data(ring, before), response_data(ring, after)
+    said += assumed_of(after, second)
+    if _same(first, second):
+        trials = []
+        said.append("the two measurements are the same, to the last digit")
+    progress("the reference")
+    rng = np.random.default_rng(seed)
+    fitted = _reference(first, split_columns(first, holdout, rng), WITHOUT_KICKS if trials else ())
+    bad = [name for name, good in zip(before.monitors, fitted.good, strict=True) if not good]
+    if bad:
+        kept = [name for name in before.monitors if name not in bad]
+        said.append(f"monitors left out, bad in the reference: {', '.join(bad)}")
+        first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
+        errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
+    else:
+        errors = fitted.at.errors
+    there, change = response_change(first, errors, second)
+    data = response_data(there, change)
+    split = split_columns(data, holdout, rng)
+    judgement = Judgement(false_alarm=false_alarm)
+    options = {
+        "reference": True, "holdout": holdout,
+        "effects": None if effects is None else list(effects), "max_effects": max_effects,
+        "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
+    }  # fmt: skip
+    asked = changes() if effects is None else effects
+    few = few_causes(data, split, asked, max_effects, judgement, seed, progress, left_open(fitted))
+    if few is not None:
+        causes = tuple(cause for cause, _ in few.told)
+        return as_diagnosis(
+            there, few.fit, few.fit.state.at.errors.ring, few.told,
+            verdict=few.verdict,
+            findings=with_consequences(there, few.findings, causes),
+            warnings=(*said, *few.said),
+            noise_estimated=False,
+            provenance=provenance(ring, options, seed, started),
+        )  # fmt: skip
+    fit = _fit_change(data, split, trials, progress)
+    progress("what changed")
+    whole = _all_columns(fit.state)
+    found = findings_of_change(whole, effects, max_effects, judgement)
+    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in found)
+    told: list[Told] = [
+        (cause, own.amount_sigma or 0.0) for cause, own in zip(causes, found, strict=True)
+    ]
+    have = {(cause.effect, cause.element) for cause in causes}
+    told += [row for row in _drifts(whole) if (row[0].effect, row[0].element) not in have]
+    return as_diagnosis(
+        there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
+        verdict=_verdict(whole, found),
+        findings=with_consequences(there, found, causes),
+        warnings=(*said, *_said(data, fit, whole)),
+        noise_estimated=True,
+        provenance=provenance(ring, options, seed, started),
+    )  # fmt: skip
+
+
+def changes() -> list[str]:
+    """Names of what changes between two measurements: every usual effect, and supplies of families,
+    which one measurement alone does not ask for all of."""
+    families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
+    return list(dict.fromkeys([*modelled(), *families]))
+
+
+def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
+    said = []
+    for what, a, b in (
+        ("correctors", before.correctors, after.correctors),
+        ("monitors", before.monitors, after.monitors),
+    ):
+        alone = sorted({n.casefold() for n in a} ^ {n.casefold() for n in b})
+        if alone:
+            said.append(f"{what} of one measurement alone, left out: {', '.join(alone)}")
+    return said
+
+
+# --- the fits -------------------------------------------------------------------------------------
+def _judged_by_nobody(split: Split) -> Split:
+    """All correctors are fitted, and all of the RF's orbit."""
+    nobody, half = np.zeros_like(split.held), split.half.copy()
+    half[-1] = True
+    return Split(nobody, nobody, half, np.zeros_like(split.inner_rf))
+
+
+def _same(first: ResponseData, second: ResponseData) -> bool:
+    return bool(
+        np.array_equal(first.orbits, second.orbits, equal_nan=True)
+        and np.array_equal(first.kicks, second.kicks)
+    )
+
+
+def _reference(data: ResponseData, split: Split, steps: Sequence[Trial]) -> State:
+    """Everything that a lattice holds, fitted to all of the first measurement: a ring whose
+    dispersion is the measured one, for that is what a changed gradient acts on; kicks would stay
+    behind. The design where that goes astray."""
+    state = replace(begin(data, _judged_by_nobody(split)), exploring=False)
+    try:
+        for _, settled in one_by_one(begun(state, steps), steps):
+            state = settled
+        return settle(bend(jump(state)))
+    except (TmlatticeError, np.linalg.LinAlgError):
+        return state
+
+
+def _fit_change(
+    data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
+) -> DenseFit:
+    """All that may have changed, with the noise that the two measurements have."""
+    design = replace(begin(data, split), exploring=False, guessed=ANY)
+    before = score(design, split.held)
+    steps = [Step.scored("reference", 0, before)]
+    state = design
+    for trial, settled in one_by_one(design, trials, progress):
+        state = settled
+        count = sum(family.count(data) for family in trial.families)
+        title = ", ".join(family.title for family in trial.families)
+        steps.append(Step.scored(title, count, score(state, split.held)))
+    state = settle(bend(jump(state)))
+    state = settle(_learnt_noise(state))
+    after = score(state, split.held)
+    if len(steps) > 1:
+        steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
+    design = _with_noise(design, state.data.noise)
+    return DenseFit(design, state, tuple(steps), (), (score(design, split.held), after))
+
+
+def _learnt_noise(state: State) -> State:
+    """With less noise where two measurements agree better than is stated; where they agree worse,
+    every column's own lack says so."""
+    scales = []
+    data = state.data
+    for block in (0, 1):
+        left = (data.pick(state.at.left, block) / data.noise_of(block))[:-1]
+        left = left[state.fitted[:-1]][:, state.good]
+        left = left[np.isfinite(left)]
+        scales.append(float(np.median(np.abs(left))) / 0.6745 if len(left) else 1.0)
+    lower = float(np.clip(max(scales), LEAST_NOISE, 1.0))
+    return _with_noise(state, lower * data.noise)
+
+
+def _with_noise(state: State, noise: Array) -> State:
+    data = replace(state.data, noise=noise)
+    at = Predicted(data, state.at.errors, state.at.bent)
+    return replace(state, data=data, at=at)
+
+
+def _all_columns(state: State) -> State:
+    """Fitted to the held-out correctors too."""
+    return settle(replace(state, split=_judged_by_nobody(state.split)))
+
+
+# --- what changed ---------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """What may have changed, as causes of amount one, and what each moves."""
+
+    causes: tuple[tuple[str, str], ...]
+    members: Array  # [number, candidate]
+    scatter: Array  # covariance of single numbers, [number, number]
+
+
+def _candidates(state: State, variables: Sequence[str]) -> _Candidates:
+    causes: list[tuple[str, str]] = []
+    blocks: list[Array] = []
+    scatter: list[Array] = []
+    for family in {f.variable: f for f in state.families if f.variable in variables}.values():
+        places = family.places(state.data)  # type: ignore[attr-defined]
+        rms = state.groups[family.name].rms if family.name in state.groups else 0.0
+        own = np.eye(len(places))
+        if isinstance(family, QuadrupoleGradient):
+            kinds, members = families(places)
+            supply = (REPRODUCED / 2) ** 2 * members @ members.T
+            scatter.append(max(rms, REPRODUCED) ** 2 * np.eye(len(places)) + supply)
+            causes += [(FamilyGradient.name, kind) for kind in kinds]
+            own = np.hstack([members, own])
+        else:
+            scatter.append(max(rms, STRAY) ** 2 * np.eye(len(places)))
+        effect = QuadrupoleGradient.name if isinstance(family, QuadrupoleGradient) else family.name
+        causes += [(effect, place) for place in places]
+        blocks.append(own)
+    from scipy.linalg import block_diag
+
+    return _Candidates(tuple(causes), block_diag(*blocks), block_diag(*scatter))
+
+
+def findings_of_change(
+    state: State, effects: Sequence[str] | None, most: int, judgement: Judgement
+) -> tuple[Finding, ...]:
+    """Supplies, magnets and devices that changed, then monitors and correctors that stand out."""
+    found: list[Finding] = []
+    for block in (0, 1):
+        variables = [f.variable for f in state.of_block(block) if f.per == "ring"]
+        variables = list(dict.fromkeys(variables))
+        if not variables:
+            continue
+        there = linear(state, block)
+        information, pull = marginal(there, variables)
+        among = _candidates(state, variables)
+        wider = _widened(state, block)
+        levels = Levels(
+            information / wider**2, pull / wider**2, among.members, among.scatter,
+            np.full(len(among.causes), USUAL),
+            np.array([0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]),
+        )  # fmt: skip
+        chosen = levels.choose(most)
+        found += [
+            _finding(state.data.ring, among.causes, own, judgement)
+            for own in levels.reasons(chosen)
+        ]
+    found += _outstanding(state, judgement)
+    wanted = found if effects is None else [own for own in found if own.effect in effects]
+    return tuple(sorted(wanted, key=lambda own: -own.detection.statistic)[:most])
+
+
+def _widened(state: State, block: int) -> float:
+    """By what errors grow, for the noise was learnt from readings that were fitted."""
+    there = linear(state, block)
+    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    fitted = float(np.sum(1 - np.diag(posterior.covariance)))
+    count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
+    return float(np.sqrt(count / max(count - fitted, count / 4)))
+
+
+def _finding(
+    ring: Ring, names: Sequence[tuple[str, str]], own: Reason, judgement: Judgement
+) -> Finding:
+    chance = np.array([p for _, p in own.rivals])
+    causes = [Cause(*names[c], own.amount) for c, _ in own.rivals]
+    shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
+    seen = Detection(own.statistic, CLEAR, min(1.0, len(names) * chi2.sf(own.statistic, 1)))
+    return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)
+
+
+def _drifts(state: State) -> list[Told]:
+    """What monitors and correctors do otherwise than before, with errors."""
+    found: list[Told] = []
+    for block in (0, 1):
+        own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
+        if not own:
+            continue
+        there = linear(state, block)
+        posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        for name, family in own.items():
+            sigma = posterior.sigma[there.where[name]]
+            found += family.told(state.at.errors, state.values[name], sigma, state.data)
+    return found
+
+
+def _outstanding(state: State, judgement: Judgement) -> list[Finding]:
+    """Monitors and correctors whose change is another thing than everybody's drift."""
+    told = _drifts(state)
+    found = []
+    for effect in dict.fromkeys(cause.effect for cause, _ in told):
+        rows = [row for row in told if row[0].effect == effect]
+        usual = float(np.median([abs(cause.amount) for cause, _ in rows])) / 0.6745
+        for cause, sigma in rows:
+            size = abs(cause.amount)
+            if size > max(DRIFT, OUTSTANDING * usual) and size > 5 * sigma:
+                square = (size / max(sigma, 1e-12)) ** 2
+                seen = Detection(square, CLEAR, min(1.0, len(rows) * chi2.sf(square, 1)))
+                found.append(
+                    finding_of(state.data.ring, [cause], np.ones(1), [cause], sigma, seen,
+                               judgement.mass)
+                )  # fmt: skip
+    return found
+
+
+def _verdict(state: State, found: Sequence[Finding]) -> str:
+    if found:
+        return max((own.verdict for own in found), key=VERDICTS.index)
+    group = state.groups.get(QuadrupoleGradient.name)
+    return "distributed" if group is not None and group.rms > EVERYWHERE else "nothing"
+
+
+def _said(data: ResponseData, fit: DenseFit, state: State) -> list[str]:
+    """How well two measurements agree, and what drifted."""
+    left = data.pick(state.at.left)[:-1][:, state.good]
+    agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
+    stated = 1e6 * float(np.median(data.noise))
+    said = [
+        f"with what changed the two measurements agree to {agree:.2g} µm (their stated noise makes "
+        f"{stated:.2g})"
+    ]
+    group = state.groups.get(QuadrupoleGradient.name)
+    if group is not None:
+        said.append(
+            f"magnets of one supply differ in their change by {group.rms:.1g} (rms, relative), "
+            f"which is in the errors; changes below {REPRODUCED:g} are taken for none"
+        )
+    return said

@@ -1,0 +1,443 @@
+"""The dense fit of an orbit response: families of errors, step by step, judged on held-out data.
+
+>>> fit = fit_steps(data, split)
+>>> [(step.effect, step.heldout_rms_in_plane) for step in fit.steps]
+
+Gradients and skew gradients are fitted together, because skew ones move the tunes.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.steps import STEPS, Trial
+from tmlattice.diagnosis.response.first_guess import begun, strange
+from tmlattice.diagnosis.response.jitter import MOSTLY, Jitter, sought
+from tmlattice.diagnosis.response.judges import (
+    WORTH,
+    Chi2,
+    Score,
+    against,
+    in_favour,
+    inner,
+    lost,
+    score,
+)
+from tmlattice.diagnosis.response.odd_readings import robust
+from tmlattice.diagnosis.response.odd_steps import beside, odd_steps
+from tmlattice.diagnosis.response.rf_by_others import rf_by_others
+from tmlattice.diagnosis.response.rounds import (
+    Evidence,
+    Linear,
+    evidence_of,
+    linear,
+    linear_evidence,
+    settle,
+)
+from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.state import (
+    State,
+    allow,
+    begin,
+    bend,
+    forbid,
+    jump,
+)
+from tmlattice.diagnosis.response.stated import stated
+from tmlattice.errors import TmlatticeError
+from tmlattice.inference.normal import Posterior, solve
+from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.split import Split
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
+
+LEAST = 5.0
+"""Log evidence that a step has to have."""
+SPOILT = 0.05
+"""By how much the judges' figures may rise with all families together."""
+ASTRAY, NEAR = 1.2, 1e-3
+"""So many times what the design leaves of the typical column's square no result may leave; or this
+share of it, if that is more."""
+SURE = 100.0
+"""Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
+FIRST, ROUGH = 4, 0.03
+"""Rounds of each block after a family came in, or went, and what one has to gain for another."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """The gap with what has been allowed so far.
+
+    Attributes:
+        effect: what was tried; the first is "design".
+        parameters: how many it has.
+        heldout_rms_in_plane, heldout_rms_coupling: m, over held-out correctors.
+        heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
+        heldout_rms_roll: coupling, with the roll of each held-out corrector from the monitors that
+            gave its kick, m; NaN before rolls are fitted.
+        heldout_chi2_per_dof: in-plane, by the readings' noise.
+        dispersion_rms: of the RF's orbit in x on the half of the monitors not fitted, m.
+        kept: whether it helped those who choose; the figures of one that was not are its own.
+    """
+
+    effect: str
+    parameters: int
+    heldout_rms_in_plane: float
+    heldout_rms_coupling: float
+    heldout_chi2_per_dof: float
+    dispersion_rms: float
+    heldout_rms_position: float = float("nan")
+    heldout_rms_roll: float = float("nan")
+    kept: bool = True
+
+    @classmethod
+    def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
+        """With what the judges say."""
+        return cls(
+            effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
+            s.roll,
+        )  # fmt: skip
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {name: value for name, value in vars(self).items() if name != "kept"}
+
+
+def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
+    """Of the fitted readings, by their noise alone: in-plane, across, of the RF."""
+    data = state.data
+    out = []
+    use = ~state.split.held
+    for block in (0, 1):
+        pull = data.pick(state.at.left, block) / data.noise_of(block)
+        squares = (pull[:-1][use[:-1]][:, state.good]) ** 2
+        out.append(Chi2(float(np.nansum(squares)), int(np.isfinite(squares).sum())))
+        if block == 0:
+            rf = pull[-1][state.split.half[-1] & state.good] ** 2
+    out.append(Chi2(float(np.nansum(rf)), int(np.isfinite(rf).sum())))
+    return out[0], out[1], out[2]
+
+
+# --- the steps ------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class DenseFit:
+    """Ordered steps, and where they end.
+
+    Attributes:
+        design, state: before and after.
+        steps: those kept; the first is the design's, the last the result's.
+        refused: those that did not help, or spoilt the RF's response.
+        heldout: what held-out correctors say of the design and of the result.
+        said: sentences of steps that went wrong, and are left out.
+    """
+
+    design: State
+    state: State
+    steps: tuple[Step, ...]
+    refused: tuple[Step, ...]
+    heldout: tuple[Score, Score]
+    said: tuple[str, ...] = ()
+
+
+def fit_steps(
+    data: ResponseData,
+    split: Split,
+    trials: Sequence[Trial] = STEPS,
+    most: int = len(STEPS),
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> DenseFit:
+    """All families together, those taken out again that nobody needs, the rest fitted to all
+    correctors but the held-out ones.
+
+    Families need one another: monitors' gains, say, help nobody before the gradients are there. So
+    each is judged by what is lost without it, everything else settled anew: the same work with it
+    and without it.
+
+    Args:
+        data, split: what was measured, and who judges.
+        trials: families, in the order in which they come in.
+        most: steps that are kept at most.
+        progress: called with each step's name.
+    """
+    design = begin(data, split)
+    stages, state = _in_turn(design, trials, progress)
+    readings, steps_gone = odd_steps(state)
+    if readings.said:  # the families went after them, and what that made of steps is not known
+        stages, state = _in_turn(beside(design, readings.unread), trials, progress)
+        more, steps_gone = odd_steps(state)
+        readings = readings.and_more(more)
+    odd = readings.and_more(steps_gone)
+    state = beside(state, odd.unread)
+    progress("all together")
+    state = taken_back(settle(bend(jump(replace(state, independent=np.ones((2, 2)))))))
+    log.info("independent readings: %s", state.independent)
+    odd = odd.and_more(*odd_steps(state))  # what is usual is less now
+    state, design = beside(state, odd.unread), beside(design, odd.unread)
+    state, moving = _beside_jitter(state, progress)
+    split = state.split
+    before = score(design, split.held)
+    steps = {
+        trial: Step.scored(
+            _title(trial), sum(family.count(data) for family in trial.families),
+            score(beside(own, odd.unread), split.held),
+        )
+        for trial, own in stages.items()
+    }  # fmt: skip
+    stages.clear()
+    refused: list[Step] = []
+    doubts: list[str] = []
+    worth, without = _worth(state, steps, progress)
+    while worth and (min(worth.values()) <= 0 or len(worth) > most):
+        least = min(worth, key=lambda trial: worth[trial])
+        doubts += _doubts(state, least)
+        state = without[least] if least in without else _without(state, least)
+        refused.append(replace(steps.pop(least), kept=False))
+        doubted = [trial for trial in steps if worth[trial] <= 0]
+        del worth[least]
+        without = {}
+        if doubted:
+            again, without = _worth(state, doubted, progress)
+            worth |= again
+    spoilt = -lost(inner(replace(design, jitter=state.jitter)), inner(state))[0]
+    nothing = DenseFit(
+        design, design, (Step.scored("design", 0, before),),
+        (*refused, *(replace(step, kept=False) for step in steps.values())),
+        (before, before), (*odd.said, *doubts),
+    )  # fmt: skip
+    if spoilt > SPOILT:  # all together spoil what they should mend
+        return nothing
+    progress("result")
+    # those that chose start at what they say: a column far off would weigh nothing, and stay there
+    state = bend(jump(replace(state, exploring=False), beyond=1.0))
+    if moving is not None:
+        moving = sought(state, moving.planes) or moving
+        state = replace(state, jitter=moving.orbits)
+    state = taken_back(settle(robust(state)))
+    for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since it was asked
+        doubts += _doubts(state, trial)
+        state = _without(state, trial)
+        refused.append(replace(steps.pop(trial), kept=False))
+    then = replace(design, good=state.good, exploring=False)
+    if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
+        astray = (
+            "the fit left more of the readings that it was fitted to than the design leaves: the "
+            "lattice may be too far from the ring, and no effect is told"
+        )
+        return replace(nothing, said=(*nothing.said, astray))
+    after = score(state, split.held)
+    kept = [Step.scored("design", 0, before), *steps.values()]
+    kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
+    said = (*odd.said, *doubts, *(() if moving is None else (moving.sentence,)))
+    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
+
+
+def _in_turn(
+    design: State, trials: Sequence[Trial], progress: Callable[[str], Any]
+) -> tuple[dict[Trial, State], State]:
+    """The state with each trial's families, of those that there are, and the last of them."""
+    stages: dict[Trial, State] = {}
+    state = design
+    for trial, state in one_by_one(begun(design, trials), trials, progress):
+        stages[trial] = replace(state, kept={})
+    return stages, state
+
+
+def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
+    """With a jitter of the beam, where one stands out and those who choose do not object; or where
+    one is seen and they fare better with it."""
+    moving = sought(state)
+    if moving is None:
+        return state, None
+    progress("jitter of the beam")
+    beside_it = replace(state, jitter=moving.orbits)
+    with_it = settle(beside_it)
+    said = lost(inner(beside_it), inner(with_it))
+    log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
+    taken = not against(said, WORTH) if moving.share > MOSTLY else in_favour(said)
+    return (with_it, moving) if taken else (state, None)
+
+
+def one_by_one(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
+) -> Iterator[tuple[Trial, State]]:
+    """The state with one trial's families after another, each fitted beside those before it;
+    without those that the ring has no places of, or the measurement no readings."""
+    for given in trials:
+        told = tuple(family for family in given.families if state.reads(family.block))
+        trial = replace(given, families=told)
+        if not any(family.count(state.data) for family in trial.families):
+            continue
+        progress(_title(trial))
+        state = bend(state) if trial.own else state
+        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
+        yield trial, state
+
+
+def _title(trial: Trial) -> str:
+    return ", ".join(family.title for family in trial.families)
+
+
+def _blocks(trial: Trial) -> list[int]:
+    return [1] * (trial.across > 0) + [0] * (trial.own > 0)
+
+
+def _worth(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
+) -> tuple[dict[Trial, float], dict[Trial, State]]:
+    """Log evidence of each trial's families beside all the others (0 or less: not needed), and the
+    states without them.
+
+    Correctors that were not fitted have the veto: evidence takes readings for independent, which
+    what the model lacks is not.
+    """
+    worth, judged = _quickly(state, trials, progress)
+    doubtful = [
+        trial for trial, unwanted in judged.items()
+        if worth[trial] > -np.inf and (unwanted or not worth[trial] > SURE)
+    ]  # fmt: skip
+    states: dict[Trial, State] = {}
+    if not doubtful:
+        return worth, states
+    shares = state.independent
+    whole = evidence_of(state, state.good, shares)
+    for trial in doubtful:
+        progress(f"without {_title(trial)}")
+        try:
+            without = states[trial] = _without(state, trial)
+        except TmlatticeError:  # no closed orbit without it
+            worth[trial] = np.inf
+            continue
+        good = state.good & without.good
+        with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
+        other = evidence_of(without, good, shares)
+        gained = with_it.log - other.log - LEAST
+        said = lost(inner(without, _of_rf(other)), inner(state, _of_rf(with_it)))
+        log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
+        worth[trial] = min(gained, said[0]) if _asked(trial) and against(said) else gained
+    return worth, states
+
+
+def _doubts(state: State, trial: Trial) -> list[str]:
+    """Why what was found of a trial's families cannot be what they stand for."""
+    doubts = (family.doubt(state.values[family.variable], state.data) for family in trial.families)
+    return [doubt for doubt in doubts if doubt is not None]
+
+
+def _of_rf(own: Evidence) -> Array:
+    """What the RF's fitted monitors leave, each predicted by all others."""
+    return rf_by_others(own.state, own.in_plane, own.found)
+
+
+def _priors(trial: Trial, state: State) -> set[str]:
+    return {group.name for family in trial.families for group in family.groups(state.data)}
+
+
+def _asked(trial: Trial) -> bool:
+    """Whether correctors that were not fitted know of it: not of what fitted ones have of their
+    own."""
+    return any(family.per != "column" for family in trial.families)
+
+
+def _quickly(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
+) -> tuple[dict[Trial, float], dict[Trial, bool]]:
+    """Log evidence of each trial, linear about where the fit stands, which is enough for what
+    nobody doubts; and whether the judges would rather be without it."""
+    worth: dict[Trial, float] = {}
+    unwanted: dict[Trial, bool] = {}
+    blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
+    for block in {trial.families[0].block for trial in trials} | {0}:
+        if state.of_block(block):
+            there = linear(state, block)
+            blocks[block] = there, linear_evidence(there)
+    in_plane = blocks.get(0)
+    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
+    judged = inner(state, of_rf)
+    for trial in trials:
+        progress(f"is {_title(trial)} needed")
+        if not any(state.values[family.variable].any() for family in trial.families):
+            worth[trial], unwanted[trial] = -LEAST, False  # held at zero: nothing is lost without
+            continue
+        if _doubts(state, trial):
+            worth[trial], unwanted[trial] = -np.inf, False
+            continue
+        block = trial.families[0].block
+        there, (evidence, _, _) = blocks[block]
+        other, values, found = linear_evidence(there, _priors(trial, state))
+        worth[trial] = evidence - other - LEAST
+        without_it = of_rf if block else rf_by_others(state, there, found)
+        try:
+            said = lost(inner(state.moved({**state.values, **values}), without_it), judged)
+        except TmlatticeError:  # no closed orbit without it
+            said = np.inf, 0.0
+        unwanted[trial] = _asked(trial) and against(said)
+        log.info(
+            "%s: linear evidence %+.1f, judges %+.3f +- %.3f", _title(trial), worth[trial], *said
+        )
+    return worth, unwanted
+
+
+def _without(state: State, trial: Trial) -> State:
+    """All the others settled anew; the other block does not feel it, to first order."""
+    return settle(forbid(state, trial.families), _blocks(trial), FIRST, ROUGH)
+
+
+# --- what was found -------------------------------------------------------------------------------
+def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
+    """What is wrong as causes, with errors; and what the data alone do not settle, in words."""
+    found: list[Told] = []
+    said: tuple[str, ...] = ()
+    for block in (0, 1):
+        families = {f.variable: f for f in state.of_block(block)}
+        if not families:
+            continue
+        there = linear(state, block)
+        posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        sigma = stated(state, block, there, posterior)
+        for name, family in families.items():
+            own = sigma[there.where[name]]
+            found += family.told(state.at.errors, state.values[name], own, state.data)
+        if block == 0:
+            said = _degenerate(state, there, posterior)
+    return [row for row in found if row[0].amount != 0 or row[1] != 0], said
+
+
+def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
+    """Directions that the prior holds and not the data."""
+    said = []
+    columns, monitors = state.data.shape
+    m = 2 * monitors
+    spread = posterior.spread
+    factor = np.linalg.cholesky(posterior.covariance + 1e-12 * np.eye(len(spread.T)))
+    draws = spread @ factor
+    scale = draws[:m].mean(axis=0)
+    kick = draws[m : m + columns - 1].mean(axis=0)
+    if scale.any() and kick.any():  # both are fitted
+        both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
+        said.append(
+            f"mean monitor gain against mean corrector scale: known to "
+            f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
+            f"{both:+.2f}"
+        )
+    for family in state.families:
+        own = [g for g in there.groups if g.name == family.name]
+        if family.per != "ring" or family.block or not own or len(own[0].scale) < 2:
+            continue
+        loose = np.flatnonzero(posterior.sigma[there.where[family.variable]] > 0.5 * own[0].scale)
+        causes = family.told(state.at.errors, state.values[family.variable],
+                             np.zeros(family.size(state.data)), state.data)  # fmt: skip
+        names = [causes[i][0].element or "" for i in loose] if causes else []
+        if names:
+            said.append(
+                f"{len(names)} gradients that the prior holds more than the data: "
+                + ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+            )  # fmt: skip
+    return tuple(said)

@@ -1,0 +1,139 @@
+"""Neighbouring correctors whose columns are exchanged: each answers as the other one should.
+Monitors whose readings are; and those whose planes are.
+
+A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
+the model's far too well for a stranger: it seems displaced by the way to its neighbour.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.response.state import State
+from tmlattice.measurement import OrbitResponse
+
+Array = NDArray[np.float64]
+
+SHARE = 0.25
+"""Of the mean square left of each of the two columns, left at most once they are exchanged."""
+
+Pair = tuple[str, str]
+
+
+def exchanged(state: State) -> list[Pair]:
+    """Pairs of neighbours of a plane, in beam order; no corrector stands in two of them."""
+    data = state.data
+    model, orbits = data.pick(state.at.seen(state.at.beam)), data.pick(data.orbits)
+    names = data.measured.correctors
+
+    def left(column: int, as_one: int) -> float:
+        seen = np.isfinite(orbits[column]) & state.good
+        u, d = model[as_one, seen], orbits[column, seen]
+        gain = max(float(u @ d) / max(float(u @ u), 1e-300), 0.0)
+        return float(np.sum((d - gain * u) ** 2))
+
+    found: list[Pair] = []
+    for p in (0, 1):
+        mine = np.flatnonzero(data.plane[:-1] == p)
+        order = mine[np.argsort([data.ring[names[c]].s for c in mine])]
+        for a, b in zip(order, np.roll(order, -1), strict=True):
+            crossed = left(a, b) < SHARE * left(a, a) and left(b, a) < SHARE * left(b, b)
+            if crossed and not any(names[a] in pair for pair in found):
+                found.append((names[a], names[b]))
+    return found
+
+
+def told(pairs: Sequence[Pair], what: str = "correctors") -> str:
+    """In words."""
+    both = ", ".join(f"{a} and {b}" for a, b in pairs)
+    return (
+        f"{what} that answer each as the other one should, taken as exchanged: {both}; look at "
+        "their cables and at the table of names"
+    )
+
+
+def put_right(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
+    """The measurement with their columns exchanged."""
+    order = np.arange(len(measured.correctors))
+    for pair in pairs:
+        a, b = (measured.correctors.index(name) for name in pair)
+        order[[a, b]] = b, a
+    return replace(
+        measured, response=measured.response[order], kicks=np.asarray(measured.kicks)[order]
+    )
+
+
+def exchanged_monitors(state: State, among: Collection[str]) -> list[Pair]:
+    """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains; none
+    stands in two.
+
+    Args:
+        state: what the model makes of the readings.
+        among: those that resemble nothing: of a design with another phase advance many others seem
+            to be read one cell further on.
+    """
+    data, read = state.data, state.at.seen(state.at.beam)
+    model, orbits = data.pick(read)[:-1], data.pick(data.orbits)[:-1]
+    left = np.zeros((data.shape[1],) * 2)  # of a's readings as b's, [a, b]
+    for p in (0, 1):
+        rows = data.plane[:-1] == p
+        there = np.isfinite(orbits[rows])
+        d, u = np.where(there, orbits[rows], 0.0), model[rows]
+        both, size = np.maximum(d.T @ u, 0.0), there.T.astype(float) @ u**2
+        left += (d**2).sum(axis=0)[:, None] - both**2 / np.maximum(size, 1e-300)
+    names = data.measured.monitors
+    odd = [m for m, name in enumerate(names) if name in among]
+    stays = np.diagonal(left)
+    found: list[Pair] = []
+    for a, b in combinations(odd, 2):
+        crossed = left[a, b] < SHARE * stays[a] and left[b, a] < SHARE * stays[b]
+        if crossed and not any(names[own] in pair for own in (a, b) for pair in found):
+            found.append((names[a], names[b]))
+    return found
+
+
+def monitors_back(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
+    """The measurement with the readings of monitors exchanged, their noise and the RF's too."""
+    order = np.arange(len(measured.monitors))
+    for pair in pairs:
+        a, b = (measured.monitors.index(name) for name in pair)
+        order[[a, b]] = b, a
+    rf = measured.rf
+    if rf is not None and rf.orbit is not None:
+        rf = replace(rf, orbit=rf.orbit[order])
+    noise = None if measured.noise is None else measured.noise[order]
+    return replace(measured, response=measured.response[:, order], noise=noise, rf=rf)
+
+
+def swapped(state: State) -> list[str]:
+    """Monitors that read in each plane what the model has in the other one, whatever their gain."""
+    data, read = state.data, state.at.seen(state.at.beam)
+    found = []
+    for m, name in enumerate(data.measured.monitors):
+        seen = np.isfinite(data.orbits[:-1, m]).all(axis=1)
+        d, u = data.orbits[:-1, m][seen], read[:-1, m][seen]
+        if len(d) and _left(d, u[:, ::-1]) < SHARE * _left(d, u):
+            found.append(name)
+    return found
+
+
+def _left(measured: Array, model: Array) -> float:
+    """Of readings [column, 2], with a gain of each plane that is not negative."""
+    gain = np.maximum((measured * model).sum(axis=0), 0.0)
+    gain = gain / np.maximum((model**2).sum(axis=0), 1e-300)
+    return float(np.sum((measured - gain * model) ** 2))
+
+
+def planes_back(measured: OrbitResponse, monitors: Sequence[str]) -> OrbitResponse:
+    """The measurement with the planes of some monitors exchanged."""
+    at = [measured.monitors.index(name) for name in monitors]
+    response, rf = measured.response.copy(), measured.rf
+    response[:, at] = response[:, at, ::-1]
+    if rf is not None and rf.orbit is not None:
+        orbit = rf.orbit.copy()
+        orbit[at] = orbit[at, ::-1]
+        rf = replace(rf, orbit=orbit)
+    return replace(measured, response=response, rf=rf)

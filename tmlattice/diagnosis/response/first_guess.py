@@ -1,0 +1,118 @@
+"""Where a dense fit begins, if the design is far from the ring that was measured.
+
+Rounds that follow slopes bring phases home that are off by a fraction of a turn. Of a lattice with
+another working point, which no orbit resembles any more, they find a ring that one plane agrees
+with and the other does not. There, focusing and defocusing quadrupoles are tried in steps, all of
+them together, and the fit begins at what resembles the readings most.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.families.magnets import magnets
+from tmlattice.diagnosis.families.steps import Trial
+from tmlattice.diagnosis.response.state import State, allow, begin
+from tmlattice.errors import UnstableRingError
+from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.split import Split
+
+Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+FAR = 0.25
+"""Share of the typical column's mean square, in the worse plane, that the design leaves of it with
+a kick of its own where it is far: half of its size. Rings as they are leave a tenth of that."""
+BETTER = 0.5
+"""Of that share, at most, is left at another beginning: else the design is as good a one."""
+STEPS = np.arange(-3, 4) * 0.01
+"""Relative changes that are tried."""
+
+
+def begun(design: State, trials: Sequence[Trial]) -> State:
+    """The design, or the ring that resembles the readings more, with each quadrupole's gradient a
+    number of its own from the first: one of no family would else go back to nothing.
+
+    Args:
+        design: with no families yet.
+        trials: that will be fitted; without quadrupoles' gradients it is the design.
+    """
+    family = QuadrupoleGradient()
+    if not any(own.name == family.name for trial in trials for own in trial.families):
+        return design
+    guess = first_guess(design)
+    return design if guess is None else allow(replace(design, values=guess.values), [family])
+
+
+class Guess(NamedTuple):
+    """Where the readings are resembled more than by the design.
+
+    Attributes:
+        focusing, defocusing: relative change of all such quadrupoles.
+        values: the same, by variable.
+        left: share of the typical column's mean square that is left there.
+    """
+
+    focusing: float
+    defocusing: float
+    values: Mapping[str, Array]
+    left: float
+
+
+def elsewhere(data: ResponseData) -> Guess | None:
+    """The first guess by all that was measured."""
+    nobody, everybody = (np.full(data.shape, own) for own in (False, True))
+    split = Split(held=nobody[:, 0], inner=nobody[:, 0], half=everybody, inner_rf=nobody[0])
+    return first_guess(begin(data, split))
+
+
+def first_guess(design: State) -> Guess | None:
+    """Where a fit is to begin; None where the design is near enough, or nothing better.
+
+    Args:
+        design: with no families yet.
+    """
+    stands = strange(design)
+    if not stands > FAR:
+        return None
+    family = QuadrupoleGradient()
+    start = allow(design, [family])
+    own = magnets(design.data.ring, ("quadrupole",), True)
+    focusing = np.array([pieces[0].k1 > 0 for pieces in own])
+    best, found = BETTER * stands, None
+    for f, d in product(STEPS, STEPS):
+        values = {family.variable: np.where(focusing, f, d)}
+        try:
+            left = strange(start.moved(values))
+        except UnstableRingError:
+            continue
+        if left < best:
+            best, found = left, Guess(float(f), float(d), values, left)
+            log.info("focusing %+.2g, defocusing %+.2g: %.2g of the typical column's square left, "
+                     "%.2g by the design", f, d, left, stands)  # fmt: skip
+    return found
+
+
+def strange(state: State) -> float:
+    """Share of the typical column's mean square that is left with a kick of its own, in its plane,
+    of the worse plane."""
+    data = state.data
+    read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]
+    seen = np.isfinite(orbits) & state.fitted[:-1, None] & state.good
+    u, d = np.where(seen, read, 0.0), np.where(seen, orbits, 0.0)
+    size = (d**2).sum(axis=1)
+    kick = np.maximum((u * d).sum(axis=1) / np.maximum((u**2).sum(axis=1), 1e-300), 0.0)
+    left = ((d - kick[:, None] * u) ** 2).sum(axis=1)
+    shares = [
+        np.median(left[rows] / size[rows])
+        for rows in ((data.plane[:-1] == p) & (size > 0) for p in (0, 1))
+        if rows.any()
+    ]
+    return float(max(shares, default=0.0))

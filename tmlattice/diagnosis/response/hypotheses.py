@@ -1,0 +1,283 @@
+"""What may be missing of a fitted orbit response: each hypothesis as patterns of readings.
+
+To add one, write a function that gives its patterns where the fit stands, and put it into
+`HYPOTHESES`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.diagnosis.families.dispersion import HorizontalKicks
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.families.magnets import families
+from tmlattice.diagnosis.response.state import State
+from tmlattice.effects import apply
+from tmlattice.observe.orbit_response import DELTA
+
+Array = NDArray[np.float64]
+
+BEND_GRADIENT = 1e-4
+"""1/m2, of the differences."""
+MILLIMETRE = 1e-3
+WAVES = 4
+"""Of the leading closed orbits of random kicks in a plane."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect that may be missing.
+
+    Attributes:
+        effect: its name.
+        unit: of the amounts.
+        expected: what physics would allow.
+        patterns: d reading / d amount in each column's own plane, m, [parameter, column, monitor].
+        own: each column has its own amount of each pattern.
+        most: the largest physically sensible amount.
+    """
+
+    effect: str
+    unit: str
+    expected: str
+    patterns: Array = field(repr=False)
+    own: bool = False
+    most: float = np.inf
+
+
+def _readings(state: State, beam: Array) -> Array:
+    """Own-plane readings [column, monitor] of the beam's orbit changes [column, monitor, 2]."""
+    return state.data.pick(state.at.seen(beam))
+
+
+def _kicks(state: State) -> Array:
+    return np.asarray((state.data.kicks * (1 + state.at.errors.calibration))[:-1])
+
+
+def _orders(state: State) -> tuple[Array, Array]:
+    """Second and third order of the orbit changes for whole steps, [column, monitor, 2]."""
+    model, kicks = state.at.model, _kicks(state)
+    f = state.data.kicks[-1]
+    up, down = (
+        np.concatenate([
+            model.closed_orbits(state.data.measured.correctors, side * kicks),
+            model.at_frequency(side * f).readings[None],
+        ])[:, state.data.at]
+        for side in (1, -1)
+    )  # fmt: skip
+    steps = model.response(state.data.measured.correctors) * kicks[:, None, None]
+    linear = np.concatenate([steps, model.rf_change(f)[None]])[:, state.data.at]
+    return (up + down) / 2 - model.readings[state.data.at], (up - down) / 2 - linear
+
+
+def _one_sided(state: State) -> Hypothesis:
+    second, _ = _orders(state)
+    return Hypothesis(
+        "one-sided steps", "share", "0: two-sided, 1 or -1: one-sided",
+        _readings(state, second)[None], most=1.1,
+    )  # fmt: skip
+
+
+def _third_order(state: State) -> Hypothesis:
+    third = _orders(state)[1]
+    third[-1] = 0
+    return Hypothesis(
+        "third order of two-sided steps", "beyond the model's", "0; -1: none",
+        _readings(state, third)[None] / 4, most=2.0,
+    )  # fmt: skip
+
+
+def _corrector_energy(state: State) -> Hypothesis:
+    ring = state.at.model.ring
+    flat = ResponseModel(ring, 4).response(state.data.measured.correctors)[:, state.data.at]
+    shift = state.at.orbits(state.at.model)
+    shift[:-1] -= flat * state.data.kicks[:-1, None, None]
+    shift[-1] = 0
+    return Hypothesis(
+        "corrector's energy shift", "beyond the model's", "0; -1: the energy stays",
+        _readings(state, shift)[None], most=1.1,
+    )  # fmt: skip
+
+
+def _position(state: State, by_family: bool) -> Hypothesis:
+    jumps = _readings(state, state.at.jumps) * state.data.kicks[:, None]
+    name = "corrector's field displaced in s"
+    if not by_family:
+        return Hypothesis(name + ", each", "m", "< 0.05 m", jumps[None], own=True, most=0.05)
+    _, members = families([*state.data.measured.correctors, "\0"])
+    return Hypothesis(
+        name + ", by family", "m", "< 0.05 m", members.T[:, :, None] * jumps[None], most=0.05
+    )
+
+
+def _energy_drift(state: State) -> Hypothesis:
+    rf = _readings(state, state.at.beam)[-1]
+    pattern = np.where((state.data.plane == 0)[:, None], rf, 0.0)
+    pattern[-1] = 0
+    return Hypothesis(
+        "drift of the energy", "RF step", "< 1e-3", pattern[None], own=True, most=1e-3
+    )
+
+
+def _orbit_drift(state: State) -> Hypothesis:
+    """The orbit moves between the readings of a step: whatever kicks it, in each column anew."""
+    orbits = _readings(state, state.at.orbits(state.at.model))
+    waves = np.zeros((WAVES, *orbits.shape))
+    for p in (0, 1):
+        mine = state.data.plane == p
+        mine[-1] = False
+        per_kick = np.nan_to_num(orbits[mine]) / state.data.kicks[mine, None]
+        found = np.linalg.svd(per_kick, full_matrices=False)[2][:WAVES]
+        waves[: len(found), mine] = found[:, None] * np.sqrt(found.shape[1])
+    return Hypothesis(
+        "drift of the orbit (betatron waves)", "m", "< 1e-5", waves, own=True, most=1e-5
+    )
+
+
+def _tune_drift(state: State) -> Hypothesis:
+    total = np.zeros((2, len(state.data.plane), len(state.data.at)))
+    single = QuadrupoleGradient()
+    focusing = [int(state.data.ring[name].k1 < 0) for name in single.places(state.data)]
+    np.add.at(total, focusing, single.rows(state.at, np.zeros(len(focusing))))
+    total[:, -1] = 0
+    return Hypothesis(
+        "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", total, own=True,
+        most=1e-4,
+    )  # fmt: skip
+
+
+def _energy_spread(state: State) -> Hypothesis | None:
+    if state.allows("energy_spread"):
+        return None  # it is in the fit
+    curved = state.at.curved.copy()
+    curved[-1] = 0
+    return Hypothesis(
+        "energy spread of the beam", "(1e-3)^2", "about 1", _readings(state, curved)[None], most=4.0
+    )
+
+
+def _energy_offset(state: State) -> Hypothesis:
+    """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
+    f = DELTA / state.at.model.rf_start[5]
+    up, down = (state.at.orbits(state.at.model.at_frequency(side * f)) for side in (1, -1))
+    scale = np.append(1 + state.at.errors.calibration[:-1], 1)[:, None, None]
+    slope = _readings(state, (up - down) / 2 * scale)
+    return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
+
+
+def _dispersion(state: State) -> Hypothesis | None:
+    """See `dispersion`; one amount a pattern."""
+    if state.allows("horizontal kicks"):
+        return None  # they are in the fit
+    kicks = HorizontalKicks()
+    count = kicks.size(state.data)
+    if not count:
+        return None
+    rows = kicks.rows(state.at, np.zeros(count))
+    return Hypothesis("dispersion that no gradient makes (kicks)", "rad", "< 1e-3", rows, most=1e-3)
+
+
+def _nonlinear(state: State) -> Hypothesis:
+    """Two-sided steps: x^3 / 4 of the whole change is left of a cubic reading."""
+    cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
+    rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
+    return Hypothesis("nonlinear monitors (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
+
+
+def _gradients(state: State, name: str, effect: str, kind: str, most: float) -> Hypothesis | None:
+    places = [e.name for e in state.data.ring.elements if e.kind == kind]
+    if not places:
+        return None
+    slopes = state.at.rows(effect, places, 0)
+    return Hypothesis(name, "1/m", f"< {most:g}", slopes, most=most)
+
+
+def _radiation(state: State) -> Hypothesis | None:
+    pairs = [
+        (f"radiation_loss_{kind}s", None)
+        for kind in ("bend", "wiggler")
+        if any(e.kind == kind for e in state.data.ring.elements)
+    ]
+    rows = [_readings(state, slope) for slope in state.at.slopes(pairs)]
+    return Hypothesis("radiation in bends, wigglers", "expected loss", "1", np.array(rows), most=3)
+
+
+def _monitor_position(state: State) -> Hypothesis:
+    model = state.at.model
+    columns = model.columns(state.data.measured.correctors)
+    start = np.vstack([columns.start, model.rf_start])
+    behind = np.vstack([columns.pulled * 1.0, np.zeros(model.dimension)])
+    after = np.vstack([model.downstream(columns), np.zeros((1, len(model.monitors)), bool)])
+    slopes = model.tangents[model.maps.at][:, [1, 3]]
+    angle = np.einsum("mai,ci->cma", slopes, start)
+    angle = angle + after[:, :, None] * np.einsum("mai,ci->cma", slopes, behind)
+    kicks = np.append(_kicks(state), state.data.kicks[-1])
+    flat = _readings(state, angle[:, state.data.at] * kicks[:, None, None])
+    rows = np.zeros((len(state.data.at), *flat.shape))
+    for i in range(len(rows)):
+        rows[i, :, i] = flat[:, i]
+    return Hypothesis("monitors displaced in s", "m", "< 0.01 m", rows, most=0.01)
+
+
+def _bend_gradient(state: State) -> Hypothesis:
+    """By length, for magnets of one length are one type."""
+    ring = state.at.model.ring
+    bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
+    kinds = sorted({round(ring.elements[i].length, 3) for i in bends})
+    rows = []
+    for kind in kinds:
+        changed = {
+            i: ring.elements[i].changed(k1=ring.elements[i].k1 + BEND_GRADIENT)
+            for i in bends
+            if round(ring.elements[i].length, 3) == kind
+        }
+        model = ResponseModel(ring.with_elements(changed))
+        slope = (state.at.orbits(model) - state.at.orbits(state.at.model)) / BEND_GRADIENT
+        scale = np.append(1 + state.at.errors.calibration[:-1], 1)[:, None, None]
+        rows.append(_readings(state, slope * scale))
+    return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
+
+
+def _second_order_coupling(state: State) -> Hypothesis | None:
+    if not state.values.get("skew", np.zeros(1)).any():
+        return None
+    causes = [c for c in state.at.errors.ring if c.effect != "skew_gradient"]
+    change = state.at.orbits(state.at.model) - state.at.orbits(
+        ResponseModel(apply(state.data.ring, causes))
+    )
+    return Hypothesis(
+        "coupling to second order", "beyond the model's", "0; -1: none",
+        _readings(state, change)[None], most=1.1,
+    )  # fmt: skip
+
+
+HYPOTHESES: dict[str, Callable[[State], Hypothesis | None]] = {
+    "one_sided_steps": _one_sided,
+    "third_order": _third_order,
+    "energy_drift": _energy_drift,
+    "orbit_drift": _orbit_drift,
+    "gradient_drift": _tune_drift,
+    "corrector_energy": _corrector_energy,
+    "corrector_position_family": lambda state: _position(state, True),
+    "corrector_position": lambda state: _position(state, False),
+    "energy_spread": _energy_spread,
+    "energy_offset": _energy_offset,
+    "dispersion": _dispersion,
+    "monitor_nonlinearity": _nonlinear,
+    "monitor_position": _monitor_position,
+    "wiggler_gradient": lambda state: _gradients(
+        state, "gradients of damping wigglers", "insertion_device_focusing", "wiggler", 3e-3
+    ),
+    "straight_gradient": lambda state: _gradients(
+        state, "gradients in straights (markers)", "gradient_absolute", "marker", 2e-3
+    ),
+    "sextupole_gradient": lambda state: _gradients(
+        state, "gradients at sextupoles (orbit)", "gradient_absolute", "sextupole", 2e-3
+    ),
+    "bend_gradient": _bend_gradient,
+    "radiation": _radiation,
+    "second_order_coupling": _second_order_coupling,
+}

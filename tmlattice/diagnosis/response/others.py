@@ -1,0 +1,104 @@
+"""Causes in the ring that no family holds (a sextupole beside its place, a device), as numbers of a
+dense fit; and priors of numbers that are wrong alone.
+
+>>> state = with_number(state, ("sextupole_offset_x", "sf::3"), block=0)
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.response.state import State
+from tmlattice.effects import Cause, find
+from tmlattice.inference.priors import Group
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Others(Family):
+    """One number each; their priors are those of what is wrong alone.
+
+    Attributes:
+        causes: effect and place.
+    """
+
+    causes: tuple[Hypothesis, ...] = ()
+
+    per, trust, effects = "ring", 0.03, ()
+    name: ClassVar[str]
+
+    @property
+    def units(self) -> Array:
+        """Numbers are in units of the effect's largest fault, [number]."""
+        return np.array([find(effect).largest for effect, _ in self.causes])
+
+    def size(self, data: ResponseData) -> int:
+        """Of the causes."""
+        return len(self.causes)
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """None."""
+        return []
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """As the response has them."""
+        out = np.empty((len(self.causes), *at.data.shape))
+        gain, slopes = at.gain(self.block), at.slopes_of(self.block, self.causes)
+        for row, slope, unit in zip(out, slopes, self.units, strict=True):
+            row[:] = unit * slope * gain
+        return out
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """As causes in the ring."""
+        own = zip(self.causes, (values * self.units).tolist(), strict=True)
+        return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
+
+    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+        """As they stand."""
+        amounts, sigmas = (values * self.units).tolist(), (sigma * self.units).tolist()
+        rows = zip(self.causes, amounts, sigmas, strict=True)
+        return [(Cause(*h, a), s) for h, a, s in rows]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each its own."""
+        return [{h: u} for h, u in zip(self.causes, self.units.tolist(), strict=True)]
+
+
+class OthersInPlane(_Others):
+    """Whose amount the plane of the kick tells."""
+
+    name, block, variable = "others in-plane", 0, "others in-plane"
+
+
+class OthersAcross(_Others):
+    """Whose amount the other plane tells."""
+
+    name, block, variable = "others across", 1, "others across"
+
+
+KINDS: tuple[Any, ...] = (OthersInPlane, OthersAcross)
+
+
+def with_number(state: State, cause: Hypothesis, block: int) -> State:
+    """With one more number, at zero."""
+    kind = KINDS[block]
+    have = next((f.causes for f in state.families if isinstance(f, kind)), ())
+    if cause in have:
+        return state
+    families = [f for f in state.families if not isinstance(f, kind)]
+    values = np.append(state.values.get(kind.variable, np.zeros(0)), 0.0)
+    apart = tuple(
+        replace(one, members=np.append(one.members, 0.0)) if one.variable == kind.variable else one
+        for one in state.apart
+    )
+    return replace(
+        state,
+        apart=apart,
+        families=(*families, kind((*have, cause))),
+        values={**state.values, kind.variable: values},
+    )

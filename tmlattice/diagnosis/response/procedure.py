@@ -1,0 +1,449 @@
+"""Which errors close how much of a measured orbit response's gap, step by step, on held-out data.
+
+A fifth of the correctors is never fitted. Of each of them only the kick is taken, from a random
+half of the monitors, and the other half judges; the RF's orbit is fitted on half of the monitors
+and judged on the other half. Which families of errors are kept is decided on other correctors, held
+out from the rest, so that the figures of the steps judge and choose nothing.
+
+>>> result = diagnose_response(ring, measured)
+>>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
+
+Gain and calibration are degenerate in scale but for the dispersion; neighbouring quadrupoles can
+pull against one another. Priors settle both: a family of correctors or quadrupoles (one kind of
+magnet, or one supply) shares an error, its members scatter about it, and how much is learnt from
+the data.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
+from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.steps import STEPS, Trial
+from tmlattice.diagnosis.findings import swap_of, with_consequences
+from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
+from tmlattice.diagnosis.response.displaced import displaced
+from tmlattice.diagnosis.response.exchanged import (
+    exchanged,
+    exchanged_monitors,
+    monitors_back,
+    planes_back,
+    put_right,
+    swapped,
+)
+from tmlattice.diagnosis.response.exchanged import told as told_exchanged
+from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.judges import Chi2, Score
+from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
+from tmlattice.diagnosis.response.reasons import explain_gradients
+from tmlattice.diagnosis.response.rf_by_others import rf_known_to
+from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
+from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.strangers import reversed_ones, strangers
+from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView, ring_tunes
+from tmlattice.effects import Cause, apply, find, names
+from tmlattice.errors import MeasurementError
+from tmlattice.inference import chi2
+from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.lattice import Ring
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.orbit_response import ResponseData, response_data
+from tmlattice.observe.response_noise import learnt_noise
+from tmlattice.observe.response_problem import single_causes
+from tmlattice.observe.split import split_columns
+
+Array = NDArray[np.float64]
+
+MISSING = 1.5
+"""Chi2 per reading of the result above which an effect is missing."""
+UNDERSTATED = 2.0
+"""So many times the stated noise is told, where the readings show it."""
+PATTERNS = 8
+"""The strongest patterns of what is left."""
+LARGE = 60_000
+"""Readings up to which single faults among small errors are sought: every number is fitted anew
+for each of them."""
+TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
+BLOCKS = ("in-plane", "coupling", "RF")
+AS_KNOWN = 1.5
+"""So many times what a fit knows of the RF's orbit where it did not fit it is no sign of more."""
+
+
+def diagnose_response(
+    ring: Ring,
+    measured: OrbitResponse,
+    *,
+    holdout: float = 0.2,
+    effects: Sequence[str] | None = None,
+    max_effects: int = len(STEPS),
+    false_alarm: float = DEFAULT.false_alarm,
+    missing: bool = False,
+    assume: Sequence[str] = (),
+    seed: int = 0,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> Diagnosis:
+    """Correctors and families, monitors, single gradients, then what couples the planes.
+
+    Args:
+        ring: the design.
+        measured: with an RF step, if it can be, and the noise of its readings; else that is
+            learnt.
+        holdout: share of the correctors that is never fitted.
+        effects: only families of these are tried; else all.
+        max_effects: steps that are kept at most.
+        false_alarm: chance that the readings of a faultless ring are said to have an error.
+        missing: weigh too which effect the result still lacks.
+        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone
+            first.
+        seed: of the split.
+        progress: called with the name of each stage.
+
+    Raises:
+        MeasurementError: too few correctors, or effects that have no family.
+        UnknownNameError: an effect or a monitor that does not exist.
+        UnstableRingError: no closed orbit.
+    """
+    begun = time.perf_counter()
+    measured = mended(ring, measured, assume)
+    trials, data = trials_of(effects), response_data(ring, measured)
+    said = [*consulted(ring, measured), *assumed_of(measured, data)]
+    measured, gross = without_gross(measured, data)
+    if gross:
+        said, data = said + gross, response_data(ring, measured)
+    split = split_columns(data, holdout, np.random.default_rng(seed))
+    judgement = Judgement(false_alarm=false_alarm)
+    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    if few is None:
+        fit, measured, odd, swaps = _families(
+            ring, measured, trials, holdout, max_effects, seed, progress
+        )
+        said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
+        fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
+        found, degenerate = told(fit.state)
+        verdict = _verdict(fit, false_alarm)
+        if findings:
+            verdict = max((own.verdict for own in findings), key=VERDICTS.index)
+    else:
+        fit, found, degenerate = few.fit, few.told, ()
+        verdict, findings = few.verdict, few.findings
+    rows = tuple(weigh(fit.state, progress=progress)) if missing else None
+    options = {
+        "holdout": holdout, "effects": None if effects is None else list(effects),
+        "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
+        **({"assume": list(assume)} if assume else {}),
+    }  # fmt: skip
+    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in findings)
+    return as_diagnosis(
+        ring, fit, fit.state.at.errors.ring, found,
+        noise_estimated=measured.noise is None,
+        verdict=verdict,
+        findings=with_consequences(ring, findings, causes),
+        warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
+        degenerate=degenerate,
+        hypotheses=rows,
+        reasons=None if few is not None else explain_gradients(fit.state),
+        provenance=provenance(ring, options, seed, begun),
+    )  # fmt: skip
+
+
+def _families(
+    ring: Ring,
+    measured: OrbitResponse,
+    trials: Sequence[Trial],
+    holdout: float,
+    most: int,
+    seed: int,
+    progress: Callable[[str], Any],
+) -> tuple[DenseFit, OrbitResponse, list[str], list[str]]:
+    """The dense fit of what resembles the model; what was fitted, and what was done to it; and
+    monitors whose planes are exchanged."""
+    said: list[str] = []
+    swaps: list[str] = []
+    known: list[tuple[str, str]] = []
+    fit: DenseFit | None = None
+    while True:
+        data = response_data(ring, measured)
+        split = split_columns(data, holdout, np.random.default_rng(seed))
+        state = begin(data, split) if fit is None else fit.state
+        pairs = [pair for pair in exchanged(state) if pair not in known]
+        if pairs:
+            said.append(told_exchanged(pairs))
+            known += pairs
+            measured, fit = put_right(measured, pairs), None
+            continue
+        odd = strangers(state)
+        strange = {name for name, _ in odd.monitors}
+        pairs = [pair for pair in exchanged_monitors(state, strange) if pair not in known]
+        if pairs:
+            said.append(told_exchanged(pairs, "monitors"))
+            known += pairs
+            measured, fit = monitors_back(measured, pairs), None
+            continue
+        crossed = [name for name in swapped(state) if name not in swaps]
+        if crossed:
+            swaps += crossed
+            measured, fit = planes_back(measured, crossed), None
+            continue
+        if odd.any:
+            said += odd.said
+            measured = odd.without(measured)
+            data = response_data(ring, measured)
+            split = split_columns(data, holdout, np.random.default_rng(seed))
+        elif fit is not None:
+            return fit, measured, [*said, *fit.said], swaps
+        fit = fit_steps(data, split, trials, most, progress)
+
+
+def _faults(
+    fit: DenseFit,
+    swaps: Sequence[str],
+    effects: Sequence[str] | None,
+    most: int,
+    judgement: Judgement,
+    progress: Callable[[str], Any],
+) -> tuple[DenseFit, tuple[Finding, ...]]:
+    """What is wrong alone among small errors, and the fit beside it."""
+    state = fit.state
+    ring = state.data.ring
+    found = [swap_of(state, name, judgement) for name in swaps
+             if effects is None or "monitor_swap" in effects]  # fmt: skip
+    hypotheses = single_causes(state.data, effects)
+    if hypotheses and state.data.measured.response.size <= LARGE:
+        alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
+        fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
+        found += [fault.finding(ring, judgement) for fault in alone.faults]
+    return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic)[:most])
+
+
+def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
+    """What the measurement does not say, and what is taken instead."""
+    said = []
+    if measured.noise is None or np.isnan(measured.noise).any():
+        x, y = (f"{1e6 * size:.2g} µm" for size in np.median(data.noise, axis=0))
+        said.append(
+            f"the noise of the readings is not stated; from what neighbouring monitors leave it is "
+            f"{x} in x and {y} in y (a jitter of the beam is not in it)"
+        )
+    else:
+        said += _understated(data)
+    rf = data.measured.rf
+    if rf is None or rf.orbit is None:
+        copied = measured.rf is not None and measured.rf.orbit is not None
+        why = (
+            "the RF step's orbit repeats to the last digit, is a model's and no measurement, and "
+            "is left out"
+            if copied
+            else "there is no RF step"
+        )
+        said.append(
+            f"{why}: dispersion is not known, and only what is usual tells the scale of all "
+            "correctors from that of all monitors"
+        )
+    for plane in (p for p in "xy" if p not in measured.planes):
+        said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")
+    for p, plane in enumerate("xy"):
+        own = data.orbits[:-1][data.plane[:-1] == p, :, p]
+        if len(own) and not np.isfinite(own).any():
+            said.append(f"no monitor reads {plane}: what acts in that plane alone is not known")
+    if not np.isfinite(data.pick(data.orbits, 1)[:-1]).any():
+        said.append(
+            "no corrector is read in the other plane: rolls and skew gradients are not known"
+        )
+    return said
+
+
+def _understated(data: ResponseData) -> list[str]:
+    """Where the readings scatter by far more than the noise that is stated."""
+    measured = data.measured  # in beam order
+    if measured.noise is None:
+        return []
+    try:
+        shown = learnt_noise(measured, np.array([data.ring[name].s for name in measured.monitors]))
+    except MeasurementError:  # too few readings say nothing
+        return []
+    stated = np.nanmedian(measured.noise, axis=0)
+    return [
+        f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors leave "
+        f"{1e6 * seen:.2g} µm of each other's readings: chi-square is as much too large"
+        for plane, own, seen in zip("xy", stated, shown[0], strict=True)
+        if seen > UNDERSTATED * own
+    ]
+
+
+def as_diagnosis(
+    ring: Ring, fit: DenseFit, within: Sequence[Cause], found: Sequence[Told], **told: Any
+) -> Diagnosis:
+    """What a fit of a response says, as a diagnosis.
+
+    Args:
+        ring: the design.
+        fit: with its steps.
+        within: what the ring as found has.
+        found: causes with their errors.
+        told: what else the diagnosis is to say.
+    """
+    data, good = fit.state.data, fit.state.good
+    noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
+    causes = tuple(cause for cause, _ in found)
+    repaired = apply(ring, within)
+    return Diagnosis(
+        fit_before=_misfit(fit, fit.design.at.read),
+        fit_after=_misfit(fit, fit.state.at.read),
+        heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
+        heldout_shots=(),
+        unexplained=_unexplained(fit),
+        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
+        next=None,
+        sensitivity={},
+        noise=(noise_x, noise_y),
+        ring=ring,
+        repaired=repaired,
+        causes=causes,
+        errors=tuple(sigma for _, sigma in found),
+        view=_view(fit),
+        steps=fit.steps,
+        refused=fit.refused,
+        bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
+        priors={
+            name: group.rms
+            for name, group in fit.state.groups.items()
+            if name not in {one.name for one in fit.state.apart}
+        },
+        dispersion=dispersion_beside(fit.state.values, data),
+        **told,
+    )
+
+
+def _view(fit: DenseFit) -> ResponseView:
+    state, data = fit.state, fit.state.data
+    design, model = fit.design.at.read, state.at.read
+    return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
+
+
+def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
+    """What made a diagnosis."""
+    from tmlattice.version import __version__
+
+    return {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"reference": False, "background": {}, "radiation": False, **used},
+        "seed": seed,
+        "seconds": time.perf_counter() - begun,
+    }
+
+
+def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:
+    """Steps of families that may be tried."""
+    if effects is None:
+        return list(steps)
+    wanted = set(names(effects))
+    kept = [
+        replace(trial, families=tuple(f for f in trial.families if wanted & set(f.effects)))
+        for trial in steps
+    ]
+    known = {effect for trial in steps for family in trial.families for effect in family.effects}
+    known |= {name for name in names() if find(name).responds}
+    if not known & wanted:
+        raise MeasurementError(
+            f"an orbit response does not see {', '.join(sorted(wanted)) or 'no effect'}; it sees "
+            f"{', '.join(sorted(known))}"
+        )
+    return [trial for trial in kept if trial.families]
+
+
+def _six(fit: tuple[Chi2, Chi2, Chi2], heldout: Score) -> dict[str, Chi2]:
+    """What fitted readings and held-out ones say of one model, by name."""
+    said = {f"fitted, {name}": own for name, own in zip(BLOCKS, fit, strict=True)}
+    held = zip(BLOCKS, heldout.chi2, strict=True)
+    return said | {f"held-out, {name}": own for name, own in held}
+
+
+def _verdict(fit: DenseFit, false_alarm: float) -> str:
+    """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
+    the RF's response; else `distributed`: many small errors."""
+    said = _six(fit_chi2(fit.design), fit.heldout[0])
+    chances = [chi2.sf(own.total, own.readings) for own in said.values() if own.readings]
+    return "nothing" if min(chances) > false_alarm / len(chances) else "distributed"
+
+
+def _warnings(fit: DenseFit) -> tuple[str, ...]:
+    """What a reader should know."""
+    last, heldout = fit.steps[-1], fit.heldout[1]
+    said = []
+    if last.heldout_chi2_per_dof > MISSING:
+        said.append(
+            f"On held-out readings {1e6 * last.heldout_rms_in_plane:.1f} µm are left, "
+            f"{np.sqrt(last.heldout_chi2_per_dof):.1f} times the noise: an effect is missing."
+        )
+    left = {
+        name: own
+        for name, own in _six(fit_chi2(fit.state), heldout).items()
+        if own.per_reading > MISSING and chi2.sf(own.total, own.readings) < DEFAULT.false_alarm
+        and name != "held-out, in-plane"
+    }  # fmt: skip
+    rf = f"held-out, {BLOCKS[-1]}"
+    known = rf_known_to(fit.state) if rf in left else float("nan")
+    if heldout.dispersion < AS_KNOWN * known:
+        del left[rf]
+        said.append(
+            "The RF's orbit at monitors that did not fit it is missed by "
+            f"{1e6 * heldout.dispersion:.2g} µm, and the others know it to {1e6 * known:.2g} µm: "
+            "that is no sign of an effect."
+        )
+    if left:
+        how = ", ".join(f"{name} {np.sqrt(own.per_reading):.1f}" for name, own in left.items())
+        refused = "; ".join(step.effect for step in fit.refused)
+        said.append(
+            f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
+            + (f", or is one of those refused ({refused})." if refused else ".")
+        )
+    said += [*dispersion_by_kicks(fit.state.values, fit.state.data), *displaced(fit.state)]
+    return (*said, *odd_readings(fit.state))
+
+
+def _misfit(fit: DenseFit, read: Array) -> Misfit:
+    """Of the fitted correctors' readings in their own plane."""
+    data, good = fit.state.data, fit.state.good
+    rows = np.flatnonzero(~fit.state.split.held[:-1])
+    miss = data.pick(data.orbits - read)[rows][:, good]
+    pull = miss / data.noise_of(0)[rows][:, good]
+    return Misfit(float(np.sqrt(np.nanmean(miss**2))), float(np.nanmean(pull**2)))
+
+
+def _gap(fit: DenseFit, noise: float) -> Gap:
+    misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
+    before, after = (max(m.rms**2 - noise**2, 0.0) for m in (misfits[0], misfits[-1]))
+    seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
+    there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
+    return Gap(misfits, np.zeros((0, 0, 0)), 1 - after / before if there else None, None)
+
+
+def _unexplained(fit: DenseFit) -> dict[str, Any]:
+    """What stays of the fitted correctors' readings, in their own plane."""
+    state, data = fit.state, fit.state.data
+    shares = []
+    total, count = 0.0, 0
+    for p in (0, 1):
+        rows = np.flatnonzero(~state.split.held[:-1] & (data.plane[:-1] == p))
+        miss = state.at.left[rows][:, state.good, p]
+        seen = np.isfinite(miss)
+        miss = np.where(seen, miss, 0.0)
+        size = np.linalg.svd(miss, compute_uv=False) ** 2
+        shares.append(float(size[:PATTERNS].sum() / max(size.sum(), 1e-300)))
+        total += float(np.sum((miss / data.noise[state.good, p]) ** 2))
+        count += miss.size
+    return {
+        "p_value": float(chi2.sf(total, count)),
+        "places": [],
+        "patterns": {"chi2_per_dof": total / max(count, 1), "low_rank": shares},
+    }

@@ -1,0 +1,71 @@
+"""The RF's orbit at each monitor that is fitted, as all other readings predict it.
+
+A few monitors that were kept apart tell little of an orbit that is read once. What all the others
+predict of a reading follows from the fit to all of them: readings y with precision matrix Q miss
+what the others say by (Q y) / Q_ii, and for a linear fit with priors Q y is the weighed residual, Q
+the weights less what the fit takes of them. Families that follow every monitor by itself, and none
+between, are seen by that.
+
+>>> there = linear(state, 0); found = solve(there.normal, there.groups, there.start, rounds=0)
+>>> rf_by_others(state, there, found)
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from tmlattice.diagnosis.response.rounds import Linear, linear
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import taken, weight
+from tmlattice.inference.normal import Posterior, solve
+
+Array = NDArray[np.float64]
+
+LEAST = 1e-9
+"""Share of a reading's weight that a fit leaves, at least: above rounding."""
+
+
+def rf_by_others(state: State, there: Linear | None, found: Posterior | None) -> Array:
+    """What is left of each reading by a fit to all the others, m, [monitor]; NaN where none is.
+
+    Args:
+        state: where the fit stands.
+        there: `linear` of it, in-plane; None where nothing is fitted.
+        found: solved from that; None: without all that is fitted there.
+    """
+    column = len(state.data.plane) - 1
+    own = weight(state, 0)[column]
+    read = np.flatnonzero(own > 0)
+    weights = np.diag(own[read])
+    shared = taken(state, 0)
+    if shared is not None:
+        weights -= shared[column, read] @ shared[column, read].T
+    left = state.data.pick(state.at.left)[column, read]
+    precision = weights.diagonal().copy()
+    if there is not None:
+        rows = there.of_column(column, read, int(state.data.plane[column]))
+        values = np.zeros_like(there.start) if found is None else found.values
+        left = left - rows @ (values - there.start)
+    if there is not None and found is not None:
+        fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
+        precision -= (fitted**2).sum(axis=0)
+    out = np.full(len(own), np.nan)
+    out[read] = weights @ left / np.maximum(precision, LEAST * weights.diagonal())
+    return out
+
+
+def rf_known_to(state: State) -> float:
+    """How well the fit knows the RF's orbit at monitors that did not fit it, noise of their
+    readings included, rms, m; NaN where there are none, or nothing is fitted."""
+    judges = (
+        state.good & ~state.split.half[-1] & np.isfinite(state.data.pick(state.data.orbits)[-1])
+    )
+    if not state.of_block(0) or not judges.any():
+        return float("nan")
+    there = linear(state, 0)
+    found = solve(there.normal, there.groups, there.start, rounds=0)
+    column = len(state.data.plane) - 1
+    rows = there.of_column(column, np.flatnonzero(judges), int(state.data.plane[column]))
+    unknown = solve_triangular(found.factor, (rows @ found.spread).T, lower=True)
+    noise = state.data.noise_of(0)[column, judges]
+    return float(np.sqrt(np.mean((unknown**2).sum(axis=0) + noise**2)))

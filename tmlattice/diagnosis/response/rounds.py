@@ -1,0 +1,435 @@
+"""Rounds of Gauss and Newton of a dense fit, what they are solved from, and what they leave.
+
+>>> state = settle(bend(jump(allow(state, families))))
+>>> there = linear(state, 0); marginal(there, ["gradient"])
+"""
+
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.family import Family
+from tmlattice.diagnosis.response.state import Kept, State
+from tmlattice.diagnosis.response.weights import log_scale, look, taken, weighed, weight
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.normal import Normal, Posterior, normal_equations, solve
+from tmlattice.inference.priors import Group
+from tmlattice.inference.slopes import Slopes, whole
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+log = logging.getLogger(__name__)
+
+ROUNDS = 12
+"""Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
+GAIN = 3e-3
+"""Share of the cost that a round has to gain for another one."""
+EACH = 4
+"""Rounds of EM for the priors in a round of the fit."""
+LEARN = 10
+"""Rounds of EM where evidence counts: the priors of what is not there fall slowly."""
+RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
+"""How often a round that went astray is repeated; by what trust falls then and grows else, and to
+how much at most."""
+CORRECTED, CORRECTS = 6, 1e-3
+"""How often a round corrects its step by what the readings say where it led, with the slopes of its
+start; and what share of the cost that has to gain to be repeated. Numbers that pull against one
+another go far in a valley that is narrow and bent: a step along its tangent leads up its wall."""
+HELD = 4
+"""How often numbers that would be lower than they can be are held, and the rest solved again."""
+STILL = 0.05
+"""Share of what is trusted by which the ring moves, in the mean, before rows are taken anew."""
+
+
+def _ring(state: State) -> dict[str, Array]:
+    """The ring's numbers, in units of what a round may move them by."""
+    return {f.variable: state.values[f.variable] / f.trust
+            for f in state.families if f.per == "ring"}  # fmt: skip
+
+
+def _rows(state: State, family: Family) -> Kept:
+    """Of a variable of the ring: those that stand, or new ones."""
+    ring, gain = _ring(state), state.at.gain(family.block)
+    scale = 1 + state.at.errors.calibration
+    kept = state.kept.get(family.variable)
+    if kept is not None and len(kept.rows) == len(ring[family.variable]):
+        moved = np.concatenate([_change(kept.at, ring, name) for name in {**kept.at, **ring}])
+        if np.sqrt(np.mean(moved**2)) < STILL and (kept.scale != 0).all():
+            return kept
+    return Kept(family.rows(state.at, state.values[family.variable]), gain, scale, ring)
+
+
+def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) -> Array:
+    """Of one variable's numbers, of which either may have more: what is not there is zero."""
+    old, new = (one.get(name, np.zeros(0)) for one in (before, now))
+    change = np.zeros(max(len(old), len(new)))
+    change[: len(new)] += new
+    change[: len(old)] -= old
+    return change
+
+
+def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
+    """By what rows that stand are to be multiplied: monitors and correctors have moved."""
+    if (gain == kept.gain).all() and (scale == kept.scale).all():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = gain / kept.gain * (scale / kept.scale)[:, None]
+    return np.where(np.isfinite(share), share, 1.0)
+
+
+class Linear(NamedTuple):
+    """The readings of one block where the fit stands.
+
+    Parameters are those of the monitors, x and y of each; of the columns; and of the ring. One that
+    is as low as it can be, and that the readings would have lower, stays: no prior moves it.
+    """
+
+    normal: Normal
+    start: Array
+    trust: Array
+    by_monitor: Array
+    by_column: Array
+    ring: tuple[Slopes, ...]
+    where: Mapping[str, slice]
+    groups: tuple[Group, ...]
+    kept: Mapping[str, Kept]
+    lowest: Array
+
+    @property
+    def by_ring(self) -> Array:
+        """The ring's rows in one array, [error, column, monitor]: a copy of them."""
+        return whole(self.ring, self.by_monitor.shape)
+
+    def of_column(self, column: int, read: Indices, plane: int) -> Array:
+        """Slopes of some readings of a column that is read in a plane, [reading, parameter]."""
+        columns, monitors = self.by_monitor.shape
+        out = np.zeros((len(read), len(self.start)))
+        out[np.arange(len(read)), 2 * read + plane] = self.by_monitor[column, read]
+        out[:, 2 * monitors + column] = self.by_column[column, read]
+        out[:, 2 * monitors + columns :] = np.concatenate(
+            [np.zeros((0, len(read))), *(own.of(column, read) for own in self.ring)]
+        ).T
+        return out
+
+
+def linear(state: State, block: int) -> Linear:
+    """Normal equations where the fit stands, the parameters there, priors, trusted changes."""
+    data, at = state.data, state.at
+    columns, monitors = data.shape
+    families = state.of_block(block)
+    where: dict[str, slice] = {}
+    rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
+    ring: list[Slopes] = []
+    kept: dict[str, Kept] = {}
+    end = 2 * monitors + columns
+    start, trust = [np.zeros(end)], [np.ones(end)]
+    for family in {f.variable: f for f in families}.values():
+        values = state.values[family.variable]
+        if family.per == "ring":
+            stands = kept[family.variable] = _rows(state, family)
+            share = _now(stands, at.gain(block), 1 + at.errors.calibration)
+            where[family.variable] = slice(end, end + len(values))
+            end += len(values)
+            start.append(values)
+            trust.append(np.full(len(values), family.trust))
+            ring.append(Slopes(stands.rows, share))
+        else:
+            slopes = family.rows(at, values)
+            low = 0 if family.per == "monitor" else 2 * monitors
+            mine = where[family.variable] = slice(low, low + len(values))
+            start[0][mine], trust[0][mine] = values, family.trust
+            rows[family.per] = slopes
+    normal = normal_equations(
+        data.pick(at.left, block), weight(state, block), data.plane_of(block), rows["monitor"],
+        rows["column"], ring, taken(state, block),
+    )  # fmt: skip
+    groups = []
+    lowest = np.full(end, -np.inf)
+    for family in families:
+        lowest[where[family.variable]] = family.lowest(data)
+    begin = np.concatenate(start)
+    free = (begin > lowest) | (normal.vector > 0)
+    for family in families:
+        for own in family.groups(data):
+            basis = np.zeros((end, own.basis.shape[1]))
+            basis[where[family.variable]] = own.basis
+            basis[~free] = 0.0
+            known = state.groups.get(own.name, own)
+            groups.append(
+                replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms,
+                        guessed=state.guessed)
+            )  # fmt: skip
+    for one in (one for one in state.apart if one.block == block and one.variable in where):
+        basis = np.zeros((end, 1))
+        basis[where[one.variable], 0] = one.members
+        groups.append(Group(one.name, basis, one.wide, fixed=True))
+    return Linear(
+        normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], tuple(ring),
+        where, tuple(groups), kept, lowest,
+    )  # fmt: skip
+
+
+def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
+    """What the readings say of some variables of the ring, all others with their priors taken out.
+
+    Args:
+        there: where the fit stands.
+        names: of variables.
+
+    Returns:
+        Information, and score with all these numbers at zero: their likelihood is
+        exp(score x - x information x / 2).
+    """
+    A = there.normal.matrix
+    said = there.normal.vector + A @ there.start
+    own = np.concatenate([np.arange(len(A))[there.where[name]] for name in names])
+    spread = np.concatenate([group.basis * group.scale for group in there.groups], axis=1)
+    spread = spread[:, ~spread[own].any(axis=0)]
+    inside = spread.T @ A @ spread + np.eye(spread.shape[1])
+    across = A[own] @ spread
+    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ said]))
+    information = A[np.ix_(own, own)] - across @ taken[:, :-1]
+    return (information + information.T) / 2, said[own] - across @ taken[:, -1]
+
+
+class Moved(NamedTuple):
+    """A state after a round, and the cost that the round was to lessen, before and after."""
+
+    state: State
+    before: float
+    after: float
+
+
+def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Moved:
+    """Solve the readings of one block, and move.
+
+    Args:
+        state: where it stands.
+        block: 0 in-plane, 1 coupling.
+        there: `linear` of that block where it stands.
+        bold: factor of every trusted change: small where the last rounds went astray.
+    """
+    found = _within(there, bold)
+    groups = {group.name: group for group in found.groups}
+    learnt = replace(state, groups={**state.groups, **groups})
+    weights = weight(state, block)
+
+    def cost(at: State) -> float:
+        left = np.where(weights > 0, state.data.pick(at.at.left, block), 0.0)
+        penalty = sum(
+            _penalty([g for g in found.groups if g.basis[rows].any()], rows, at.values[name])
+            for name, rows in there.where.items()
+        )
+        return float(np.sum(left * weighed(state, block, left))) + penalty
+
+    best, aim = Moved(learnt, cost(state), np.inf), found.values
+    for _ in range(CORRECTED + 1):
+        values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
+        then = learnt.moved({**state.values, **values})
+        try:
+            after = cost(then)
+        except UnstableRingError:  # astray: nothing is stored there
+            break
+        last = best.after
+        if after <= last:
+            best = best._replace(state=then, after=after)
+        if after > (1 - CORRECTS) * last:
+            break
+        # what the readings say there, as if the ring were linear with the slopes of the start
+        moved = np.zeros_like(there.start)
+        for name, at in there.where.items():
+            moved[at] = values[name] - there.start[at]
+        left = state.data.pick(then.at.left, block)
+        said = gathered(there, state.data.plane_of(block), weighed(state, block, left))
+        said += there.normal.matrix @ moved
+        aim, before = _aim(there, found, bold * there.trust, said), aim
+        further = aim - before
+        if further @ there.normal.matrix @ further < CORRECTS * after:
+            break  # as straight as the step took it for
+    return best
+
+
+def _within(there: Linear, bold: float) -> Posterior:
+    """The step, those that it would make lower than they can be left where they are lowest."""
+    groups, trust = there.groups, bold * there.trust
+    for _ in range(HELD):
+        found = solve(there.normal, groups, there.start, trust, rounds=EACH)
+        low = found.values < there.lowest
+        if not low.any():
+            break
+        rest = ~low[:, None]
+        groups = tuple(replace(group, basis=group.basis * rest) for group in groups)
+    return found
+
+
+def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
+    """J^T of weighted readings [column, monitor] with the slopes of the start, [parameter], each
+    column read in a plane."""
+    by_monitor = there.by_monitor * weighted
+    alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
+    by_column = (there.by_column * weighted).sum(axis=1)
+    return np.concatenate([alone.ravel(), by_column, *(r.times(weighted) for r in there.ring)])
+
+
+def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
+    """Values that another vector leads to, from the same start with the same priors and trust."""
+    whole = vector + there.normal.matrix @ there.start + there.start / trust**2
+    return found.solved(whole)
+
+
+def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
+    """What the priors of one variable, which add up, ask for its values."""
+    if not groups:  # of numbers that a ring has none of
+        return 0.0
+    bases = [group.basis[rows] for group in groups]
+    own = next((i for i, basis in enumerate(bases) if _of_each(basis)), None)
+    spreads = [basis * group.scale for basis, group in zip(bases, groups, strict=True)]
+    if own is None:
+        spread = np.concatenate(spreads, axis=1)
+        return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
+    # a few that are shared, each number's own takes the rest
+    each = np.diagonal(spreads.pop(own))
+    free = each > 0  # one that is held is not asked for
+    shared = np.concatenate([np.zeros((free.sum(), 0)), *(s[free] for s in spreads)], axis=1)
+    rest = values[free] / each[free]
+    shared /= each[free, None]
+    asked = np.concatenate([rest, np.zeros(shared.shape[1])])
+    both = np.concatenate([shared, np.eye(shared.shape[1])])
+    amounts = np.linalg.lstsq(both, asked, rcond=None)[0]
+    return float(np.sum((rest - shared @ amounts) ** 2) + amounts @ amounts)
+
+
+def _of_each(basis: Array) -> bool:
+    """Whether a group has one parameter for each number."""
+    rows, columns = basis.shape
+    return rows == columns and bool(np.count_nonzero(basis) == np.count_nonzero(basis.diagonal()))
+
+
+def settle(
+    state: State,
+    blocks: Sequence[int] = (1, 0),
+    most: int = ROUNDS,
+    gain: float = GAIN,
+    possible: Callable[[State], bool] = lambda state: True,
+    look_at_monitors: bool = True,
+) -> State:
+    """Rounds until none gains any more, none of which may make things worse.
+
+    As Levenberg and Marquardt have it, but that what is trusted is a change of each number by
+    itself: a round that went astray is taken back and repeated with less trust.
+
+    Args:
+        state: where it stands.
+        blocks: that move, in this order.
+        most: rounds of each block.
+        gain: share of the cost that a round has to gain for another one.
+        possible: whether a state is one that is sought; rounds end at one that is not.
+        look_at_monitors: whether those that are bad are set aside after each round.
+    """
+    good = state.good
+    bold = dict.fromkeys(blocks, 1.0)
+    for turn in range(most):
+        gained = 0.0
+        for block in blocks:
+            if not state.of_block(block):
+                continue
+            there = linear(state, block)
+            state = replace(state, kept={**state.kept, **there.kept})
+            for _ in range(RETRIES):
+                moved = one_round(state, block, there, bold[block])
+                if moved.after <= moved.before:
+                    break
+                bold[block] /= ASTRAY
+            if moved.after > moved.before:
+                continue
+            bold[block] = min(BOLDER * bold[block], BOLDEST)
+            gained = max(gained, (moved.before - moved.after) / max(moved.after, 1e-300))
+            state = moved.state
+            for seen in (0, 1):
+                if state.of_block(seen):
+                    state = look(state, seen)
+                    state = state if look_at_monitors else replace(state, good=good)
+        log.info(
+            "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
+        )
+        if gained < gain or not possible(state):
+            break
+    return state
+
+
+def linear_evidence(
+    there: Linear, gone: Collection[str] = (), rounds: int = LEARN
+) -> tuple[float, dict[str, Array], Posterior | None]:
+    """Log evidence that priors and readings have of one block where the fit stands, linear about
+    it, up to a constant; the values that are the likeliest; and the fit, if there is one.
+
+    Args:
+        there: where the fit stands.
+        gone: priors of families that are not there, by name.
+        rounds: of EM for the priors.
+    """
+    left = [group for group in there.groups if group.name not in gone]
+    found = solve(there.normal, left, there.start, rounds=rounds) if left else None
+    nothing = np.zeros_like(there.start)
+    moved = (nothing if found is None else found.values) - there.start
+    total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
+    if found is None:
+        return total, {name: nothing[rows] for name, rows in there.where.items()}, None
+    total += found.occam
+    for rows in there.where.values():
+        groups = [g for g in found.groups if g.basis[rows].any()]
+        if groups:
+            total -= 0.5 * _penalty(groups, rows, found.values[rows])
+    return total, {name: found.values[rows] for name, rows in there.where.items()}, found
+
+
+class Evidence(NamedTuple):
+    """What the readings say for a state.
+
+    Attributes:
+        log: its logarithm, of both blocks.
+        state: with the weights that it was taken with.
+        in_plane: linear where it stands; None where nothing is fitted there.
+        found: the fit of that.
+    """
+
+    log: float
+    state: State
+    in_plane: Linear | None
+    found: Posterior | None
+
+
+def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evidence:
+    """Evidence of what is fitted, of the readings of some monitors, both blocks, what the model
+    lacks and the priors at their likeliest; up to a constant of the data.
+
+    Args:
+        state: that is weighed.
+        good: the monitors.
+        shares: of the readings that are independent: the same for states that are compared.
+    """
+    total, in_plane, found = 0.0, None, None
+    state = replace(state, good=good)
+    for block in (block for block in (1, 0) if state.reads(block)):
+        state = replace(look(state, block), independent=shares)
+        left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
+        total += 0.5 * log_scale(state, block)
+        total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
+        if state.of_block(block):
+            there = linear(state, block)
+            more, _, last = linear_evidence(there)
+            total += more
+            if block == 0:
+                in_plane, found = there, last
+    return Evidence(total, state, in_plane, found)
+
+
+def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
+    """That of `evidence_of`."""
+    return evidence_of(state, good, shares).log

@@ -1,0 +1,279 @@
+"""The state of a dense fit of an orbit response, and what may happen to it.
+
+Everything that is fitted is one frozen `State`; what happens to it is a function that gives another
+one: `bend`, `allow`, `jump`, `settle`, `look`.
+"""
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.family import Family
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.priors import GUESSED, Group
+from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.split import Split
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
+
+ALONE = 0.3
+"""A column whose misfit falls to this share by its own number has no other error to speak of."""
+FEW = 3
+"""Readings that it takes to judge the gain of a monitor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """Numbers of one variable that are wrong together and alone: a prior of their own, beside that
+    of their family, which so learns nothing from them.
+
+    Attributes:
+        cause: effect and place.
+        variable: whose numbers.
+        block: 0 in-plane, 1 coupling.
+        members: the numbers for a unit of the cause's amount, [number].
+        wide: prior rms of the amount.
+    """
+
+    cause: tuple[str, str | None]
+    variable: str
+    block: int
+    members: Array
+    wide: float
+
+    @property
+    def name(self) -> str:
+        """Of its prior."""
+        return f"alone: {self.cause[0]} {self.cause[1]}"
+
+
+class Kept(NamedTuple):
+    """What the ring's numbers of one variable do to the readings, and where that was taken."""
+
+    rows: Array  # [number, column, monitor]
+    gain: Array  # [column, monitor]
+    scale: Array  # [column]
+    at: Mapping[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything that is fitted.
+
+    Attributes:
+        data, split: what was measured, and who judges.
+        at: what the model reads with the values.
+        lacking: what the model lacks in-plane and across in each column, m: it lessens weights as
+            noise does, so that one corrector whose field is not where the model has it spoils no
+            magnet; [block, column].
+        good: monitors that are not bad, [monitor].
+        families: that are allowed.
+        values: by variable.
+        groups: the families' priors with what they have learnt, by name.
+        exploring: the inner correctors choose, and are not fitted.
+        kept: rows of the ring's variables, that stand until the ring has moved.
+        share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
+        apart: numbers that are wrong alone.
+        independent: share of the readings that tell something of their own, see `independent`,
+            [block, plane that is read]; None: all are taken to.
+        jitter: closed orbits that each step has an unknown amount of, as large as they typically
+            are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
+        guessed: rms of the logarithm of a family's size about its first guess.
+        unneeded: families that were tried: their numbers are taken for zero, and stated errors know
+            that they may not be (those of the ring, where they are few).
+    """
+
+    data: ResponseData
+    split: Split
+    at: Predicted
+    lacking: Array
+    good: Flags
+    families: tuple[Family, ...] = ()
+    values: Mapping[str, Array] = field(default_factory=dict)
+    groups: Mapping[str, Group] = field(default_factory=dict)
+    exploring: bool = True
+    kept: Mapping[str, Kept] = field(default_factory=dict)
+    share: Array | None = None
+    apart: tuple[Apart, ...] = ()
+    independent: Array | None = None
+    jitter: Array | None = None
+    guessed: float = GUESSED
+    unneeded: tuple[Family, ...] = ()
+
+    def of_block(self, block: int) -> tuple[Family, ...]:
+        """Families of a block."""
+        return tuple(family for family in self.families if family.block == block)
+
+    def reads(self, block: int) -> bool:
+        """Whether correctors that are fitted have readings of a block."""
+        orbits = self.data.pick(self.data.orbits, block)
+        return bool(np.isfinite(orbits[self.fitted][:, self.good]).any())
+
+    def allows(self, name: str) -> bool:
+        """Whether a family is in the fit."""
+        return any(family.name == name for family in self.families)
+
+    @property
+    def fitted(self) -> Flags:
+        """Correctors that are, [column]; the RF's monitors are split instead."""
+        out = self.split.held | (self.split.inner & self.exploring)
+        return np.asarray(~out & (np.arange(len(out)) < len(out) - 1))
+
+    def moved(self, values: Mapping[str, Array]) -> "State":
+        """With other values, and what the model reads with them."""
+        errors = Errors.none(self.data)
+        for family in {f.variable: f for f in self.families}.values():
+            errors = family.put(errors, values[family.variable], self.data)
+        return replace(self, values=values, at=Predicted(self.data, errors, self.at.bent))
+
+
+def begin(data: ResponseData, split: Split) -> State:
+    """The design."""
+    at = Predicted(data, Errors.none(data))
+    gap = data.pick(at.left)[~split.held]
+    size = float(np.nanmedian(np.abs(gap))) / 0.6745
+    return State(
+        data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
+    )
+
+
+def bend(state: State) -> State:
+    """With the third order of the steps where the fit stands. A ring that stores no beam with such
+    a step is far from the one that was measured, and keeps what it has."""
+    try:
+        return replace(state, at=state.at.bend())
+    except UnstableRingError:
+        return state
+
+
+def allow(state: State, families: Sequence[Family]) -> State:
+    """With more families, at zero or where they are to begin; those that are there stay."""
+    values = {f.variable: np.zeros(f.size(state.data)) for f in families}
+    begun = any(state.values.get(name, new).any() for name, new in values.items())
+    begun &= not {f.variable for f in state.families} >= set(values)
+    names = [family.name for family in families]
+    more = [family for family in families if not state.allows(family.name)]
+    state = replace(
+        state, families=(*state.families, *more), values={**values, **state.values},
+        unneeded=tuple(family for family in state.unneeded if family.name not in names),
+    )  # fmt: skip
+    return state.moved(state.values) if begun else state
+
+
+def forbid(state: State, families: Sequence[Family]) -> State:
+    """Without some families; numbers that no other family moves go back to zero."""
+    names = [family.name for family in families]
+    gone = {group.name for family in families for group in family.groups(state.data)}
+    left = tuple(family for family in state.families if family.name not in names)
+    values = {f.variable: state.values[f.variable] for f in left}
+    groups = {name: group for name, group in state.groups.items() if name not in gone}
+    unneeded = (*state.unneeded, *families)
+    return replace(state, families=left, groups=groups, unneeded=unneeded).moved(values)
+
+
+def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
+    """What each column alone says of its own number, from its near monitors: with the third order
+    of its step, or without it where that agrees better (it was taken at a kick twice too large).
+
+    Returns:
+        The change of the number, and the far readings' mean squares in units of the noise, without
+        it and with it, [column]; NaN for columns that are never fitted.
+    """
+    rows = family.rows(state.at, np.zeros(0))
+    left = state.data.pick(state.at.left, family.block)
+    noise = state.data.noise_of(family.block)
+    bent = state.data.pick(np.broadcast_to(state.at.bent, state.data.orbits.shape), family.block)
+    bent = state.at.gain(family.block) * bent
+    scale = 1 + state.at.errors.calibration[:, None]
+    # a kick is (1 + calibration) (linear + bent); only in its own plane
+    flat = (rows - bent, left + scale * bent) if family.block == 0 else (rows, left)
+    amounts, without, told = np.full((3, len(left)), np.nan)
+    for c in np.flatnonzero(~state.split.held[:-1]):
+        seen = np.isfinite(left[c]) & state.good
+        near, far = seen & state.split.half[c], seen & ~state.split.half[c]
+        if not rows[c, near].any():
+            continue
+        without[c] = np.mean((left[c, far] / noise[c, far]) ** 2)
+        for own, read in ((rows[c], left[c]), (flat[0][c], flat[1][c])):
+            (amount,), miss = amplitudes(own[:, None], read, near, far)
+            mean = np.mean((miss / noise[c, far]) ** 2)
+            if not mean >= told[c]:
+                amounts[c], told[c] = amount, mean
+    return amounts, without, told
+
+
+def by_monitors(state: State) -> Array:
+    """What each monitor alone says of its gains, over those that it has, x and y of each, [2 x
+    monitor]: from half of the columns that are fitted, where the other half agrees; else 1."""
+    model, orbits = (state.data.pick(own) for own in (state.at.read, state.data.orbits))
+    gains = np.ones((len(state.data.at), 2))
+    for p in (0, 1):
+        rows = np.flatnonzero(state.fitted & (state.data.plane == p))
+        for m in range(len(gains)):
+            seen = rows[np.isfinite(orbits[rows, m])]
+            near, far = seen[::2], seen[1::2]
+            size = float(model[near, m] @ model[near, m])
+            if len(far) < FEW or not size > 0:
+                continue
+            gain = float(model[near, m] @ orbits[near, m]) / size
+            without = np.sum((orbits[far, m] - model[far, m]) ** 2)
+            if np.sum((orbits[far, m] - gain * model[far, m]) ** 2) < ALONE**2 * without:
+                gains[m, p] = gain
+    return gains.ravel()
+
+
+def jump(state: State, beyond: float | None = None) -> State:
+    """Start large numbers of single columns at what the column alone says.
+
+    Args:
+        state: whose column families are looked at.
+        beyond: trusted changes; None: what is gross.
+    """
+    values = dict(state.values)
+    for family in state.families:
+        if family.per == "monitor" and not np.isinf(family.gross):
+            gains = by_monitors(state)
+            far = np.abs(gains - 1) > family.gross  # of a gain of zero nothing can be made
+            moved = np.where(far, (1 + values[family.variable]) * (gains - 1), 0.0)
+            values[family.variable] = values[family.variable] + moved
+        limit = family.gross if beyond is None else beyond * family.trust
+        if family.per != "column" or np.isinf(limit):
+            continue
+        amounts, without, told = by_columns(state, family)
+        far = state.fitted & (np.abs(amounts) > limit) & (told < ALONE**2 * without)
+        values[family.variable] = values[family.variable] + np.where(far, amounts, 0.0)
+    changed = any((values[name] != state.values[name]).any() for name in values)
+    return state.moved(values) if changed else state
+
+
+def rms_of(parts: Iterable[Array]) -> float:
+    """Over all of them; NaN where there is none."""
+    values = np.concatenate(list(parts))
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def amplitudes(
+    patterns: Array, data: Array, near: Flags, far: Flags, held: Array | None = None
+) -> tuple[Array, Array]:
+    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss.
+
+    Args:
+        patterns, data: m, [monitor, pattern] and [monitor].
+        near, far: [monitor].
+        held: by priors about zero, noise of a reading over the amplitude's rms, [pattern]; 0: free.
+    """
+    size = np.abs(patterns[near]).max(axis=0)
+    size[size == 0] = 1
+    rows, right = patterns[near] / size, data[near]
+    if held is not None:
+        rows = np.concatenate([rows, np.diag(held / size)])
+        right = np.concatenate([right, np.zeros(len(held))])
+    amounts = np.linalg.lstsq(rows, right, rcond=None)[0] / size
+    return amounts, data[far] - patterns[far] @ amounts

@@ -1,0 +1,87 @@
+"""The errors of a dense fit's numbers as they are told.
+
+>>> there = linear(state, 0)
+>>> posterior = solve(there.normal, there.groups, there.start, rounds=0)
+>>> sigma = stated(state, 0, there, posterior)
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.response.rounds import Linear, linear
+from tmlattice.diagnosis.response.state import Apart, State, allow
+from tmlattice.diagnosis.response.weights import taken, weight
+from tmlattice.inference import unknown_sizes
+from tmlattice.inference.clusters import Found, Rows, widened
+from tmlattice.inference.normal import Posterior
+from tmlattice.inference.unknown_sizes import MANY
+
+Array = NDArray[np.float64]
+
+
+def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
+    """Posterior errors, widened by what readings share (`of_readings`) and by what the sizes of
+    families are unknown by (`of_sizes`).
+
+    Args:
+        state: where the fit stands.
+        block: 0 in-plane, 1 coupling.
+        there: `linear` of that block.
+        posterior: solved from it.
+
+    Returns:
+        Of each number, in the order of `there`, [parameter].
+    """
+    more = np.sum(of_sizes(state, block, there) ** 2, axis=1)
+    return np.asarray(np.sqrt(of_readings(state, block, there, posterior) ** 2 + more))
+
+
+def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
+    """Posterior errors, widened where single columns, or monitors, contradict all others; see
+    `stated`."""
+    covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
+    found = Found.of(there.normal.matrix, covariance)
+    return _widened(state, block, there, posterior, found)
+
+
+def of_sizes(state: State, block: int, there: Linear) -> Array:
+    """What sizes of families add to the covariance that are unknown, of those too that were tried
+    and not needed: F, of F F^T, [parameter, direction]; see `stated`."""
+    tried = [
+        family
+        for family in state.unneeded
+        if family.block == block and family.per == "ring" and family.size(state.data) <= MANY
+    ]
+    whole = linear(allow(state, tried), block) if tried else there
+    gone = [group.name for family in tried for group in family.groups(state.data)]
+    more = unknown_sizes.of_sizes(whole.normal, whole.groups, whole.start, gone)
+    return more[: len(there.start)]  # what was tried comes after
+
+
+def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:
+    """By how much the variance of the amount of what is wrong alone grows so, as a factor.
+
+    Args:
+        state, there, posterior: as in `stated`; its block is that of the cause.
+        one: has a prior of its own in them.
+    """
+    ends = np.cumsum([group.basis.shape[1] for group in posterior.groups])
+    at = int(ends[[group.name for group in posterior.groups].index(one.name)]) - 1
+    covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
+    along = one.wide * posterior.spread @ posterior.covariance[:, [at]]
+    variance = one.wide**2 * posterior.covariance[[at], at]
+    found = Found(there.normal.matrix, covariance, along, variance)
+    (sigma,) = _widened(state, one.block, there, posterior, found)
+    return float(sigma**2 / variance[0])
+
+
+def _widened(state: State, block: int, there: Linear, posterior: Posterior, found: Found) -> Array:
+    data = state.data
+    rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
+    weights = weight(state, block)
+    left = np.where(weights > 0, data.pick(state.at.left, block), 0.0)
+    moved = posterior.values - there.start  # rounds end before the last digit
+    for column in np.flatnonzero(weights.any(axis=1)):
+        seen = np.flatnonzero(weights[column])
+        left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]
+    return widened(rows, weights, left, found, taken(state, block))

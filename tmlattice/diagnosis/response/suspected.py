@@ -1,0 +1,227 @@
+"""What each single cause would do to an orbit response beside all usual small errors.
+
+>>> seen = look_at(state, suspects_of(state, single_causes(state.data)))
+>>> seen.statistic, seen.amount
+
+A cause that one number of a family is (a quadrupole's gradient, a gain, a roll), or some together
+(a supply), costs nothing: the normal equations hold it. Others are weighed by their signatures.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
+from tmlattice.diagnosis.response.rounds import Linear, gathered, linear
+from tmlattice.diagnosis.response.small_errors import sizes_in
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import weighed, weight
+from tmlattice.effects import RingEffect, find
+from tmlattice.inference.normal import solve
+from tmlattice.inference.priors import Group
+from tmlattice.observe.orbit_response import Hypothesis
+
+Array = NDArray[np.float64]
+
+AFFORDABLE = 4e9
+"""Products of signatures with rows of the small errors that are taken: more causes, readings and
+errors than that, and only numbers of families are weighed."""
+BLIND = 1e-6
+"""Share of a signature that small errors leave of what can be seen beside them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """One cause.
+
+    Attributes:
+        cause: effect and place.
+        block: 0 in-plane, 1 coupling; None: both, by its signature.
+        variable: whose numbers it moves.
+        members: which, for a unit of its amount, [number].
+    """
+
+    cause: Hypothesis
+    block: int | None = None
+    variable: str = ""
+    members: Array | None = None
+
+
+def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Suspect]:
+    """How each cause is weighed; those that nothing here can tell are left out."""
+    numbers = _numbers(state)
+    found, signed = [], []
+    for cause in causes:
+        if cause in numbers:
+            block, variable, at, share = numbers[cause]
+            members = np.zeros(len(state.values[variable]))
+            members[at] = share
+            found.append(Suspect(cause, block, variable, members))
+        elif cause[1] is not None and isinstance(find(cause[0]), RingEffect):
+            signed.append(Suspect(cause))
+    size = sum(len(values) for values in state.values.values())
+    if len(signed) * state.data.orbits.size * size <= AFFORDABLE:
+        found += signed
+    return found
+
+
+def _numbers(state: State) -> dict[Hypothesis, tuple[int, str, list[int], list[float]]]:
+    """Causes that are numbers of the fit: block, variable, which ones, and how much of each."""
+    data, ring = state.data, state.data.ring
+    out: dict[Hypothesis, tuple[int, str, list[int], list[float]]] = {}
+    for family in state.families:
+        if family.name == "monitor_gain":
+            for m, name in enumerate(data.measured.monitors):
+                for p, plane in enumerate("xy"):
+                    key = (f"monitor_gain_{plane}", ring[name].name)
+                    out[key] = (0, family.variable, [2 * m + p], [1.0])
+        elif family.name == "monitor_roll":
+            for m, name in enumerate(data.measured.monitors):
+                for effect, across in (("monitor_roll", -1.0), ("monitor_coupling", 1.0)):
+                    key = (effect, ring[name].name)
+                    out[key] = (1, family.variable, [2 * m, 2 * m + 1], [1.0, across])
+        elif family.per == "column":
+            for c, name in enumerate(data.measured.correctors):
+                # a roll's number is a share of what the corrector is told, not of what it kicks
+                kick = 1 + state.at.errors.calibration[c] if family.block else 1.0
+                out[(family.name, ring[name].name)] = (family.block, family.variable, [c], [kick])
+        elif isinstance(family, QuadrupoleGradient):
+            _of_gradients(family, state, out)
+        elif isinstance(family, SkewGradient):
+            for i, pieces in enumerate(family.shares(data)):
+                for name, share in pieces.items():
+                    out[("skew_gradient", name)] = (1, family.variable, [i], [1.0])
+                    strength = ring[name].k1 * ring[name].length
+                    if strength and len(pieces) == 1:
+                        turned = [-2 * strength / share]
+                        out[("quadrupole_roll", name)] = (1, family.variable, [i], turned)
+        elif family.per == "ring":
+            for i, moves in enumerate(family.moves(data)):
+                for cause, share in moves.items():
+                    if len(moves) == 1 and cause[1] is not None:
+                        out[cause] = (family.block, family.variable, [i], [1 / share])
+    return out
+
+
+def _of_gradients(
+    family: QuadrupoleGradient,
+    state: State,
+    out: dict[Hypothesis, tuple[int, str, list[int], list[float]]],
+) -> None:
+    """Single ones, those of supplies, and the same as absolute ones."""
+    ring = state.data.ring
+    places = {name: i for i, own in enumerate(family.shares(state.data)) for name in own}
+    supplies: dict[str, list[int]] = {}
+    for name, i in places.items():
+        out[("quadrupole_gradient", name)] = (0, family.variable, [i], [1.0])
+        strength = ring[name].k1 * ring[name].length
+        out[("gradient_absolute", name)] = (0, family.variable, [i], [1 / strength])
+        supplies.setdefault(ring[name].family, []).append(i)
+    for supply, members in supplies.items():
+        if len(set(members)) > 1:
+            own = sorted(set(members))
+            out[("family_gradient", supply)] = (0, family.variable, own, [1.0] * len(own))
+
+
+# --- products -------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Of one block: the fit, what it leaves, and each suspect's products with both.
+
+    Attributes:
+        there: where the fit stands.
+        sizes: the small errors' priors, without those of what is wrong alone.
+        across: J^T W S, [number, suspect].
+        own, left: S^T W S, and S^T W r, [suspect].
+    """
+
+    there: Linear
+    sizes: tuple[Group, ...]
+    across: Array
+    own: Array
+    left: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """Each suspect beside small errors.
+
+    Attributes:
+        statistic: fall of chi-square, [suspect].
+        amount, sigma: best one, and its error, [suspect].
+        information: by block, [2, suspect].
+    """
+
+    statistic: Array
+    amount: Array
+    sigma: Array
+    information: Array
+
+
+class Seen:
+    """All suspects where a fit stands.
+
+    Args:
+        state: with small errors, and with what is wrong alone so far.
+        suspects: to be weighed.
+    """
+
+    def __init__(self, state: State, suspects: Sequence[Suspect]) -> None:
+        self.state, self.suspects = state, suspects
+        blocks = [block for block in (0, 1) if state.of_block(block)]
+        there = {block: linear(state, block) for block in blocks}
+        self.blocks = {block: self._block(block, there[block]) for block in blocks}
+        self._by_signature()
+
+    def _block(self, block: int, there: Linear) -> _Block:
+        across = np.zeros((len(there.normal.vector), len(self.suspects)))
+        for h, one in enumerate(self.suspects):
+            if one.block == block and one.variable in there.where:
+                across[there.where[one.variable], h] = one.members
+        left = there.normal.vector @ across
+        spread = there.normal.matrix @ across
+        own = np.einsum("nh,nh->h", across, spread)
+        return _Block(there, sizes_in(there), spread, own, left)
+
+    def _by_signature(self) -> None:
+        state = self.state
+        some = [h for h, one in enumerate(self.suspects) if one.block is None]
+        weights = {block: weight(state, block) for block in self.blocks}
+        left = {
+            block: np.where(w > 0, state.data.pick(state.at.left, block), 0.0)
+            for block, w in weights.items()
+        }
+        signatures = state.at.signatures([self.suspects[h].cause for h in some])
+        for h, signature in zip(some, signatures, strict=True):
+            for block, it in self.blocks.items():
+                row = np.where(weights[block] > 0, state.data.pick(signature, block), 0.0)
+                heavy = weighed(state, block, row)
+                it.own[h] = np.sum(heavy * row)
+                it.left[h] = np.sum(heavy * left[block])
+                it.across[:, h] = gathered(it.there, state.data.plane_of(block), heavy)
+
+    def beside(self, without: str | None = None) -> Weighed:
+        """Each suspect beside small errors and what is wrong alone.
+
+        Args:
+            without: the prior's name of one of these that is taken back: its rivals take its place.
+        """
+        shape = (2, len(self.suspects))
+        information, inner = np.zeros(shape), np.zeros(shape)
+        for block, it in self.blocks.items():
+            priors = [group for group in it.sizes if group.name != without]
+            found = solve(it.there.normal, priors, it.there.start, rounds=0)
+            along = found.spread.T @ it.across
+            taken = np.einsum("ph,ph->h", along, found.covariance @ along)
+            information[block] = np.maximum(it.own - taken, 0.0)
+            information[block][information[block] < BLIND * it.own] = 0.0
+            inner[block] = it.left - (found.values - it.there.start) @ it.across
+        inner[information == 0] = 0.0
+        total = information.sum(axis=0)
+        safe = np.where(total > 0, total, 1.0)
+        pull = inner.sum(axis=0)
+        amount = np.where(total > 0, pull / safe, 0.0)
+        sigma = np.where(total > 0, 1 / np.sqrt(safe), np.inf)
+        return Weighed(amount * pull, amount, sigma, information)
