@@ -415,9 +415,8 @@ def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evide
         shares: of the readings that are independent: the same for states that are compared.
     """
     total, in_plane, found = 0.0, None, None
-    state = replace(state, good=good)
     for block in (block for block in (1, 0) if state.reads(block)):
-        state = replace(look(state, block), independent=shares)
+        state = replace(look(state, block), good=good, independent=shares)
         left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
         total += 0.5 * log_scale(state, block)
         total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
