@@ -8,7 +8,7 @@ import pytest
 from tmlattice import diagnose
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.dense import fit_steps, told
+from tmlattice.diagnosis.response.dense import fit_steps, one_by_one, told
 from tmlattice.diagnosis.response.exchanged import (
     exchanged,
     exchanged_monitors,
@@ -21,6 +21,7 @@ from tmlattice.diagnosis.response.other_kicks import other_kicks
 from tmlattice.diagnosis.response.procedure import assumed_of
 from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
@@ -141,7 +142,7 @@ def test_a_step_whose_calibration_was_a_wrong_guess_is_not_odd(small_ring, clean
     """Diamond, 68 % from its design: +153 %, with the third order of such a step."""
     data = response_data(small_ring, clean)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    state = fit_steps(data, split, STEPS[:3]).state
+    *_, (_, state) = one_by_one(begin(data, split), STEPS[:3])  # with gains
     column = int(np.flatnonzero(state.fitted & (data.plane == 1))[0])
     values = {name: own.copy() for name, own in state.values.items()}
     values["calibration"][column] = 1.5
