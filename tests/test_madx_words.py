@@ -67,6 +67,12 @@ def test_edges_that_stand_by_themselves_are_those_of_the_bend(tmp_path):
         for tilt in ("0", "pi/2")
     )
     np.testing.assert_allclose(upright[[1, 3], [0, 2]], flat[[3, 1], [2, 0]], atol=1e-12)
+    # without a gap it is a thin quadrupole, turned the same way
+    edge = matrix(tmp_path, f"{D}e: dipedge, h=0.2, e1=0.08, tilt=0.3;\nring: line=(e, d);\n")
+    k1 = -0.2 * np.tan(0.08) / 1e-6
+    thin = matrix(tmp_path, f"q: quadrupole, l=1e-6, k1={k1}, tilt=0.3;\nring: line=(q);\n")
+    np.testing.assert_allclose(edge, thin, atol=2e-6)
+    assert abs(thin[1, 2]) > 1e-3
 
 
 def test_names_without_a_value_are_zero_and_told(tmp_path):

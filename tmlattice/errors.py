@@ -2,7 +2,7 @@
 
 import difflib
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def harmless(text: str) -> str:
@@ -29,6 +29,11 @@ def plain(text: str, longest: int | None = None) -> str:
     if longest is None or len(shown) <= longest:
         return shown
     return shown[: longest - 3] + "..."
+
+
+def first_of(names: Sequence[object], most: int = 5) -> str:
+    """The first few of several names, and whether there are more: "a, b, ..."."""
+    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
 
 
 class TmlatticeError(Exception):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.choice import chosen_effects
 from tmlattice.effects import Cause, expected_radiation, find, rare
-from tmlattice.errors import BeamLostError, MeasurementError
+from tmlattice.errors import BeamLostError, MeasurementError, first_of
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
@@ -166,8 +166,7 @@ def _dead_monitors(
     if absent:
         said.append(f"{absent} of the ring's {count} monitors are not in the measurement")
     if half:
-        some = ", ".join(half[:3]) + (", ..." if len(half) > 3 else "")
-        said.append(f"{len(half)} monitors read one plane only: {some}")
+        said.append(f"{len(half)} monitors read one plane only: {first_of(half, 3)}")
     if len(silent) > judgement.silent * count:
         said.append(f"{len(silent)} monitors have no signal; they count as not there")
         silent = []

@@ -9,13 +9,11 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from tmlattice.errors import LatticeError, plain, unknown_name
+from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.lattice.at_file import quiet_at, ring_from_at
 from tmlattice.lattice.madx_parsers import parser_of
 from tmlattice.lattice.ring import Ring
 
-NAMED = 5
-"""Undefined names that a warning tells."""
 _BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
 
 
@@ -59,10 +57,8 @@ def read_madx(
         raise _unreadable(path, error) from error
     if parser.undefined:
         names = parser.undefined
-        more = ", ..." if len(names) > NAMED else ""
         warnings.warn(
-            f"'{path}' does not define {', '.join(names[:NAMED])}{more} ({len(names)}): taken for "
-            "0, as by MAD-X",
+            f"'{path}' does not define {first_of(names)} ({len(names)}): taken for 0, as by MAD-X",
             stacklevel=2,
         )
     return ring_from_at(lattice, name, energy)

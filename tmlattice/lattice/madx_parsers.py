@@ -63,9 +63,6 @@ class _Zeros(dict[str, float]):
         self[name] = 0.0
         return 0.0
 
-    def __contains__(self, name: object) -> bool:
-        return True
-
 
 class _Bounded:
     """What stands before AT's parser of either language."""

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, cast
 
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, first_of
 from tmlattice.lattice.ring import Element, Kind, number_names
 
 log = logging.getLogger(__name__)
@@ -151,10 +151,9 @@ def _warn_of_octupoles(sources: Sequence[Any]) -> None:
     names = [str(s.id) for s in sources if isinstance(s, elements.Octupole) and s.k3 != 0]
     if names:
         kinds = list(dict.fromkeys(names))
-        more = ", ..." if len(kinds) > NAMED else ""
         warnings.warn(
             "octupoles are drifts in second-order maps, their fields are not modelled: "
-            f"{', '.join(kinds[:NAMED])}{more} ({len(names)})",
+            f"{first_of(kinds, NAMED)} ({len(names)})",
             stacklevel=4,
         )
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.errors import first_of
 from tmlattice.lattice.ring import Element, Ring
 from tmlattice.lattice.write_at import first_order, kicks, second_order
 
@@ -54,7 +55,7 @@ def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
         line.append(name)
     told = [f"{what} ({count} elements)" for what, count in left_out.items()]
     if several:
-        some = ", ".join(sorted(several)[:4]) + (", ..." if len(several) > 4 else "")
+        some = first_of(sorted(several), 4)
         told.append(f"members of {some} differ, and have names of their own: NAME..k for NAME::k")
     particle = "ELECTRON" if ring.radiates else "PROTON"
     content = [

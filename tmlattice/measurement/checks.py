@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, first_of
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.trajectory import Settings, check_settings
 
@@ -68,9 +68,7 @@ def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
     index = {shot: i for i, shot in enumerate(shots)}
     missing = [shot for shot in wanted if shot not in index]
     if missing:
-        known = ", ".join(str(s) for s in shots[:5])
-        more = ", ..." if len(shots) > 5 else ""
-        raise MeasurementError(f"no shot {missing[0]}; there are {known}{more}")
+        raise MeasurementError(f"no shot {missing[0]}; there are {first_of(shots)}")
     return [index[shot] for shot in wanted]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError, unknown_name
+from tmlattice.errors import MeasurementError, first_of, unknown_name
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
@@ -199,9 +199,8 @@ class Measurement(Shown):
             index = {shot: i for i, shot in enumerate(self.shots)}
             missing = [shot for shot in shots if shot not in index]
             if missing:
-                known = ", ".join(str(s) for s in self.shots[:5])
-                more = ", ..." if len(self.shots) > 5 else ""
-                raise MeasurementError(f"no shot {missing[0]}; there are {known}{more}")
+                known = first_of(self.shots)
+                raise MeasurementError(f"no shot {missing[0]}; there are {known}")
             part = part._take([index[shot] for shot in shots])
         if monitors is not None:
             names = Names("monitor", self.monitors)

@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import TooFewTurnsError
+from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.line_errors import change, growth, noise_at
@@ -167,8 +167,7 @@ def _say(said: Said, shot: int, sentence: str) -> None:
 
 
 def _shots(ids: Sequence[int]) -> str:
-    shown = ", ".join(str(i) for i in ids[:5]) + (", ..." if len(ids) > 5 else "")
-    return f"shot{'s' * (len(ids) > 1)} {shown}"
+    return f"shot{'s' * (len(ids) > 1)} {first_of(ids)}"
 
 
 def _shot(
@@ -252,7 +251,7 @@ def _silent(turns: TurnByTurn, noise: Array) -> list[str]:
     names = [turns.monitors[i] for i in np.flatnonzero((flat & read).any(axis=1))]
     if not names:
         return []
-    shown = ", ".join(f"'{name}'" for name in names[:5]) + (", ..." if len(names) > 5 else "")
+    shown = first_of([f"'{name}'" for name in names])
     one = len(names) == 1
     return [
         f"{'monitor' if one else 'monitors'} {shown} {'stands' if one else 'stand'} still or "

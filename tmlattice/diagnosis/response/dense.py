@@ -49,7 +49,7 @@ from tmlattice.diagnosis.response.state import (
     jump,
 )
 from tmlattice.diagnosis.response.stated import stated
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import TmlatticeError, first_of
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.observe.orbit_response import ResponseData
 from tmlattice.observe.split import Split
@@ -438,6 +438,6 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
         if names:
             said.append(
                 f"{len(names)} gradients that the prior holds more than the data: "
-                + ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-            )  # fmt: skip
+                + first_of(names, 12)
+            )
     return tuple(said)
