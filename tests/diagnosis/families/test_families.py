@@ -70,23 +70,46 @@ def test_causes_that_are_told_read_as_the_errors_that_were_fitted(data, rng, fam
     assert np.abs(told - fitted).max() < 5e-3 * change
 
 
+def ring_of(*elements):
+    """Of (name, kind, length) and, of bends, the angle, one behind the other."""
+    placed, end = [], 0.0
+    for name, kind, length, *angle in elements:
+        placed.append(
+            SimpleNamespace(
+                name=name, kind=kind, length=length, s=end + length / 2,
+                angle=angle[0] if angle else 0.0, is_magnet=kind not in ("drift", "marker"),
+            )
+        )  # fmt: skip
+        end += length
+    return SimpleNamespace(elements=placed, length=end)
+
+
+def wiggler(second):
+    return [
+        ("q1", "quadrupole", 0.2), ("d1", "drift", 2.0), ("w1", "bend", 0.1, 0.01),
+        ("w2", "bend", 0.1, second), ("d2", "drift", 2.0), ("q2", "quadrupole", 0.2),
+        ("d3", "drift", 2.0), ("q3", "quadrupole", 0.2),
+    ]  # fmt: skip
+
+
+def named(ring):
+    return [own.name for own in straights(ring)]
+
+
 def test_a_straight_beside_a_wiggler_in_bends_has_no_device_of_its_own():
     """LNLS: two drifts beside a wiggler at the ring's start ran to 0.13 and 0.19 1/m against it."""
+    assert named(ring_of(*wiggler(0.01))) == ["d1", "d2", "d3"]
+    assert named(ring_of(*wiggler(-0.01))) == ["d3"]
 
-    def one(name, kind, length, s, angle=0.0):
-        is_magnet = kind not in ("drift", "marker")
-        return SimpleNamespace(
-            name=name, kind=kind, length=length, s=s, angle=angle, is_magnet=is_magnet
-        )
 
-    def ring(second):
-        elements = [
-            one("q1", "quadrupole", 0.2, 0.1), one("d1", "drift", 2.0, 1.2),
-            one("w1", "bend", 0.1, 2.25, 0.01), one("w2", "bend", 0.1, 2.35, second),
-            one("d2", "drift", 2.0, 3.4), one("q2", "quadrupole", 0.2, 4.5),
-            one("d3", "drift", 2.0, 5.6), one("q3", "quadrupole", 0.2, 6.7),
-        ]  # fmt: skip
-        return SimpleNamespace(elements=elements, length=6.8)
-
-    assert [own.name for own in straights(ring(0.01))] == ["d1", "d2", "d3"]
-    assert [own.name for own in straights(ring(-0.01))] == ["d3"]
+def test_straights_are_the_same_wherever_the_lattice_begins():
+    """ALS begins in the middle of one, which had two numbers: 6.8 m with a marker at both ends."""
+    for second in (0.01, -0.01):
+        line = wiggler(second)
+        whole = sorted(named(ring_of(*line)))
+        for i in range(len(line)):
+            assert sorted(named(ring_of(*line[i:], *line[:i]))) == whole
+    cut = [("d1", "drift", 0.7), ("h", "hcorrector", 0.0), ("q", "quadrupole", 0.2),
+           ("d2", "drift", 0.9), ("q2", "quadrupole", 0.2), ("d3", "drift", 0.4)]  # fmt: skip
+    assert named(ring_of(*cut)) == ["d1"]  # 1.1 m in all
+    assert len(named(ring_of(("a", "marker", 0.0), *cut, ("b", "marker", 0.0)))) == 1

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,7 @@ def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[t
 
 def straights(ring: Ring, beside: bool = False) -> list[Element]:
     """Of every long way without a magnet the marker that is nearest to its middle, or the longest
-    drift where no marker stands.
+    drift where no marker stands; wherever the lattice begins.
 
     A way beside a wiggler that the lattice has as bends to and fro has none: the wiggler's own
     focusing is a number already, and two beside it would pull against it.
@@ -79,23 +80,48 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
         beside: ways beside such a wiggler too.
     """
     found, ways = list[Element](), list[Element]()
-    within, bends, begin = list[Element](), list[float](), 0.0
-    for element in ring.elements:
-        if not element.is_magnet or element.kind in ("hcorrector", "vcorrector"):
-            within.append(element)
+    within, bends = list[_Placed](), list[float]()
+    begin = np.inf  # of the first way, which ends the last turn's
+    for element, s in _around(ring):
+        if not _parts(element):
+            within.append(_Placed(element, s))
             continue
-        end = element.s - element.length / 2
+        end = s - element.length / 2
         if end - begin > STRAIGHT:
             ways += _middle(within, (begin + end) / 2)
-        within, begin = [], element.s + element.length / 2
+        within, begin = [], s + element.length / 2
         if element.kind == "bend":
             bends.append(element.angle)
             continue
         found += ways if beside else _outside(ways, bends)
         ways, bends = [], []
-    if ring.length - begin > STRAIGHT:
-        ways += _middle(within, (begin + ring.length) / 2)
     return found + (ways if beside else _outside(ways, bends))
+
+
+class _Placed(NamedTuple):
+    element: Element
+    s: float  # m, one turn further where the way to it goes through the lattice's first place
+
+
+def _parts(element: Element) -> bool:
+    """Whether the ways at its two ends are two."""
+    return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
+
+
+def _around(ring: Ring) -> list[_Placed]:
+    """A turn from a magnet to itself, both of them in it: from one that is no bend, if one is, for
+    bends to and fro are a wiggler."""
+    own = ring.elements
+    magnets = sorted(
+        (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)
+    )
+    if not magnets:
+        return []
+    first = magnets[0]
+    return [
+        *(_Placed(e, e.s) for e in own[first:]),
+        *(_Placed(e, e.s + ring.length) for e in own[: first + 1]),
+    ]
 
 
 def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
@@ -103,9 +129,13 @@ def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
     return [] if bends and min(bends) < 0 < max(bends) else list(ways)
 
 
-def _middle(within: Sequence[Element], middle: float) -> list[Element]:
-    markers = [e for e in within if e.kind == "marker"]
-    drifts = [e for e in within if e.kind == "drift" and e.length >= STRAIGHT / 2]
+def _middle(within: Sequence[_Placed], middle: float) -> list[Element]:
+    markers = [own for own in within if own.element.kind == "marker"]
+    drifts = [
+        own.element
+        for own in within
+        if own.element.kind == "drift" and own.element.length >= STRAIGHT / 2
+    ]
     if markers:
-        return [min(markers, key=lambda e: abs(e.s - middle))]
+        return [min(markers, key=lambda own: abs(own.s - middle)).element]
     return [max(drifts, key=lambda e: e.length)] if drifts else []
