@@ -72,7 +72,7 @@ def folders(tmp_path_factory, small_ring):
     )
     (place / "strange").mkdir()
     for file in (place / "weak").iterdir():
-        text = file.read_text().replace("last_a", "last_c").replace("table_sha256", "_")
+        text = file.read_text().replace("last_a", "v1").replace("table_sha256", "_")
         (place / "strange" / file.name).write_text(text)
     return place
 
@@ -186,7 +186,7 @@ def test_reference_and_single_shot(folders, tmp_path, schema):
         ([SMALL, "response"], "the noise of the readings is not stated"),
         ([SMALL, "weak", "--reference", "response"], "give a reference of the same kind"),
         ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
-        ([SMALL, "strange"], "no monitor 'last_c'; did you mean"),
+        ([SMALL, "strange"], "no monitor 'v1'; "),
         ([SMALL, "weak", "--effects", "quadrupole_gradiant"], "did you mean 'quadrupole_gradient'"),
         ([SMALL, "weak", "--effects", ","], "--effects"),
         ([SMALL, "weak", "--background", "quadrupole_roll=a"], "is no rms"),

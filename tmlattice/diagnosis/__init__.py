@@ -7,11 +7,13 @@
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from tmlattice.by_name import by_name
+from tmlattice.diagnosis.absent import in_the_lattice
 from tmlattice.diagnosis.kinds import Measured, kind_of
 from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
@@ -51,19 +53,42 @@ def diagnose(
             background, and known, what an earlier diagnosis left known of the ring as it found it
             (`diagnosis.twin`; first turns take it too), see `diagnosis.joint.diagnose_together`.
 
+    Monitors and correctors that the lattice lacks are left out, and told, where they are half of
+    the names at most.
+
     Of fewer than 100,000 readings the result is the same to the bit on any number of threads: a
     library that shares a product among them adds in another order, and is no quicker there. Of
     more it is the same to rounding.
 
     Raises:
         MeasurementError: data that cannot be used, or an option without meaning for them.
-        UnknownNameError: a monitor or an effect that does not exist.
+        UnknownNameError: an effect that does not exist, or names that mostly are not the lattice's.
     """
     from threadpoolctl import threadpool_limits
 
     one = 1 if _readings(measurement) < MANY else None
+    measurement, said = _in_the_lattice(ring, measurement)
+    for name in ("reference", "heldout"):
+        options[name], more = _in_the_lattice(ring, options.get(name))
+        said += [f"the {name}: {sentence}" for sentence in more if sentence not in said]
+        if options[name] is None:
+            del options[name]
     with threadpool_limits(one, "blas"):
-        return _diagnosed(ring, measurement, options)
+        found = _diagnosed(ring, measurement, options)
+    return replace(found, warnings=(*said, *found.warnings)) if said else found
+
+
+def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
+    """One measurement, or several by name, without what the lattice lacks."""
+    if not isinstance(measured, Mapping):
+        return in_the_lattice(ring, measured)
+    parts = {name: in_the_lattice(ring, own) for name, own in measured.items()}
+    said = [
+        f"{name}: {sentence}" if len(parts) > 1 else sentence
+        for name, (_, some) in parts.items()
+        for sentence in some
+    ]
+    return {name: own for name, (own, _) in parts.items()}, said
 
 
 def _readings(measurement: Any) -> int:

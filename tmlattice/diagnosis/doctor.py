@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
+from tmlattice.diagnosis.absent import in_the_lattice
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
 from tmlattice.diagnosis.stored_doctor import StoredData, stored_checks
@@ -87,15 +88,17 @@ def check_data(
 
     Raises:
         MeasurementError: an assumption without meaning for these data.
-        UnknownNameError: a monitor that the ring does not have, or an unknown assumption.
+        UnknownNameError: an unknown assumption, or names that mostly are not the lattice's.
     """
     begun = time.perf_counter()
     names = [monitor.name for monitor in ring.monitors]
+    data, absent = in_the_lattice(ring, data)
+    stated = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
     if not isinstance(data, Measurement | OrbitResponse):
-        return _of_stored(ring, data, assumed, begun)
+        return _of_stored(ring, data, assumed, stated, begun)
     kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
     few = signals.few(ring, data)
-    checks = [_stated(ring, data)]
+    checks = stated
     if few is not None:
         checks.append(few)
     elif isinstance(data, Measurement):
@@ -107,7 +110,9 @@ def check_data(
     return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
 
 
-def _of_stored(ring: Ring, data: StoredData, assumed: Sequence[str], begun: float) -> Checkup:
+def _of_stored(
+    ring: Ring, data: StoredData, assumed: Sequence[str], stated: Sequence[Check], begun: float
+) -> Checkup:
     if assumed:
         raise MeasurementError(
             f"'{assumed[0]}' cannot be assumed of {in_words(data)}: mend the data themselves"
@@ -116,7 +121,7 @@ def _of_stored(ring: Ring, data: StoredData, assumed: Sequence[str], begun: floa
         TurnByTurn: "turn_by_turn", ClosedOrbit: "closed_orbit", Dispersion: "dispersion",
         TuneReading: "tunes",
     }  # fmt: skip
-    checks = (_stated(ring, data), *stored_checks(ring, data))
+    checks = (*stated, *stored_checks(ring, data))
     return Checkup(kinds[type(data)], checks, _provenance(ring, assumed, False, begun))
 
 
