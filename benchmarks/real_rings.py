@@ -8,10 +8,10 @@ the result; beside them what the experts' own LOCO fit leaves of all the data th
 (its last model, in the file). Then the steps, kept and refused. `--iteration first` takes the
 model as it was before that fit; `--seed N` another split, `--seeds N` that many of them;
 `--families` seeks no single faults among small errors, which takes most of the time;
-`--pictures FOLDER` makes a picture a ring: what is left before and after, and the gradients.
-`--into FOLDER` writes a file for each ring and seed as it comes; what stands there already, of the
-same options and version, is told and not measured again, so that a long study can be stopped, and
-goes on.
+`--missing` weighs what the result still lacks, and tells a table of that; `--pictures FOLDER` makes
+a picture a ring: what is left before and after, and the gradients. `--into FOLDER` writes a file of
+each ring and seed as it comes; what stands there already, of the same options and code, is told and
+not measured again, so that a long study can be stopped, and goes on.
 
 Of several seeds each is told as it comes, and at the end the median and the worst, and by how much
 what was found scatters between them, in units of its stated errors: 0.5 is right where errors are
@@ -19,6 +19,7 @@ those of the readings, of which two seeds share four fifths; 1 where they share 
 """
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -110,12 +111,20 @@ def stands(path, made_with):
     return found if found.items() >= made_with.items() else None
 
 
+def code():
+    """What stands for the package's code: a digest of its files."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(tmlattice.__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 def ring(name, files, data, place, options):
     """One ring: what each seed found."""
     found = []
     source = None
-    made_with = {"tmlattice": tmlattice.__version__, "iteration": options.iteration,
-                 "families": options.families}  # fmt: skip
+    made_with = {"code": code(), "iteration": options.iteration, "families": options.families,
+                 "missing": options.missing}  # fmt: skip
     for seed in range(options.seed, options.seed + options.seeds):
         path = options.into and options.into / f"{name}-{seed}.json"
         one = stands(path, made_with)
@@ -124,7 +133,7 @@ def ring(name, files, data, place, options):
             try:
                 source = source or imported(name, files, data, place, options.iteration)
                 picture_of = None if seed > options.seed else options.pictures
-                one |= _diagnosed(*source, seed, picture_of, name)
+                one |= _diagnosed(*source, seed, options.missing, picture_of, name)
             except (TmlatticeError, np.linalg.LinAlgError) as error:
                 one |= {"error": str(error), "seconds": 0.0}
             if files and files[0].name.endswith(".loco.mat"):
@@ -162,10 +171,10 @@ def _figures(step):
     return f"{step['in_plane']:.2f}{jump} / {step['coupling']:.2f}{roll} / {rf}"
 
 
-def _diagnosed(lattice, folder, told, seed, pictures, name):
+def _diagnosed(lattice, folder, told, seed, missing, pictures, name):
     begun = time.process_time()
     ring, measurement = tmlattice.load_ring(lattice), read_measurement(folder)
-    found = tmlattice.diagnose(ring, measurement, seed=seed)
+    found = tmlattice.diagnose(ring, measurement, seed=seed, missing=missing)
     seconds = time.process_time() - begun
     if pictures:
         picture(found, pictures / f"real-{name}.png")
@@ -177,6 +186,8 @@ def _diagnosed(lattice, folder, told, seed, pictures, name):
         "fit": MICRO * found.fit_after.rms,
         "steps": [_step(step.as_json()) for step in found.steps],
         "refused": [_step(step.as_json()) for step in found.refused],
+        "findings": [own.words or f"{own.effect} {own.element}" for own in found.findings],
+        "hypotheses": [row.as_json() for row in found.hypotheses or ()],
         "warnings": list(found.warnings),
         "amounts": _amounts(found),
     }
@@ -248,6 +259,31 @@ def table(rings):
         )
 
 
+def table_of_missing(rings):
+    """What the first seed of each ring still lacks: those that help, or would."""
+    yield ("| ring | hypothesis | numbers | amount | sensible | in plane: alone | on top "
+           "| random | log evidence | so |")  # fmt: skip
+    yield "|" + "---|" * 10
+    for found in rings:
+        none, *rows = found[0].get("hypotheses") or [None]
+        if none is None:
+            continue
+        yield (f"| {found[0]['ring']} | none | | | | {MICRO * none['heldout_rms_in_plane']:.2f} | "
+               f"{MICRO * none['on_top_in_plane']:.2f} with all that help | | | |")  # fmt: skip
+        for row in rows:
+            if row["judgement"] == "excluded":
+                continue
+            keys = "heldout_rms_in_plane", "on_top_in_plane", "control_in_plane"
+            alone, on_top, random = (
+                "" if row[key] is None else f"{MICRO * row[key]:.2f}" for key in keys
+            )
+            yield (
+                f"| | {row['effect']} | {row['parameters']} | {row['amount']:.2g} ± "
+                f"{row['amount_sigma']:.1g} | {row['expected']} | {alone} | {on_top} | {random} | "
+                f"{row['evidence']:.0f} | {row['judgement']} |"
+            )
+
+
 def table_of_seeds(rings):
     """Median and worst of the seeds of each ring, and by how much what they found scatters."""
     keys = {"in_plane": "in plane", "with_jump": "with a jump", "coupling": "across",
@@ -305,6 +341,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--families", action="store_true")
+    parser.add_argument("--missing", action="store_true")
     parser.add_argument("--into", type=Path)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
@@ -323,6 +360,8 @@ def main():
             rings.append(ring(name, files, data, Path(place), options))
             print(*steps(rings[-1][0]), sep="\n", flush=True)
     print(*table(rings), "", *table_of_seeds(rings), sep="\n")
+    if options.missing:
+        print("", *table_of_missing(rings), sep="\n")
     for found in rings:
         good = [one for one in found if "error" not in one]
         for effect, (count, all_of_them, worst) in (scatter(good) if good else {}).items():

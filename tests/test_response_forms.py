@@ -10,11 +10,11 @@ import pytest
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response import few
+from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import fit_steps
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing import control, weigh
 from tmlattice.diagnosis.response.odd_readings import without_gross
-from tmlattice.diagnosis.response.procedure import assumed_of
 from tmlattice.diagnosis.response.strangers import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT

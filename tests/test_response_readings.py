@@ -8,6 +8,7 @@ import pytest
 from tmlattice import diagnose
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import fit_steps, one_by_one, told
 from tmlattice.diagnosis.response.exchanged import (
     exchanged,
@@ -18,7 +19,6 @@ from tmlattice.diagnosis.response.exchanged import (
 from tmlattice.diagnosis.response.odd_readings import odd_readings
 from tmlattice.diagnosis.response.odd_steps import odd_steps
 from tmlattice.diagnosis.response.other_kicks import other_kicks
-from tmlattice.diagnosis.response.procedure import assumed_of
 from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.state import begin
@@ -336,6 +336,23 @@ def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
     assert any("monitors that answer each as the other one should" in s for s in found.warnings)
     assert not any("resemble nothing" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
+
+
+@pytest.mark.parametrize("what", ["correctors", "monitors"])
+def test_what_is_exchanged_is_the_finding(small_ring, clean, what):
+    """A ring without another fault had been told to have no error."""
+    pair = ("v5", "v6") if what == "correctors" else (clean.monitors[4], clean.monitors[20])
+    found = diagnose(
+        small_ring, (put_right if what == "correctors" else monitors_back)(clean, [pair])
+    )
+    assert found.verdict == "located"
+    (one,) = (own for own in found.findings if own.words)
+    assert one.words == f"{what} {pair[0]} and {pair[1]} answer each as the other one should"
+    places = [small_ring[name].s for name in pair]
+    assert one.where[0] < min(places) < max(places) < one.where[1]
+    assert one.detection.statistic > 1e3
+    assert f"LOCATED: {what.capitalize()} {pair[0]} and" in found.report()
+    assert one.to_check in " ".join(found.report().split())
 
 
 @pytest.mark.parametrize("waves", [0.0, 3.0])

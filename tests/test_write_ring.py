@@ -10,12 +10,12 @@ from conftest import SMALL
 
 from tmlattice import Cause, load_ring, simulate
 from tmlattice.beam.chain import Chain
-from tmlattice.diagnosis.result import ring_tunes
 from tmlattice.effects import apply
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import write_ring
 from tmlattice.lattice.ring import PROTON_GEV
 from tmlattice.measurement import write_measurement
+from tmlattice.optics import ring_tunes
 
 FORMATS = ("ring.json", "ring.at.json", "ring.madx", "ring.seq", "ring.py")
 FOREIGN = FORMATS[1:]

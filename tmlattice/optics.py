@@ -20,6 +20,8 @@ from tmlattice.beam.assembly import Assembly
 from tmlattice.beam.chain import LayerChain, products
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
+from tmlattice.lattice import Ring
+from tmlattice.maps.magnets import ring_matrix
 from tmlattice.maps.taylor import symplectic_form
 
 Array = NDArray[np.float64]
@@ -140,6 +142,14 @@ def matrix_tunes(matrix: Array) -> Array:
     """
     values, _ = normal_modes(matrix)
     return _fractions(values)
+
+
+def ring_tunes(ring: Ring) -> list[float] | None:
+    """Fractions of Qx, Qy about the axis; None where there are none."""
+    try:
+        return [float(q) for q in matrix_tunes(ring_matrix(ring))]
+    except (UnstableRingError, np.linalg.LinAlgError):
+        return None
 
 
 def short_way(difference: Array) -> Array:

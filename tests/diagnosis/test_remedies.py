@@ -11,13 +11,13 @@ from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.next_measurement import LEAST, next_measurement
 from tmlattice.diagnosis.remedies import credible, leading, remedies_of, remedy_of, undone
-from tmlattice.diagnosis.result import Finding, faults_of, ring_tunes
+from tmlattice.diagnosis.result import Finding, faults_of
 from tmlattice.effects import CATALOGUE, Effect, apply
 from tmlattice.inference.newton import fit
 from tmlattice.inference.rivals import Rival
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
-from tmlattice.optics import off_momentum, twiss
+from tmlattice.optics import off_momentum, ring_tunes, twiss
 from tmlattice.report.plain import report_text
 from tmlattice.report.remedies import consequence_text
 

@@ -19,7 +19,7 @@ from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, w
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.left_out import spikes, with_silent
 from tmlattice.diagnosis.next_kind import next_kind
-from tmlattice.diagnosis.result import Diagnosis, JointView, ring_tunes
+from tmlattice.diagnosis.result import Diagnosis, JointView
 from tmlattice.diagnosis.stages import (
     held_out,
     misfit_of,
@@ -49,6 +49,7 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
+from tmlattice.optics import ring_tunes
 from tmlattice.version import __version__
 
 Array = NDArray[np.float64]

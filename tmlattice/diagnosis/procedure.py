@@ -28,7 +28,7 @@ from tmlattice.diagnosis.findings import (
 from tmlattice.diagnosis.next_kind import leading
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
-from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView, ring_tunes
+from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.effects import Cause, apply, background_rms
@@ -43,6 +43,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
+from tmlattice.optics import ring_tunes
 from tmlattice.version import __version__
 
 Array = NDArray[np.float64]

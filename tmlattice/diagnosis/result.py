@@ -15,16 +15,13 @@ from tmlattice.diagnosis.numbers import NumberRead
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.effects import Cause, apply
-from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
-from tmlattice.maps.magnets import ring_matrix
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 from tmlattice.observe.data import Data
-from tmlattice.optics import matrix_tunes
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response.dense import Step
@@ -79,6 +76,8 @@ class Finding(ShownFinding):
             set; empty without an effect.
         consequences: what it does to the stored beam, and what is left of that after the repair.
         seen_by: share of each measurement in what is known of its amount, where there are several.
+        words, to_check: what it is and what to look at, where that is known and no effect of the
+            catalogue is it; else empty.
     """
 
     effect: str | None
@@ -96,6 +95,8 @@ class Finding(ShownFinding):
     remedies: tuple[Remedy, ...] = ()
     consequences: Consequences | None = None
     seen_by: Mapping[str, float] | None = None
+    words: str = ""
+    to_check: str = ""
 
     @property
     def verdict(self) -> str:
@@ -136,6 +137,7 @@ class Finding(ShownFinding):
             "or_remedies": [remedy.as_json() for remedy in self.remedies[1:]],
             "consequences": None if self.consequences is None else self.consequences.as_json(),
             **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
+            **({"words": self.words, "to_check": self.to_check} if self.words else {}),
         }
 
 
@@ -438,11 +440,3 @@ class Diagnosis(ShownDiagnosis):
             "left_out": [dict(row) for row in self.left_out],
             "provenance": self.provenance,
         }
-
-
-def ring_tunes(ring: Ring) -> list[float] | None:
-    """Fractions of Qx, Qy about the axis; None where there are none."""
-    try:
-        return [float(q) for q in matrix_tunes(ring_matrix(ring))]
-    except (UnstableRingError, np.linalg.LinAlgError):
-        return None

@@ -221,7 +221,7 @@ def _near(ring: Ring, tunes: Array, used: Flags) -> Check:
 # --- tunes ----------------------------------------------------------------------------------------
 def _tunes(near: Array, data: TuneReading, ring: Ring) -> list[Check]:
     """Tunes [shot, 2], beside those of the design."""
-    from tmlattice.diagnosis.result import ring_tunes
+    from tmlattice.optics import ring_tunes
 
     design = ring_tunes(ring)
     if design is None:

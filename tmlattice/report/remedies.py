@@ -49,7 +49,7 @@ def remedy_text(remedy: Remedy) -> str:
 def title(finding: Finding) -> str:
     """A finding in one line."""
     if finding.remedy is None:
-        return "something that no effect of the catalogue explains"
+        return finding.words or "something that no effect of the catalogue explains"
     return remedy_text(finding.remedy)
 
 

@@ -119,11 +119,7 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "equivalent":
         return "; ".join(_open(finding) for finding in found) + "."
     if diagnosis.verdict == "located":
-        places = [f for f in found if f.effect is None and f.where is not None]
-        where = "; ".join(f"{f.where[0]:.1f} m to {f.where[1]:.1f} m" for f in places if f.where)
-        named = [f for f in found if f.effect is not None]
-        also = f" Besides: {'; '.join(_short(f) for f in named)}." if named else ""
-        return f"Something acts at s = {where}, and no effect of the catalogue explains it.{also}"
+        return _located_sentence(found)
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return steps_sentence(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.priors:
@@ -136,6 +132,16 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
             "places, explain it."
         )
     return "No error is seen: the design explains the readings within their noise."
+
+
+def _located_sentence(found: Sequence[Finding]) -> str:
+    unknown = [f.where for f in found if f.effect is None and f.where and not f.words]
+    where = "; ".join(f"{low:.1f} m to {high:.1f} m" for low, high in unknown)
+    acts = f"Something acts at s = {where}, and no effect of the catalogue explains it."
+    told = [f"{f.words[0].upper()}{f.words[1:]}." for f in found if f.words]
+    named = [_short(f) for f in found if f.effect is not None]
+    also = [f"Besides: {'; '.join(named)}."] if named else []
+    return " ".join([*([acts] if unknown else []), *told, *also])
 
 
 def steps_sentence(diagnosis: Diagnosis) -> str:
@@ -163,6 +169,8 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
 
 def _short(finding: Finding) -> str:
     if finding.remedy is None:
+        if finding.words:
+            return finding.words
         low, high = finding.where or (float("nan"), float("nan"))
         return f"something unnamed at {low:.1f} m to {high:.1f} m"
     return remedy_text(finding.remedy)
@@ -201,6 +209,9 @@ def advice(diagnosis: Diagnosis) -> str:
             "Small errors everywhere look like this: state them (--background all), or give a "
             "measurement of this machine from before the fault (--reference)."
         )
+    checks = dict.fromkeys(f.to_check for f in diagnosis.findings if f.to_check)
+    if diagnosis.verdict == "located" and checks:
+        return " ".join(checks)
     if diagnosis.verdict == "located":
         return (
             "Look at what stands there: hardware, apertures, cables of the monitors. More launches "
@@ -215,7 +226,7 @@ def headline(diagnosis: Diagnosis) -> str:
     if len(found) < 2:
         return verdict_sentence(diagnosis)
     several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "equivalent"]
-    unnamed = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "located"]
+    unnamed = [str(n) for n, f in enumerate(found, 1) if f.verdict == "located" and not f.words]
     since = "Since the reference: " if since_reference(diagnosis) else ""
     text = f"{since}{len(found)} findings."
     if several:
@@ -268,6 +279,8 @@ def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     remedy = finding.remedy
     if remedy is not None:
         rows += [("remedy", remedy.action), ("check", find(remedy.effect).to_check)]
+    elif finding.to_check:
+        rows.append(("check", finding.to_check))
     rows.append(("place", place_text(finding)))
     consequence = consequence_text(finding)
     if consequence:

@@ -25,12 +25,13 @@ from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradie
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import finding_of, with_consequences
+from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
 from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.first_guess import begun
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import left_open
-from tmlattice.diagnosis.response.procedure import as_diagnosis, assumed_of, provenance, trials_of
+from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import linear, marginal, settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding

@@ -8,6 +8,7 @@ the model's far too well for a stranger: it seems displaced by the way to its ne
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,14 @@ SHARE = 0.25
 """Of the mean square left of each of the two columns, left at most once they are exchanged."""
 
 Pair = tuple[str, str]
+
+
+class PutRight(NamedTuple):
+    """What was exchanged: planes of monitors, correctors, monitors."""
+
+    planes: list[str]
+    correctors: list[Pair]
+    monitors: list[Pair]
 
 
 def exchanged(state: State) -> list[Pair]:

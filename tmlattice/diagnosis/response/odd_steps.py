@@ -2,7 +2,7 @@
 not fitted, and judge nobody.
 
 >>> readings, steps = odd_steps(state)
->>> odd = readings.and_more(steps)
+>>> odd = readings.and_more(steps, *odd_in_the_end(settle(state)))
 >>> state = beside(state, odd.unread)
 """
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.response.displaced import Displaced, displaced, in_words
 from tmlattice.diagnosis.response.exchanged import exchanged
 from tmlattice.diagnosis.response.odd_readings import gross, told_gross
 from tmlattice.diagnosis.response.other_kicks import OtherKick, left_in_plane, other_kicks
@@ -34,17 +35,20 @@ class OddSteps:
     Attributes:
         unread: which readings are not used, [column, monitor, plane that is read].
         said: sentences of them.
+        misplaced: correctors among them that stand elsewhere than in the lattice.
     """
 
     unread: Flags
     said: tuple[str, ...] = ()
+    misplaced: tuple[Displaced, ...] = ()
 
     def and_more(self, *others: "OddSteps") -> "OddSteps":
         """With others."""
-        unread, said = self.unread, self.said
+        unread, said, misplaced = self.unread, self.said, self.misplaced
         for own in others:
             unread, said = unread | own.unread, (*said, *own.said)
-        return OddSteps(unread, said)
+            misplaced = (*misplaced, *own.misplaced)
+        return OddSteps(unread, said, misplaced)
 
 
 def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
@@ -55,7 +59,7 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
         state: with all families; without monitors' gains nothing is told, for these break triples
             and leave kicks, too.
     """
-    data, split = state.data, state.split
+    data = state.data
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
         return OddSteps(nothing), OddSteps(nothing)
@@ -83,11 +87,36 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
         if own.plane == data.plane[own.column]:  # its own kick is not known either
             unread[own.column] = True
     unread[left_in_plane(state, [own.column for own in others])] = True
-    gone = unread.all(axis=1)
-    if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
+    if not _enough(state, np.asarray(unread.all(axis=1))):
         return single, OddSteps(nothing)
     whole = np.broadcast_to(unread[:, None], nothing.shape)
     return single, OddSteps(whole, (*_torn(data, broken), *_kicked(state, others)))
+
+
+def odd_in_the_end(state: State) -> tuple[OddSteps, ...]:
+    """The same of a fit that has settled, of which less is usual; and before that, for these would
+    be told as kicked by something else, steps of correctors that stand elsewhere than in the
+    lattice: none where too few are left, and none that is to be put right.
+
+    Args:
+        state: settled with all families: before it is, gradients beside a corrector seem its place.
+    """
+    data, names = state.data, state.data.measured.correctors
+    swapped = {name for pair in exchanged(state) for name in pair}
+    far = [own for own in displaced(state) if names[own.column] not in swapped]
+    gone = np.zeros(len(data.plane), dtype=bool)
+    gone[[own.column for own in far]] = True
+    if not far or not state.allows(GAINS) or not _enough(state, gone):
+        return odd_steps(state)
+    whole = np.broadcast_to(gone[:, None, None], data.orbits.shape)
+    said = tuple(in_words(state, far, ", left out"))
+    return OddSteps(whole, said, tuple(far)), *odd_steps(beside(state, whole))
+
+
+def _enough(state: State, gone: Flags) -> bool:
+    """Whether columns are left to judge, to choose and to be fitted."""
+    split = state.split
+    return all(bool((own & ~gone).any()) for own in (split.held, split.inner, state.fitted))
 
 
 def _beside_own_kick(state: State) -> Array:

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.response.displaced import clear
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.torn_steps import orbits_of
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 TIMES = 5.0
 """What a step leaves, its own kick apart, over what the typical one leaves in the same plane."""
@@ -28,7 +30,7 @@ ALSO = 2.0
 SHARE = 0.15
 """Of the mean square of the far monitors, left at most beside one kick elsewhere."""
 HERE = 0.5
-"""Of the same beside a jump at the corrector's own place, at most."""
+"""Of the same beside a jump at the corrector's own place, at most: else it stands elsewhere."""
 ENOUGH, COLUMNS = 12, 5
 """Readings of a column, and columns of a plane, that it takes to say so."""
 
@@ -155,6 +157,7 @@ def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKic
     """
     far = np.arange(len(one.seen)) % 2 == 1
     near, patterns = ~far, kicks[:, one.seen]
+    every = np.ones(len(far), dtype=bool)
     own = one.own / max(float(np.abs(one.own).max()), 1e-300)
     size = max(float(own[near] @ own[near]), 1e-300)
     across = patterns[:, near] - np.outer(patterns[:, near] @ own[near], own[near]) / size
@@ -163,12 +166,25 @@ def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKic
     layer = int(np.argmax((across @ rest) ** 2 / squares))
     amount = float(across[layer] @ rest / squares[layer])
 
-    def missed(*more: Array) -> float:
+    def missed(*more: Array, among: Flags = every) -> float:
         patterns = np.column_stack([own, *more])
-        return float(np.mean(amplitudes(patterns, one.left, near, far)[1] ** 2))
+        left = amplitudes(patterns, one.left, near & among, far & among)[1]
+        return float(np.mean(left**2))
 
-    without, here = missed(), missed(state.at.jumps[one.column, one.seen, plane])
+    jump = state.at.jumps[one.column, one.seen, plane]
+    kicked = state.data.plane[one.column] == plane
+    without, here = missed(), missed(jump, among=_beside(state, one, jump) if kicked else every)
     beside_it = missed(patterns[layer])
     if beside_it > SHARE * without or beside_it > HERE * here:
         return None
     return OtherKick(one.column, plane, layer, amount)
+
+
+def _beside(state: State, one: _Column, jump: Array) -> Flags:
+    """Readings that a corrector may be asked for if it stands elsewhere, [reading]."""
+    monitors = state.data.shape[1]
+    seen = np.zeros(monitors, dtype=bool)
+    seen[one.seen] = True
+    patterns, left = np.zeros((monitors, 2)), np.zeros(monitors)
+    patterns[one.seen], left[one.seen] = np.column_stack([one.own, jump]), one.left
+    return clear(state, one.column, patterns, left, seen, kick=1.0)[one.seen]

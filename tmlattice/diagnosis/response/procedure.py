@@ -27,9 +27,11 @@ from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersio
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import swap_of, with_consequences
+from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
-from tmlattice.diagnosis.response.displaced import displaced
+from tmlattice.diagnosis.response.displaced import displaced, in_words
 from tmlattice.diagnosis.response.exchanged import (
+    PutRight,
     exchanged,
     exchanged_monitors,
     monitors_back,
@@ -47,7 +49,8 @@ from tmlattice.diagnosis.response.rf_by_others import rf_known_to
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.strangers import reversed_ones, strangers
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView, ring_tunes
+from tmlattice.diagnosis.response.unnamed import unnamed
+from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -55,17 +58,15 @@ from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import ResponseData, response_data
-from tmlattice.observe.response_noise import learnt_noise
+from tmlattice.observe.orbit_response import response_data
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
+from tmlattice.optics import ring_tunes
 
 Array = NDArray[np.float64]
 
 MISSING = 1.5
 """Chi2 per reading of the result above which an effect is missing."""
-UNDERSTATED = 2.0
-"""So many times the stated noise is told, where the readings show it."""
 PATTERNS = 8
 """The strongest patterns of what is left."""
 LARGE = 60_000
@@ -122,11 +123,11 @@ def diagnose_response(
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
     if few is None:
-        fit, measured, odd, swaps = _families(
+        fit, measured, odd, exchanges = _families(
             ring, measured, trials, holdout, max_effects, seed, progress
         )
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
-        fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
+        fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
         found, degenerate = told(fit.state)
         verdict = _verdict(fit, false_alarm)
         if findings:
@@ -140,7 +141,9 @@ def diagnose_response(
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
         **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in findings)
+    causes = tuple(
+        Cause(own.effect, own.element, own.amount or 0.0) for own in findings if own.effect
+    )
     return as_diagnosis(
         ring, fit, fit.state.at.errors.ring, found,
         noise_estimated=measured.noise is None,
@@ -162,34 +165,33 @@ def _families(
     most: int,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[DenseFit, OrbitResponse, list[str], list[str]]:
+) -> tuple[DenseFit, OrbitResponse, list[str], PutRight]:
     """The dense fit of what resembles the model; what was fitted, and what was done to it; and
-    monitors whose planes are exchanged."""
+    what is exchanged."""
     said: list[str] = []
-    swaps: list[str] = []
-    known: list[tuple[str, str]] = []
+    known = PutRight([], [], [])
     fit: DenseFit | None = None
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
-        pairs = [pair for pair in exchanged(state) if pair not in known]
+        pairs = [pair for pair in exchanged(state) if pair not in known.correctors]
         if pairs:
             said.append(told_exchanged(pairs))
-            known += pairs
+            known.correctors.extend(pairs)
             measured, fit = put_right(measured, pairs), None
             continue
         odd = strangers(state)
         strange = {name for name, _ in odd.monitors}
-        pairs = [pair for pair in exchanged_monitors(state, strange) if pair not in known]
+        pairs = [pair for pair in exchanged_monitors(state, strange) if pair not in known.monitors]
         if pairs:
             said.append(told_exchanged(pairs, "monitors"))
-            known += pairs
+            known.monitors.extend(pairs)
             measured, fit = monitors_back(measured, pairs), None
             continue
-        crossed = [name for name in swapped(state) if name not in swaps]
+        crossed = [name for name in swapped(state) if name not in known.planes]
         if crossed:
-            swaps += crossed
+            known.planes.extend(crossed)
             measured, fit = planes_back(measured, crossed), None
             continue
         if odd.any:
@@ -198,13 +200,13 @@ def _families(
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))
         elif fit is not None:
-            return fit, measured, [*said, *fit.said], swaps
+            return fit, measured, [*said, *fit.said], known
         fit = fit_steps(data, split, trials, most, progress)
 
 
 def _faults(
     fit: DenseFit,
-    swaps: Sequence[str],
+    exchanges: PutRight,
     effects: Sequence[str] | None,
     most: int,
     judgement: Judgement,
@@ -213,69 +215,16 @@ def _faults(
     """What is wrong alone among small errors, and the fit beside it."""
     state = fit.state
     ring = state.data.ring
-    found = [swap_of(state, name, judgement) for name in swaps
+    found = [swap_of(state, name, judgement) for name in exchanges.planes
              if effects is None or "monitor_swap" in effects]  # fmt: skip
+    if effects is None:
+        found += unnamed(state, exchanges, [*fit.misplaced, *displaced(state)])
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
         alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
         fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
     return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic)[:most])
-
-
-def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
-    """What the measurement does not say, and what is taken instead."""
-    said = []
-    if measured.noise is None or np.isnan(measured.noise).any():
-        x, y = (f"{1e6 * size:.2g} µm" for size in np.median(data.noise, axis=0))
-        said.append(
-            f"the noise of the readings is not stated; from what neighbouring monitors leave it is "
-            f"{x} in x and {y} in y (a jitter of the beam is not in it)"
-        )
-    else:
-        said += _understated(data)
-    rf = data.measured.rf
-    if rf is None or rf.orbit is None:
-        copied = measured.rf is not None and measured.rf.orbit is not None
-        why = (
-            "the RF step's orbit repeats to the last digit, is a model's and no measurement, and "
-            "is left out"
-            if copied
-            else "there is no RF step"
-        )
-        said.append(
-            f"{why}: dispersion is not known, and only what is usual tells the scale of all "
-            "correctors from that of all monitors"
-        )
-    for plane in (p for p in "xy" if p not in measured.planes):
-        said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")
-    for p, plane in enumerate("xy"):
-        own = data.orbits[:-1][data.plane[:-1] == p, :, p]
-        if len(own) and not np.isfinite(own).any():
-            said.append(f"no monitor reads {plane}: what acts in that plane alone is not known")
-    if not np.isfinite(data.pick(data.orbits, 1)[:-1]).any():
-        said.append(
-            "no corrector is read in the other plane: rolls and skew gradients are not known"
-        )
-    return said
-
-
-def _understated(data: ResponseData) -> list[str]:
-    """Where the readings scatter by far more than the noise that is stated."""
-    measured = data.measured  # in beam order
-    if measured.noise is None:
-        return []
-    try:
-        shown = learnt_noise(measured, np.array([data.ring[name].s for name in measured.monitors]))
-    except MeasurementError:  # too few readings say nothing
-        return []
-    stated = np.nanmedian(measured.noise, axis=0)
-    return [
-        f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors leave "
-        f"{1e6 * seen:.2g} µm of each other's readings: chi-square is as much too large"
-        for plane, own, seen in zip("xy", stated, shown[0], strict=True)
-        if seen > UNDERSTATED * own
-    ]
 
 
 def as_diagnosis(
@@ -407,7 +356,8 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
-    said += [*dispersion_by_kicks(fit.state.values, fit.state.data), *displaced(fit.state)]
+    said += dispersion_by_kicks(fit.state.values, fit.state.data)
+    said += in_words(fit.state, displaced(fit.state))
     return (*said, *odd_readings(fit.state))
 
 

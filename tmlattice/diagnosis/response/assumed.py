@@ -1,0 +1,69 @@
+"""What a response does not say, and what is taken instead; in sentences.
+
+>>> warnings = assumed_of(measured, response_data(ring, measured))
+"""
+
+import numpy as np
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_noise import learnt_noise
+
+UNDERSTATED = 2.0
+"""So many times the stated noise is told, where the readings show it."""
+
+
+def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
+    """What the measurement does not say, and what is taken instead."""
+    said = []
+    if measured.noise is None or np.isnan(measured.noise).any():
+        x, y = (f"{1e6 * size:.2g} µm" for size in np.median(data.noise, axis=0))
+        said.append(
+            f"the noise of the readings is not stated; from what neighbouring monitors leave it is "
+            f"{x} in x and {y} in y (a jitter of the beam is not in it)"
+        )
+    else:
+        said += _understated(data)
+    rf = data.measured.rf
+    if rf is None or rf.orbit is None:
+        copied = measured.rf is not None and measured.rf.orbit is not None
+        why = (
+            "the RF step's orbit repeats to the last digit, is a model's and no measurement, and "
+            "is left out"
+            if copied
+            else "there is no RF step"
+        )
+        said.append(
+            f"{why}: dispersion is not known, and only what is usual tells the scale of all "
+            "correctors from that of all monitors"
+        )
+    for plane in (p for p in "xy" if p not in measured.planes):
+        said.append(f"no corrector kicks in {plane}: what acts in that plane alone is not known")
+    for p, plane in enumerate("xy"):
+        own = data.orbits[:-1][data.plane[:-1] == p, :, p]
+        if len(own) and not np.isfinite(own).any():
+            said.append(f"no monitor reads {plane}: what acts in that plane alone is not known")
+    if not np.isfinite(data.pick(data.orbits, 1)[:-1]).any():
+        said.append(
+            "no corrector is read in the other plane: rolls and skew gradients are not known"
+        )
+    return said
+
+
+def _understated(data: ResponseData) -> list[str]:
+    """Where the readings scatter by far more than the noise that is stated."""
+    measured = data.measured  # in beam order
+    if measured.noise is None:
+        return []
+    try:
+        shown = learnt_noise(measured, np.array([data.ring[name].s for name in measured.monitors]))
+    except MeasurementError:  # too few readings say nothing
+        return []
+    stated = np.nanmedian(measured.noise, axis=0)
+    return [
+        f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors leave "
+        f"{1e6 * seen:.2g} µm of each other's readings: chi-square is as much too large"
+        for plane, own, seen in zip("xy", stated, shown[0], strict=True)
+        if seen > UNDERSTATED * own
+    ]
