@@ -525,7 +525,7 @@ def test_the_errors_of_a_known_machine_are_those_stated(small_ring):
     assert np.std(beta / expected - 1) < 3e-3
 
 
-def test_report_and_json(result):
+def test_report_and_json(small_ring, result):
     schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
     document = result.as_json()
     jsonschema.validate(json.loads(json.dumps(document)), schema)
@@ -533,6 +533,12 @@ def test_report_and_json(result):
     text = report_text(result)
     assert "NAMED: 5 faults" in text  # and no small errors beside them
     assert "QD::5" in text
+    (line,) = (line for line in text.splitlines() if line.startswith("beta beat, rms [%]"))
+    told = [float(word) for word in line.split()[-3::2]]
+    sick = apply(small_ring, [c for c in CAUSES if c.effect == "quadrupole_gradient"])
+    expected, design = (twiss(TaylorNetwork.from_ring(ring)).beta for ring in (sick, small_ring))
+    beat = 100 * np.sqrt(np.mean((expected / design - 1) ** 2, axis=0))
+    assert np.allclose(told, beat, rtol=0.1, atol=0.02)  # the places are others
 
 
 def test_command(tmp_path, measured, result):

@@ -122,6 +122,28 @@ def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, mo
     assert own.evidence < 0
 
 
+def test_fields_that_their_neighbours_shift_are_weighed_by_the_magnets_beside_them(
+    small_ring, whole
+):
+    """All vertical correctors between the same two families by 2 cm."""
+    data = response_data(small_ring, whole)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    trials = [replace(STEPS[0], families=STEPS[0].families[:1]), *STEPS[1:3]]
+    name = "corrector_position_neighbours"
+    patterns = HYPOTHESES[name](fit_steps(data, split, trials).state).patterns
+    counts = (np.abs(patterns).max(axis=2) > 0).sum(axis=1)
+    assert (counts > 1).all()
+    response = data.measured.response.copy()
+    own = np.arange(len(response))[:, None], np.arange(response.shape[1]), data.plane[:-1, None]
+    shift = 0.02 * patterns[int(np.argmax(counts))][:-1]
+    response[own] += shift
+    moved = response_data(small_ring, replace(data.measured, response=response))
+    none, row = weigh(fit_steps(moved, split, trials).state, [name])
+    assert row.judgement == "helps"
+    assert row.heldout_rms_in_plane < 0.7 * none.heldout_rms_in_plane
+    assert row.amount * np.sqrt(row.parameters) == pytest.approx(0.02, rel=0.2)
+
+
 def test_no_causes_are_sought_of_kicks_beyond_all_measure(small_ring, whole, monkeypatch):
     """A ring with all gradients 1 % off had its tunes mended by kicks of centimetres' orbit, for
     100 s, before anything was fitted."""

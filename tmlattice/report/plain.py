@@ -7,7 +7,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
-from tmlattice.report.tables import LARGE_TITLE, NUMBERS, large_text, number_rows
+from tmlattice.report.tables import LARGE_TITLE, NUMBERS, large_text, number_rows, optics_rows
 from tmlattice.report.text import (
     advice,
     closed_text,
@@ -29,6 +29,9 @@ WIDTH = 100
 
 MOST = 8
 """Tunes that are listed; the page has all."""
+
+OPTICS = ("stored beam", "design", "as found")
+"""Head of `optics_rows`."""
 
 SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 
@@ -64,6 +67,8 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         for name, text in small:
             lines += wrapped(text, f"   {name:<{size}}   ", width)
     if diagnosis.steps:
+        if diagnosis.causes:
+            lines += ["", *columns([OPTICS, *optics_rows(diagnosis)])]
         lines += ["", *steps_text(diagnosis, width)]
     if diagnosis.verdict == "nothing":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])

@@ -16,6 +16,7 @@ from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
+from tmlattice.lattice.slices import stem
 from tmlattice.observe.orbit_response import DELTA
 
 Array = NDArray[np.float64]
@@ -102,15 +103,30 @@ def _corrector_energy(state: State) -> Hypothesis:
     )  # fmt: skip
 
 
-def _position(state: State, by_family: bool) -> Hypothesis:
+def _position(
+    state: State, which: str, names: Callable[[State], list[str]] | None = None
+) -> Hypothesis:
+    """Each corrector's own, or one amount for all whose names begin alike."""
     jumps = _readings(state, state.at.jumps) * state.data.kicks[:, None]
-    name = "corrector's field displaced in s"
-    if not by_family:
-        return Hypothesis(name + ", each", "m", "< 0.05 m", jumps[None], own=True, most=0.05)
-    _, members = families([*state.data.measured.correctors, "\0"])
-    return Hypothesis(
-        name + ", by family", "m", "< 0.05 m", members.T[:, :, None] * jumps[None], most=0.05
-    )
+    rows = jumps[None]
+    if names is not None:
+        members = families([*names(state), "\0"])[1]
+        rows = members.T[:, :, None] * rows
+    name = f"corrector's field displaced in s, {which}"
+    return Hypothesis(name, "m", "< 0.05 m", rows, own=names is None, most=0.05)
+
+
+def _neighbours(state: State) -> list[str]:
+    """Of each corrector its plane and the families that it stands between: their iron moves and
+    shortens its field."""
+    ring, measured = state.data.ring, state.data.measured
+    own = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
+    ends = np.array([e.s for e in own])
+    behind = np.searchsorted(ends, [ring[name].s for name in measured.correctors]) % len(own)
+    return [
+        f"{plane} {stem(own[i - 1].name)} {stem(own[i].name)}"
+        for plane, i in zip(measured.planes, behind, strict=True)
+    ]
 
 
 def _energy_drift(state: State) -> Hypothesis:
@@ -261,8 +277,13 @@ HYPOTHESES: dict[str, Callable[[State], Hypothesis | None]] = {
     "orbit_drift": _orbit_drift,
     "gradient_drift": _tune_drift,
     "corrector_energy": _corrector_energy,
-    "corrector_position_family": lambda state: _position(state, True),
-    "corrector_position": lambda state: _position(state, False),
+    "corrector_position_family": lambda state: _position(
+        state, "by family", lambda own: list(own.data.measured.correctors)
+    ),
+    "corrector_position_neighbours": lambda state: _position(
+        state, "by the magnets beside it", _neighbours
+    ),
+    "corrector_position": lambda state: _position(state, "each"),
     "energy_spread": _energy_spread,
     "energy_offset": _energy_offset,
     "dispersion": _dispersion,
