@@ -38,8 +38,10 @@ def test_places_between_elements_lie_on_the_orbit(small_ring):
 def test_names_of_findings_that_stand_together_step_aside(small_ring):
     """The name of the last but one would stand on that of the one before, from the other side."""
     places = {"a": 10.0, "b": 11.0, "c": 12.0, "end_1": 13.2, "QF::3": 20.0, "d": 60.0}
-    found = [SimpleNamespace(s=s, where=None, element=name) for name, s in places.items()]
-    nowhere = SimpleNamespace(s=None, where=None, element=None)
+    found = [
+        SimpleNamespace(s=s, where=None, element=name, label=name) for name, s in places.items()
+    ]
+    nowhere = SimpleNamespace(s=None, where=None, element=None, elements=())
     plan_of = survey(small_ring)
     diagnosis = SimpleNamespace(ring=small_ring, findings=(*found, nowhere))
     placed = plan.placed(diagnosis, plan_of)

@@ -14,9 +14,7 @@ from tmlattice.diagnosis.remedies import remedies_of, remedy_of
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
-from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
@@ -243,5 +241,5 @@ def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
     as_read = np.nansum((d[:, ::-1] - model) ** 2 - (d - model) ** 2, axis=0)
     statistic = float(np.sum(as_read / data.noise[at] ** 2))
     cause = Cause("monitor_swap", data.ring[name].name, 1.0)
-    seen = Detection(statistic, CLEAR, min(1.0, 2 * len(data.at) * chi2.sf(statistic, 1)))
+    seen = Detection.among(statistic, 2 * len(data.at))
     return finding_of(data.ring, [cause], np.ones(1), [cause], 0.0, seen, judgement.mass)

@@ -76,8 +76,8 @@ class Finding(ShownFinding):
             set; empty without an effect.
         consequences: what it does to the stored beam, and what is left of that after the repair.
         seen_by: share of each measurement in what is known of its amount, where there are several.
-        words, to_check: what it is and what to look at, where that is known and no effect of the
-            catalogue is it; else empty.
+        words, to_check, elements: what it is, what to look at, and which elements it is of, where
+            that is known and no effect of the catalogue is it; else empty.
     """
 
     effect: str | None
@@ -97,6 +97,12 @@ class Finding(ShownFinding):
     seen_by: Mapping[str, float] | None = None
     words: str = ""
     to_check: str = ""
+    elements: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """What it is of, where there is little room."""
+        return self.element or ", ".join(self.elements) or "unnamed"
 
     @property
     def verdict(self) -> str:
@@ -116,6 +122,7 @@ class Finding(ShownFinding):
         where = None
         if self.where is not None:
             where = {"s_from": self.where[0], "s_to": self.where[1]}
+        told = {"words": self.words, "to_check": self.to_check, "elements": list(self.elements)}
         return {
             "effect": self.effect,
             "element": self.element,
@@ -137,7 +144,7 @@ class Finding(ShownFinding):
             "or_remedies": [remedy.as_json() for remedy in self.remedies[1:]],
             "consequences": None if self.consequences is None else self.consequences.as_json(),
             **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
-            **({"words": self.words, "to_check": self.to_check} if self.words else {}),
+            **(told if self.words else {}),
         }
 
 

@@ -18,6 +18,7 @@ class ShownFinding(Speaks):
     amount_sigma: float | None
     unit: str | None
     probability: float
+    words: str
     where: tuple[float, float] | None
 
     def _told(self) -> tuple[str, dict[str, str]]:
@@ -26,7 +27,9 @@ class ShownFinding(Speaks):
 
     @property
     def in_short(self) -> str:
-        """Effect, element and amount, as the catalogue calls them."""
+        """Effect, element and amount, as the catalogue calls them; else what it is in words."""
+        if self.words:
+            return self.words
         what = " ".join(word for word in (self.effect or "no known effect", self.element) if word)
         if self.amount is None:
             return what

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
+from tmlattice.inference import chi2
+from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.newton import Fit, Outcome, fit, settled
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
@@ -39,6 +41,11 @@ class Detection:
     statistic: float
     threshold: float
     p_value: float
+
+    @classmethod
+    def among(cls, statistic: float, count: int) -> "Detection":
+        """Of one of so many, each a chi-square of one degree of freedom if nothing is there."""
+        return cls(statistic, CLEAR, min(1.0, count * float(chi2.sf(statistic, 1))))
 
 
 def rivals(

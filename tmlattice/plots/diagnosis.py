@@ -275,8 +275,9 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
     ]
     placed = [(s, finding) for s, finding in placed if low <= s <= high]
     for k, (s, finding) in enumerate(placed):
-        name = finding.remedy.effect if finding.remedy is not None else "unnamed"
-        text = f"{name.replace('_', ' ')} {brief(finding.element or '')}".strip()
+        name = finding.remedy.effect if finding.remedy is not None else ""
+        own = finding.label if finding.element or not name else ""
+        text = f"{name.replace('_', ' ')} {brief(own)}".strip()
         left = s > low + 0.6 * (high - low)
         ax.annotate(
             text, (s, 0.97 - 0.05 * (k % 6)), xycoords=("data", "axes fraction"),

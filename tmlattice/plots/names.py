@@ -7,3 +7,8 @@ LONGEST = 22
 def brief(name: str) -> str:
     """A name; of a long one the end, which is where names differ."""
     return name if len(name) <= LONGEST else f"…{name[-LONGEST:]}"
+
+
+def plural(kind: str) -> str:
+    """Of a kind of elements."""
+    return f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.lattice.survey import Survey, survey
-from tmlattice.plots.names import brief
+from tmlattice.plots.names import brief, plural
 from tmlattice.plots.strip import COLOURS
 
 Array = NDArray[np.float64]
@@ -55,6 +55,8 @@ def place_of(finding: Finding, diagnosis: Diagnosis, plan: Survey) -> Array | No
     """Where a finding stands, (x, y), m; None where it has no place."""
     if finding.s is not None:
         return plan.along(finding.s, diagnosis.ring)
+    if finding.elements:
+        return plan.along(diagnosis.ring[finding.elements[0]].s, diagnosis.ring)
     if finding.where is None or finding.effect is not None:
         return None
     return plan.along(float(np.mean(finding.where)), diagnosis.ring)
@@ -103,7 +105,7 @@ def _meet(one: Array, other: Array) -> bool:
 
 def label(number: int, finding: Finding) -> str:
     """A finding's number and name."""
-    return f"{number}. {brief(finding.element or 'unnamed')}"
+    return f"{number}. {brief(finding.label)}"
 
 
 def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
@@ -120,22 +122,19 @@ def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     for kind, places in groups(diagnosis).items():
         if kind in SMALL:
             look, at = SMALL[kind], beside(plan, kind, places)
-            ax.plot(*at.T, look.marker, color=look.colour, ms=1.5, zorder=3, label=f"{kind}s")
+            ax.plot(*at.T, look.marker, color=look.colour, ms=1.5, zorder=3, label=plural(kind))
             continue
         arcs = [(plan.ends[i], plan.middle[i], plan.ends[i + 1]) for i in places]
-        lines = LineCollection(arcs, colors=COLOURS[kind], linewidths=3, label=f"{kind}s")
+        lines = LineCollection(arcs, colors=COLOURS[kind], linewidths=3, label=plural(kind))
         ax.add_collection(lines)
     for number, finding, place, lines_off in placed(diagnosis, plan):
         ax.plot(*place, "o", ms=16, mfc="none", mec=CULPRIT, mew=2.2, zorder=5)
-        high, side = inwards(place, plan)
-        off = {"left": -12, "right": 12, "top": 12, "bottom": -12, "middle": 0}
-        ax.annotate(
-            label(number, finding), (place[0], place[1]),
-            xytext=(off[side], off[high] + 14 * lines_off * (1 if off[high] >= 0 else -1)),
-            textcoords="offset points",
-            ha="right" if side == "left" else "left",
-            va={"top": "bottom", "bottom": "top"}.get(high, "center"),
-            color=CULPRIT, fontweight="bold", zorder=6,
+        name = label(number, finding)
+        (left, low), (right, high) = _box(place, name, lines_off, plan)
+        to_left = inwards(place, plan)[1] == "left"
+        ax.text(
+            right if to_left else left, (low + high) / 2, name, va="center",
+            ha="right" if to_left else "left", color=CULPRIT, fontweight="bold", zorder=6,
         )  # fmt: skip
     for suspect in diagnosis.suspects:
         at = plan.at([suspect.element])[0]

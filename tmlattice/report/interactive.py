@@ -30,6 +30,7 @@ from tmlattice.plots.diagnosis import (
     noise_rms,
     thresholds,
 )
+from tmlattice.plots.names import plural
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.report.tables import standouts
@@ -165,7 +166,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         colour = plan_view.SMALL[kind].colour if small else strip_view.COLOURS[kind]
         at = plan_view.beside(view, kind, places)
         own = [ring.elements[i] for i in places]
-        trace = _trace(at[:, 0], at[:, 1], f"{kind}s", colour, mode="markers",
+        trace = _trace(at[:, 0], at[:, 1], plural(kind), colour, mode="markers",
                        size=3 if small else 4, told=f"<br>{kind}",
                        text=[f"{e.name}<br>s = {e.s:.2f} m" for e in own])  # fmt: skip
         trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
@@ -173,7 +174,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
     for number, finding, place, lines_off in plan_view.placed(diagnosis, view):
         high, side = plan_view.inwards(place, view)
         aside = "<br>\u00a0" * lines_off * (2 if high == "middle" else 1)
-        name = finding.element or "unnamed"
+        name = finding.label
         traces.append({
             **_trace(place[:1], place[1:], name, "@culprit", mode="markers", size=20,
                      text=[plan_view.label(number, finding)], showlegend=False,

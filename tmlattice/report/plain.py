@@ -7,7 +7,14 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
-from tmlattice.report.tables import LARGE_TITLE, NUMBERS, large_text, number_rows, optics_rows
+from tmlattice.report.tables import (
+    LARGE_TITLE,
+    NUMBERS,
+    OPTICS,
+    large_text,
+    number_rows,
+    optics_rows,
+)
 from tmlattice.report.text import (
     advice,
     closed_text,
@@ -29,9 +36,6 @@ WIDTH = 100
 
 MOST = 8
 """Tunes that are listed; the page has all."""
-
-OPTICS = ("stored beam", "design", "as found")
-"""Head of `optics_rows`."""
 
 SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 

@@ -142,6 +142,9 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     ]
 
 
+OPTICS = ("stored beam", "design", "as found")
+"""Head of `optics_rows`."""
+
 NUMBERS = ("tunes", "read", "design", "as found")
 """Head of `number_rows`."""
 

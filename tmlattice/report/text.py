@@ -27,6 +27,8 @@ __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  #
 # --- words for parts ------------------------------------------------------------------------------
 def place_text(finding: Finding) -> str:
     """Where a finding sits: metres, and the monitors on both sides."""
+    if finding.s is None and finding.elements:
+        return f"at {' and '.join(finding.elements)}"
     if finding.where is None:
         return "no place: the whole beam, or all elements of a kind"
     low, high = finding.where
@@ -119,7 +121,7 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "equivalent":
         return "; ".join(_open(finding) for finding in found) + "."
     if diagnosis.verdict == "located":
-        return _located_sentence(found)
+        return _located_sentence(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return steps_sentence(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.priors:
@@ -134,13 +136,15 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
     return "No error is seen: the design explains the readings within their noise."
 
 
-def _located_sentence(found: Sequence[Finding]) -> str:
+def _located_sentence(diagnosis: Diagnosis) -> str:
+    found = diagnosis.findings
     unknown = [f.where for f in found if f.effect is None and f.where and not f.words]
     where = "; ".join(f"{low:.1f} m to {high:.1f} m" for low, high in unknown)
     acts = f"Something acts at s = {where}, and no effect of the catalogue explains it."
     told = [f"{f.words[0].upper()}{f.words[1:]}." for f in found if f.words]
     named = [_short(f) for f in found if f.effect is not None]
     also = [f"Besides: {'; '.join(named)}."] if named else []
+    also += [steps_sentence(diagnosis)] if len(diagnosis.steps) > 1 else []
     return " ".join([*([acts] if unknown else []), *told, *also])
 
 
@@ -194,11 +198,12 @@ def _open(finding: Finding) -> str:
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
+    everywhere = (
+        "Look at what stands out of its kind, set the gradients that --repaired-out writes, and "
+        "measure again."
+    )
     if diagnosis.verdict == "distributed" and diagnosis.steps:
-        return (
-            "Look at what stands out of its kind, set the gradients that --repaired-out writes, "
-            "and measure again."
-        )
+        return everywhere
     if diagnosis.verdict == "distributed" and diagnosis.priors:
         return (
             "A measurement of this machine from before the fault (--reference) shows a fault that "
@@ -211,7 +216,7 @@ def advice(diagnosis: Diagnosis) -> str:
         )
     checks = dict.fromkeys(f.to_check for f in diagnosis.findings if f.to_check)
     if diagnosis.verdict == "located" and checks:
-        return " ".join(checks)
+        return " ".join([*checks, *([everywhere] if len(diagnosis.steps) > 1 else [])])
     if diagnosis.verdict == "located":
         return (
             "Look at what stands there: hardware, apertures, cables of the monitors. More launches "

@@ -2,7 +2,9 @@
 
 import json
 from dataclasses import replace
+from importlib.resources import files
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -18,67 +20,100 @@ from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import response_data
 from tmlattice.observe.split import split_columns
 
-UPSTREAM = 0.2
+BY = 0.2
 
 
-def moved(ring, folder):
-    """The ring with v5 that many metres further up, in the drift before the monitors before it."""
-    path = folder / "moved.json"
+def moved(ring, folder, name):
+    """The ring with a corrector that many metres further up, in the drift before the monitors
+    before it; that of v0 ends the ring."""
+    path = folder / f"{name}.json"
     save_ring(ring, path)
     content = json.loads(path.read_text())
     sequence, defined = content["sequence"], content["definitions"]
-    i = sequence.index("v5")
-    assert sequence[i - 3 : i] == ["d", "end_4", "bpm"]
-    whole = defined["d"]["parameters"]["l"]
-    for name, length in (("before", whole - UPSTREAM), ("after", UPSTREAM)):
-        defined[name] = defined["d"] | {"parameters": {"l": length}}
-    sequence[i - 3 : i + 1] = ["before", "v5", "after", "end_4", "bpm"]
+    i = sequence.index(name)
+    up = next(k for k in range(1, 9) if sequence[i - k] == "d")
+    assert up == 3  # two monitors
+    for own, length in (("before", defined["d"]["parameters"]["l"] - BY), ("after", BY)):
+        defined[own] = defined["d"] | {"parameters": {"l": length}}
+    places = [[own] for own in sequence]
+    places[i] = []
+    places[i - up] = ["before", name, "after"]
+    content["sequence"] = [own for place in places for own in place]
     path.write_text(json.dumps(content))
     return load_ring(path)
 
 
 @pytest.fixture(scope="module")
-def measured(small_ring, tmp_path_factory):
+def further_up(small_ring, tmp_path_factory):
+    return {name: moved(small_ring, tmp_path_factory.mktemp(name), name) for name in ("v5", "v0")}
+
+
+def measured_with(ring):
     return simulate_response(
-        moved(small_ring, tmp_path_factory.mktemp("moved")), kick=1e-5, noise=2e-8, rf_step=-3000.0,
-        engine="ocelot", progress=False, seed=1,
-    ).measured  # fmt: skip
+        ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=1
+    ).measured
 
 
-def test_a_corrector_that_stands_elsewhere_is_seen_where_it_stands(small_ring, measured):
-    data = response_data(small_ring, measured)
+@pytest.mark.parametrize(("name", "by"), [("v5", -BY), ("v5", BY), ("v0", -BY), ("v0", BY)])
+def test_a_corrector_that_stands_elsewhere_is_seen_where_it_stands(
+    small_ring, further_up, name, by
+):
+    """Monitors between the two places, and the lattice's first place."""
+    lattice, machine = small_ring, further_up[name]
+    if by > 0:
+        lattice, machine = machine, lattice
+    data = response_data(lattice, measured_with(machine))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     *_, (_, state) = one_by_one(begin(data, split), STEPS[:2])
     (found,) = displaced(state)
-    assert data.measured.correctors[found.column] == "v5"
-    assert found.by == pytest.approx(-UPSTREAM, abs=0.01)  # a drift, thin kicks; the fit's bends
+    assert found.name == data.measured.correctors[found.column] == name
+    assert found.by == pytest.approx(by, abs=0.01)  # beside noise of 2e-8 m in orbits of 1e-6
     assert found.gain > 1e4
-    (said,) = in_words(state, [found])
-    assert "elsewhere than in the lattice: v5 0.2 m upstream" in said
-    wide = replace(state, split=replace(split, inner=data.plane == 1))
-    own = [one.misplaced for one in odd_in_the_end(wide)]
-    assert not any(own) or own[0][0].column == found.column
+    (said,) = in_words([found])
+    where = "downstream" if by > 0 else "upstream"
+    assert f"elsewhere than in the lattice: {name} 0.2 m {where}" in said
+    left_out, *_ = odd_in_the_end(state)
+    assert [own.name for own in left_out.misplaced] == [name]
+    assert np.flatnonzero(left_out.unread.any(axis=(1, 2))).tolist() == [found.column]
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_it_is_the_finding_and_spoils_nobody_s_figure(small_ring, measured, seed):
-    """Fitted, or held out. A monitor stands between the two places: as a jump in its place the
-    corrector had left more than another kick elsewhere would, and was told as a supply that
-    jumps."""
+def test_it_is_the_finding_and_spoils_nobody_s_figure(small_ring, further_up, seed):
+    """Fitted, or held out. As a jump in its place the corrector had left more than another kick
+    elsewhere would, at the monitor between, and was told as a supply that jumps."""
+    measured = measured_with(further_up["v5"])
     found = diagnose(small_ring, measured, seed=seed)
     assert found.verdict == "located"
     (one,) = found.findings
     assert one.words.startswith("corrector v5 answers as if it stood 0.2 m upstream")
-    place = small_ring["v5"].s
-    assert one.where[0] < place - UPSTREAM < place < one.where[1]
-    assert found.as_json()["findings"][0]["to_check"].startswith("Check its place")
+    assert one.elements == ("v5",)
+    assert one.s == small_ring["v5"].s
+    assert one.where[0] < one.s < one.where[1]
+    document = found.as_json()
+    schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
+    jsonschema.validate(json.loads(json.dumps(document)), schema)
+    assert document["findings"][0]["to_check"].startswith("Check its place")
     assert f"LOCATED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
     assert any("left out: v5 0.2 m" in said for said in found.warnings)
     assert not any("kicked the beam" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
-    assert "corrector_calibration" not in {
-        cause.effect for cause in found.causes if cause.element == "v5" and abs(cause.amount) > 0.01
-    }
+    assert not any(c.element == "v5" and abs(c.amount) > 0.01 for c in found.causes)
+
+
+def test_small_errors_beside_it_are_told_too_and_it_takes_nobody_s_place(small_ring, further_up):
+    """Its statistic is large; `max_effects` counts what is fitted."""
+    causes = [Cause("quadrupole_gradient", "QD::5", 0.03)]
+    measured = simulate_response(
+        further_up["v5"], causes, background={"quadrupole_gradient": 1e-3}, kick=1e-5, noise=2e-8,
+        rf_step=-3000.0, engine="ocelot", progress=False, seed=1,
+    ).measured  # fmt: skip
+    found = diagnose(small_ring, measured, max_effects=1)
+    assert found.verdict == "located"
+    assert [own.elements for own in found.findings if own.words] == [("v5",)]
+    assert [own.element for own in found.findings if own.effect] == ["QD::5"]
+    text = " ".join(found.report().split())
+    assert "Small errors all along the ring" in text
+    assert "--repaired-out" in text
 
 
 def test_nothing_is_said_of_correctors_that_stand_where_they_should(small_ring):

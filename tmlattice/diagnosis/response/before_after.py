@@ -38,9 +38,8 @@ from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.levels import CLEAR, Levels, Reason
+from tmlattice.inference.levels import Levels, Reason
 from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
@@ -342,7 +341,7 @@ def _finding(
     chance = np.array([p for _, p in own.rivals])
     causes = [Cause(*names[c], own.amount) for c, _ in own.rivals]
     shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
-    seen = Detection(own.statistic, CLEAR, min(1.0, len(names) * chi2.sf(own.statistic, 1)))
+    seen = Detection.among(own.statistic, len(names))
     return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)
 
 
@@ -372,7 +371,7 @@ def _outstanding(state: State, judgement: Judgement) -> list[Finding]:
             size = abs(cause.amount)
             if size > max(DRIFT, OUTSTANDING * usual) and size > 5 * sigma:
                 square = (size / max(sigma, 1e-12)) ** 2
-                seen = Detection(square, CLEAR, min(1.0, len(rows) * chi2.sf(square, 1)))
+                seen = Detection.among(square, len(rows))
                 found.append(
                     finding_of(state.data.ring, [cause], np.ones(1), [cause], sigma, seen,
                                judgement.mass)

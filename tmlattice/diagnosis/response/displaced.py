@@ -5,7 +5,7 @@ position jump of -d times the kick. All correctors have some of that (their fiel
 one that is far beyond the others, and agrees once it is moved, has a wrong place, or name.
 
 >>> found = displaced(state)
->>> [own.column for own in found], in_words(state, found)
+>>> [own.name for own in found], in_words(found)
 """
 
 from collections.abc import Sequence
@@ -40,12 +40,13 @@ class Displaced(NamedTuple):
     """A corrector that answers as if it stood elsewhere.
 
     Attributes:
-        column: of the response.
+        name, column: of the corrector, and of the response.
         left, moved: what its readings are left with where it stands, and elsewhere, rms, m.
         by: how far downstream, m.
         gain: by which chi-square falls there.
     """
 
+    name: str
     column: int
     left: float
     moved: float
@@ -77,7 +78,8 @@ def displaced(state: State) -> list[Displaced]:
             by = -jump / (kick * data.kicks[c]) if kick else 0.0
             noise = data.noise_of(0)[c, seen]
             gain = float(np.sum((left**2 - moved**2) / noise**2))
-            found.append(Displaced(int(c), size, less, float(by), gain))
+            name = data.measured.correctors[c]
+            found.append(Displaced(name, int(c), size, less, float(by), gain))
         if len(found) < FEWEST:
             continue
         usual = float(np.median([own.left for own in found]))
@@ -117,15 +119,15 @@ def clear(
     way = np.array([data.ring[name].s for name in data.measured.monitors]) - place
     beyond = (np.sign(by) * way + SAME) % data.ring.length - SAME
     between = beyond <= MARGIN * abs(by)
-    return seen & ~between if between.sum() <= max(SPARED * seen.sum(), 1) else seen
+    few = (between & seen).sum() <= max(SPARED * seen.sum(), 1)
+    return seen & ~between if few else seen
 
 
-def in_words(state: State, found: Sequence[Displaced], done: str = "") -> list[str]:
+def in_words(found: Sequence[Displaced], done: str = "") -> list[str]:
     """A sentence of them, where there are any, and what was done with them."""
     if not found:
         return []
-    names = state.data.measured.correctors
-    told = "; ".join(f"{names[own.column]} {moved_text(own)}" for own in found)
+    told = "; ".join(f"{own.name} {moved_text(own)}" for own in found)
     return [
         f"correctors that answer as if they stood elsewhere than in the lattice{done}: {told}; "
         "check their places, which magnet each name is, and that no other one is driven with them"

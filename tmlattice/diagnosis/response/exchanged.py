@@ -1,11 +1,11 @@
-"""Neighbouring correctors whose columns are exchanged: each answers as the other one should.
+"""Correctors whose columns are exchanged: each answers as the other one should.
 Monitors whose readings are; and those whose planes are.
 
 A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
 the model's far too well for a stranger: it seems displaced by the way to its neighbour.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -25,15 +25,22 @@ Pair = tuple[str, str]
 
 
 class PutRight(NamedTuple):
-    """What was exchanged: planes of monitors, correctors, monitors."""
+    """What was exchanged: planes of monitors; pairs of correctors, and of monitors, and by how much
+    chi-square fell once they were put right, with the typical noise."""
 
     planes: list[str]
-    correctors: list[Pair]
-    monitors: list[Pair]
+    correctors: dict[Pair, float]
+    monitors: dict[Pair, float]
 
 
-def exchanged(state: State) -> list[Pair]:
-    """Pairs of neighbours of a plane, in beam order; no corrector stands in two of them."""
+def exchanged(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
+    """Pairs of a plane, and by how much chi-square falls: neighbours, in beam order, and then any
+    two of some that resemble nothing, or seem to stand elsewhere. None stands in two of them.
+
+    Args:
+        state: what the model makes of the readings.
+        among: names of those that may be exchanged with one another anywhere in the ring.
+    """
     data = state.data
     model, orbits = data.pick(state.at.seen(state.at.beam)), data.pick(data.orbits)
     names = data.measured.correctors
@@ -44,18 +51,22 @@ def exchanged(state: State) -> list[Pair]:
         gain = max(float(u @ d) / max(float(u @ u), 1e-300), 0.0)
         return float(np.sum((d - gain * u) ** 2))
 
-    found: list[Pair] = []
+    found: dict[Pair, float] = {}
     for p in (0, 1):
         mine = np.flatnonzero(data.plane[:-1] == p)
         order = mine[np.argsort([data.ring[names[c]].s for c in mine])]
-        for a, b in zip(order, np.roll(order, -1), strict=True):
-            crossed = left(a, b) < SHARE * left(a, a) and left(b, a) < SHARE * left(b, b)
-            if crossed and not any(names[a] in pair for pair in found):
-                found.append((names[a], names[b]))
+        far = combinations([c for c in order if names[c] in among], 2)
+        noise = float(np.median(data.noise[:, p]))
+        for a, b in (*zip(order, np.roll(order, -1), strict=True), *far):
+            if any(names[c] in pair for pair in found for c in (a, b)):
+                continue
+            stays, crossed = (left(a, a), left(b, b)), (left(a, b), left(b, a))
+            if all(one < SHARE * other for one, other in zip(crossed, stays, strict=True)):
+                found[names[a], names[b]] = (sum(stays) - sum(crossed)) / noise**2
     return found
 
 
-def told(pairs: Sequence[Pair], what: str = "correctors") -> str:
+def told(pairs: Iterable[Pair], what: str = "correctors") -> str:
     """In words."""
     both = ", ".join(f"{a} and {b}" for a, b in pairs)
     return (
@@ -64,7 +75,7 @@ def told(pairs: Sequence[Pair], what: str = "correctors") -> str:
     )
 
 
-def put_right(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
+def put_right(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
     """The measurement with their columns exchanged."""
     order = np.arange(len(measured.correctors))
     for pair in pairs:
@@ -75,9 +86,9 @@ def put_right(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
     )
 
 
-def exchanged_monitors(state: State, among: Collection[str]) -> list[Pair]:
-    """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains; none
-    stands in two.
+def exchanged_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
+    """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains, and by
+    how much chi-square falls; none stands in two.
 
     Args:
         state: what the model makes of the readings.
@@ -96,15 +107,16 @@ def exchanged_monitors(state: State, among: Collection[str]) -> list[Pair]:
     names = data.measured.monitors
     odd = [m for m, name in enumerate(names) if name in among]
     stays = np.diagonal(left)
-    found: list[Pair] = []
+    found: dict[Pair, float] = {}
     for a, b in combinations(odd, 2):
         crossed = left[a, b] < SHARE * stays[a] and left[b, a] < SHARE * stays[b]
         if crossed and not any(names[own] in pair for own in (a, b) for pair in found):
-            found.append((names[a], names[b]))
+            gain = stays[a] + stays[b] - left[a, b] - left[b, a]
+            found[names[a], names[b]] = float(gain / np.median(data.noise) ** 2)
     return found
 
 
-def monitors_back(measured: OrbitResponse, pairs: Sequence[Pair]) -> OrbitResponse:
+def monitors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
     """The measurement with the readings of monitors exchanged, their noise and the RF's too."""
     order = np.arange(len(measured.monitors))
     for pair in pairs:

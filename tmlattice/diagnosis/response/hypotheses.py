@@ -121,8 +121,8 @@ def _neighbours(state: State) -> list[str]:
     shortens its field."""
     ring, measured = state.data.ring, state.data.measured
     own = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
-    ends = np.array([e.s for e in own])
-    behind = np.searchsorted(ends, [ring[name].s for name in measured.correctors]) % len(own)
+    middles = np.array([e.s for e in own])
+    behind = np.searchsorted(middles, [ring[name].s for name in measured.correctors]) % len(own)
     return [
         f"{plane} {stem(own[i - 1].name)} {stem(own[i].name)}"
         for plane, i in zip(measured.planes, behind, strict=True)

@@ -101,15 +101,15 @@ def odd_in_the_end(state: State) -> tuple[OddSteps, ...]:
     Args:
         state: settled with all families: before it is, gradients beside a corrector seem its place.
     """
-    data, names = state.data, state.data.measured.correctors
-    swapped = {name for pair in exchanged(state) for name in pair}
-    far = [own for own in displaced(state) if names[own.column] not in swapped]
+    data, far = state.data, displaced(state)
+    pairs = exchanged(state, [own.name for own in far])
+    far = [own for own in far if not any(own.name in pair for pair in pairs)]
     gone = np.zeros(len(data.plane), dtype=bool)
     gone[[own.column for own in far]] = True
     if not far or not state.allows(GAINS) or not _enough(state, gone):
         return odd_steps(state)
     whole = np.broadcast_to(gone[:, None, None], data.orbits.shape)
-    said = tuple(in_words(state, far, ", left out"))
+    said = tuple(in_words(far, ", left out"))
     return OddSteps(whole, said, tuple(far)), *odd_steps(beside(state, whole))
 
 

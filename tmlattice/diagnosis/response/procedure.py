@@ -29,8 +29,9 @@ from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import swap_of, with_consequences
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
-from tmlattice.diagnosis.response.displaced import displaced, in_words
+from tmlattice.diagnosis.response.displaced import displaced
 from tmlattice.diagnosis.response.exchanged import (
+    Pair,
     PutRight,
     exchanged,
     exchanged_monitors,
@@ -169,24 +170,23 @@ def _families(
     """The dense fit of what resembles the model; what was fitted, and what was done to it; and
     what is exchanged."""
     said: list[str] = []
-    known = PutRight([], [], [])
+    known = PutRight([], {}, {})
     fit: DenseFit | None = None
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
-        pairs = [pair for pair in exchanged(state) if pair not in known.correctors]
+        odd = strangers(state)
+        far = displaced(state) if fit is not None else []
+        among = {*odd.correctors, *(own.name for own in far)}
+        pairs = _new(exchanged(state, among), known.correctors)
         if pairs:
             said.append(told_exchanged(pairs))
-            known.correctors.extend(pairs)
             measured, fit = put_right(measured, pairs), None
             continue
-        odd = strangers(state)
-        strange = {name for name, _ in odd.monitors}
-        pairs = [pair for pair in exchanged_monitors(state, strange) if pair not in known.monitors]
+        pairs = _new(exchanged_monitors(state, {name for name, _ in odd.monitors}), known.monitors)
         if pairs:
             said.append(told_exchanged(pairs, "monitors"))
-            known.monitors.extend(pairs)
             measured, fit = monitors_back(measured, pairs), None
             continue
         crossed = [name for name in swapped(state) if name not in known.planes]
@@ -204,6 +204,13 @@ def _families(
         fit = fit_steps(data, split, trials, most, progress)
 
 
+def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
+    """Pairs that were not known; they are now."""
+    new = [pair for pair in found if pair not in known]
+    known.update((pair, found[pair]) for pair in new)
+    return new
+
+
 def _faults(
     fit: DenseFit,
     exchanges: PutRight,
@@ -217,14 +224,14 @@ def _faults(
     ring = state.data.ring
     found = [swap_of(state, name, judgement) for name in exchanges.planes
              if effects is None or "monitor_swap" in effects]  # fmt: skip
-    if effects is None:
-        found += unnamed(state, exchanges, [*fit.misplaced, *displaced(state)])
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
         alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
         fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
-    return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic)[:most])
+    found = sorted(found, key=lambda own: -own.detection.statistic)[:most]
+    found += unnamed(ring, exchanges, [*fit.misplaced, *displaced(state)])
+    return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic))
 
 
 def as_diagnosis(
@@ -357,7 +364,6 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
     said += dispersion_by_kicks(fit.state.values, fit.state.data)
-    said += in_words(fit.state, displaced(fit.state))
     return (*said, *odd_readings(fit.state))
 
 
