@@ -42,9 +42,9 @@ def findings_of(
         for k, named in enumerate(explanation.named)
     ]
     for layer, detection in explanation.kicks.items():
-        found.append(_located(ring, ring.magnets[layer], detection))
+        found.append(located(ring, ring.magnets[layer], detection))
     for m, detection in explanation.monitors.items():
-        found.append(_located(ring, ring.monitors[m], detection))
+        found.append(located(ring, ring.monitors[m], detection))
     found += [_dead(ring, ring.monitors[m], amount) for m, amount in dead]
     return tuple(sorted(found, key=lambda f: -f.detection.statistic))
 
@@ -101,7 +101,7 @@ def finding_of(
     )
 
 
-def _located(ring: Ring, element: Element, detection: Detection) -> Finding:
+def located(ring: Ring, element: Element, detection: Detection) -> Finding:
     """Something without a name."""
     where, near = between(ring, [element.s])
     return Finding(

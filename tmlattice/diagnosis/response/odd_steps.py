@@ -96,14 +96,19 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
 def odd_in_the_end(state: State) -> tuple[OddSteps, ...]:
     """The same of a fit that has settled, of which less is usual; and before that, for these would
     be told as kicked by something else, steps of correctors that stand elsewhere than in the
-    lattice: none where too few are left, and none that is to be put right.
+    lattice: none where too few are left, none that is to be put right, and none that is held out,
+    for what a model misses of it is missed.
 
     Args:
         state: settled with all families: before it is, gradients beside a corrector seem its place.
     """
     data, far = state.data, displaced(state)
     pairs = exchanged(state, [own.name for own in far])
-    far = [own for own in far if not any(own.name in pair for pair in pairs)]
+    far = [
+        own
+        for own in far
+        if not state.split.held[own.column] and not any(own.name in pair for pair in pairs)
+    ]
     gone = np.zeros(len(data.plane), dtype=bool)
     gone[[own.column for own in far]] = True
     if not far or not state.allows(GAINS) or not _enough(state, gone):

@@ -8,7 +8,9 @@ say in words what they are.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+from tmlattice.diagnosis.findings import located
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.response.displaced import Displaced, moved_text
 from tmlattice.diagnosis.response.exchanged import PutRight
@@ -51,23 +53,12 @@ def _finding(
 ) -> Finding:
     """Of one element, at its place in the lattice; of two, from one to the other where they stand
     near, else at the first."""
+    found = located(ring, ring[elements[0]], seen)
+    found = replace(found, words=words, to_check=to_check, elements=elements)
+    if len(elements) == 1:
+        return found
     places = [ring[name].s for name in elements]
-    near_by = max(places) - min(places) < NEAR * ring.length
-    where, near = between(ring, places if near_by else places[:1])
-    return Finding(
-        effect=None,
-        element=None,
-        s=places[0] if len(places) == 1 else None,
-        amount=None,
-        amount_sigma=None,
-        unit=None,
-        probability=1.0,
-        detection=seen,
-        where=where,
-        near=near,
-        credible_set=(),
-        mass=0.0,
-        words=words,
-        to_check=to_check,
-        elements=elements,
-    )
+    if max(places) - min(places) > NEAR * ring.length:
+        return replace(found, s=None)
+    where, near = between(ring, places)
+    return replace(found, s=None, where=where, near=near)
