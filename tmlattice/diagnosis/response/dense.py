@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.steps import STEPS, Trial
-from tmlattice.diagnosis.response.displaced import Displaced
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import MOSTLY, Jitter, sought
 from tmlattice.diagnosis.response.judges import (
@@ -30,7 +29,7 @@ from tmlattice.diagnosis.response.judges import (
     score,
 )
 from tmlattice.diagnosis.response.odd_readings import robust
-from tmlattice.diagnosis.response.odd_steps import beside, odd_in_the_end, odd_steps
+from tmlattice.diagnosis.response.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
 from tmlattice.diagnosis.response.rounds import (
     Evidence,
@@ -138,7 +137,6 @@ class DenseFit:
         refused: those that did not help, or spoilt the RF's response.
         heldout: what held-out correctors say of the design and of the result.
         said: sentences of steps that went wrong, and are left out.
-        misplaced: correctors that stand elsewhere, and are left out.
     """
 
     design: State
@@ -147,7 +145,6 @@ class DenseFit:
     refused: tuple[Step, ...]
     heldout: tuple[Score, Score]
     said: tuple[str, ...] = ()
-    misplaced: tuple[Displaced, ...] = ()
 
 
 def fit_steps(
@@ -181,7 +178,8 @@ def fit_steps(
     state = beside(state, odd.unread)
     progress("all together")
     state = taken_back(settle(bend(jump(replace(state, independent=np.ones((2, 2)))))))
-    odd = odd.and_more(*odd_in_the_end(state))
+    log.info("independent readings: %s", state.independent)
+    odd = odd.and_more(*odd_steps(state))  # what is usual is less now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
     state, moving = _beside_jitter(state, progress)
     split = state.split
@@ -212,7 +210,7 @@ def fit_steps(
     nothing = DenseFit(
         design, design, (Step.scored("design", 0, before),),
         (*refused, *(replace(step, kept=False) for step in steps.values())),
-        (before, before), (*odd.said, *doubts), odd.misplaced,
+        (before, before), (*odd.said, *doubts),
     )  # fmt: skip
     if spoilt > SPOILT:  # all together spoil what they should mend
         return nothing
@@ -238,8 +236,7 @@ def fit_steps(
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
     said = (*odd.said, *doubts, *(() if moving is None else (moving.sentence,)))
-    two = before, after
-    return DenseFit(design, state, tuple(kept), tuple(refused), two, said, odd.misplaced)
+    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
 
 
 def _in_turn(

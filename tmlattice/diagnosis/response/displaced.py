@@ -5,10 +5,9 @@ position jump of -d times the kick. All correctors have some of that (their fiel
 one that is far beyond the others, and agrees once it is moved, has a wrong place, or name.
 
 >>> found = displaced(state)
->>> [own.name for own in found], in_words(found)
+>>> [(own.name, own.by) for own in found]
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -121,17 +120,6 @@ def clear(
     between = beyond <= MARGIN * abs(by)
     few = (between & seen).sum() <= max(SPARED * seen.sum(), 1)
     return seen & ~between if few else seen
-
-
-def in_words(found: Sequence[Displaced], done: str = "") -> list[str]:
-    """A sentence of them, where there are any, and what was done with them."""
-    if not found:
-        return []
-    told = "; ".join(f"{own.name} {moved_text(own)}" for own in found)
-    return [
-        f"correctors that answer as if they stood elsewhere than in the lattice{done}: {told}; "
-        "check their places, which magnet each name is, and that no other one is driven with them"
-    ]
 
 
 def moved_text(own: Displaced) -> str:

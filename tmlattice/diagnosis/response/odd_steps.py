@@ -2,7 +2,7 @@
 not fitted, and judge nobody.
 
 >>> readings, steps = odd_steps(state)
->>> odd = readings.and_more(steps, *odd_in_the_end(settle(state)))
+>>> odd = readings.and_more(steps)
 >>> state = beside(state, odd.unread)
 """
 
@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.displaced import Displaced, displaced, in_words
 from tmlattice.diagnosis.response.exchanged import exchanged
 from tmlattice.diagnosis.response.odd_readings import gross, told_gross
 from tmlattice.diagnosis.response.other_kicks import OtherKick, left_in_plane, other_kicks
@@ -35,20 +34,17 @@ class OddSteps:
     Attributes:
         unread: which readings are not used, [column, monitor, plane that is read].
         said: sentences of them.
-        misplaced: correctors among them that stand elsewhere than in the lattice.
     """
 
     unread: Flags
     said: tuple[str, ...] = ()
-    misplaced: tuple[Displaced, ...] = ()
 
     def and_more(self, *others: "OddSteps") -> "OddSteps":
         """With others."""
-        unread, said, misplaced = self.unread, self.said, self.misplaced
+        unread, said = self.unread, self.said
         for own in others:
             unread, said = unread | own.unread, (*said, *own.said)
-            misplaced = (*misplaced, *own.misplaced)
-        return OddSteps(unread, said, misplaced)
+        return OddSteps(unread, said)
 
 
 def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
@@ -59,7 +55,7 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
         state: with all families; without monitors' gains nothing is told, for these break triples
             and leave kicks, too.
     """
-    data = state.data
+    data, split = state.data, state.split
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
         return OddSteps(nothing), OddSteps(nothing)
@@ -87,41 +83,11 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
         if own.plane == data.plane[own.column]:  # its own kick is not known either
             unread[own.column] = True
     unread[left_in_plane(state, [own.column for own in others])] = True
-    if not _enough(state, np.asarray(unread.all(axis=1))):
+    gone = unread.all(axis=1)
+    if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
         return single, OddSteps(nothing)
     whole = np.broadcast_to(unread[:, None], nothing.shape)
     return single, OddSteps(whole, (*_torn(data, broken), *_kicked(state, others)))
-
-
-def odd_in_the_end(state: State) -> tuple[OddSteps, ...]:
-    """The same of a fit that has settled, of which less is usual; and before that, for these would
-    be told as kicked by something else, steps of correctors that stand elsewhere than in the
-    lattice: none where too few are left, none that is to be put right, and none that is held out,
-    for what a model misses of it is missed.
-
-    Args:
-        state: settled with all families: before it is, gradients beside a corrector seem its place.
-    """
-    data, far = state.data, displaced(state)
-    pairs = exchanged(state, [own.name for own in far])
-    far = [
-        own
-        for own in far
-        if not state.split.held[own.column] and not any(own.name in pair for pair in pairs)
-    ]
-    gone = np.zeros(len(data.plane), dtype=bool)
-    gone[[own.column for own in far]] = True
-    if not far or not state.allows(GAINS) or not _enough(state, gone):
-        return odd_steps(state)
-    whole = np.broadcast_to(gone[:, None, None], data.orbits.shape)
-    said = tuple(in_words(far, ", left out"))
-    return OddSteps(whole, said, tuple(far)), *odd_steps(beside(state, whole))
-
-
-def _enough(state: State, gone: Flags) -> bool:
-    """Whether columns are left to judge, to choose and to be fitted."""
-    split = state.split
-    return all(bool((own & ~gone).any()) for own in (split.held, split.inner, state.fitted))
 
 
 def _beside_own_kick(state: State) -> Array:

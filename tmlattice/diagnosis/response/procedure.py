@@ -29,7 +29,7 @@ from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import swap_of, with_consequences
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
-from tmlattice.diagnosis.response.displaced import displaced
+from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import (
     Pair,
     PutRight,
@@ -45,10 +45,11 @@ from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
+from tmlattice.diagnosis.response.odd_steps import beside
 from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.rf_by_others import rf_known_to
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
-from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.strangers import reversed_ones, strangers
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView
@@ -224,14 +225,23 @@ def _faults(
     ring = state.data.ring
     found = [swap_of(state, name, judgement) for name in exchanges.planes
              if effects is None or "monitor_swap" in effects]  # fmt: skip
+    far = displaced(state)
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
-        alone = singled_out(state.data, state.split, state, hypotheses, most, judgement, progress)
+        sound = _without(state, far)
+        alone = singled_out(sound.data, sound.split, sound, hypotheses, most, judgement, progress)
         fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
     found = sorted(found, key=lambda own: -own.detection.statistic)[:most]
-    found += unnamed(ring, exchanges, [*fit.misplaced, *displaced(state)])
+    found += unnamed(ring, exchanges, far)
     return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic))
+
+
+def _without(state: State, far: Sequence[Displaced]) -> State:
+    """As if these had not been stepped: what they leave is explained, and no single fault's."""
+    gone = np.zeros(state.data.orbits.shape, dtype=bool)
+    gone[[own.column for own in far]] = True
+    return beside(state, gone)
 
 
 def as_diagnosis(
