@@ -3,7 +3,7 @@ and correctors that stand elsewhere than in the lattice.
 
 >>> found = unnamed(ring, put_right, displaced(fit.state))
 
-What they do to the fit (put right, or left out) is told by whoever does it; they are located, and
+That exchanged ones are put right is told by whoever does it. They are located, and
 say in words what they are.
 """
 
