@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_rings import command, sources
+from real_rings import imported, sources
 
 import tmlattice
 from tmlattice import read_measurement
@@ -507,9 +507,7 @@ def cases(data: Path, wanted: Sequence[str], place: Path) -> dict[str, Case]:
             folder = place / name
             if not files:
                 sys.exit(f"{name} stands in a folder of its own: name an imported one")
-            done, _ = command("import", *files, "--out", folder)
-            if done.returncode:
-                sys.exit(done.stderr)
+            imported(name, files, data, place, "first")
         document = json.loads((folder / lattice).read_text(encoding="utf-8"))
         found[folder.name] = Case(document, read_measurement(folder))
     return found
