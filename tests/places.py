@@ -26,6 +26,7 @@ PLACES = {
     "corrector_kick_y": CORRECTORS,
     "corrector_calibration": CORRECTORS,
     "corrector_roll": CORRECTORS,
+    "corrector_position": CORRECTORS,
     "sextupole_strength": ["s1::48", "s4::26"],
     "sextupole_offset_x": ["s1::48", "s4::26"],
     "sextupole_offset_y": ["s1::48", "s4::26"],

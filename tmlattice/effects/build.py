@@ -19,6 +19,7 @@ class Build:
     Attributes:
         scale: of its strength: a quadrupole's or sextupole's, a bend's field, a corrector's kick.
         dx, dy: of its centre, m.
+        ds: of its field along the beam, m.
         roll: of its body, or of a corrector's kick, from x towards y, rad.
         kick_x, kick_y: of a corrector beyond its setting, along its own axes, rad.
         k1: gradient of a bend beyond its own, 1/m2.
@@ -30,6 +31,7 @@ class Build:
     scale: float = 1.0
     dx: float = 0.0
     dy: float = 0.0
+    ds: float = 0.0
     roll: float = 0.0
     kick_x: float = 0.0
     kick_y: float = 0.0

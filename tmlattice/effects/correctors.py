@@ -98,3 +98,21 @@ class CorrectorRoll(_OnCorrector, ErrorEffect):
     to_check = "Measure its roll; look whether its two planes' cables are mixed up."
     background = 1e-2
     largest = 0.1
+
+
+@register
+class CorrectorPosition(_OnCorrector, ErrorEffect):
+    """The field of a corrector is not where the lattice has it: iron beside it draws it away."""
+
+    name = "corrector_position"
+    responds = True
+    words = "field of a corrector elsewhere along the beam"
+    acts_on_settings = True
+    error = "ds"
+    unit = "m"
+    sign = "positive is further down: the kick comes so much later"
+    quantity = "place along the beam"
+    remedy = "enter the place of the field of {} into the lattice"
+    to_check = "Measure where it stands; iron beside it draws its field away."
+    largest = 0.1
+    usual = False  # in responses, where a family of it is fitted, or where somebody names it

@@ -221,7 +221,8 @@ class ErrorEffect(RingEffect):
     """An effect that is one of the errors which an element can carry.
 
     Attributes:
-        error: its name in `lattice.ring.Errors`, and in `Build`: dx, dy, roll, kick_x or kick_y.
+        error: its name in `lattice.ring.Errors`, and in `Build`: dx, dy, ds, roll, kick_x
+            or kick_y.
     """
 
     error: ClassVar[str]

@@ -42,11 +42,12 @@ Slopes = tuple[float, ...]
 class Errors:
     """How one magnet differs from its design, beyond its strengths: what OCELOT has no name for.
 
-    The maps feel them in this order: the entrance kick; the shift and the turn of the body, inside
-    which the kicks and the loss sit at its middle; the body back.
+    The maps feel them in this order: the way to where the field is; the entrance kick; the shift
+    and the turn of the body, inside which the kicks and the loss sit at its middle; all of it back.
 
     Attributes:
         dx, dy: offset of the magnet's centre, m.
+        ds: of its field along the beam, m; positive further down. What stands beside it stays.
         roll: about the beam axis, rad; positive turns x towards y.
         kick_x, kick_y: px and py gain these at the middle, rad; in a bend they are spread over it.
         k1l, k1sl: thin quadrupole at the middle: px -= k1l x, py += k1l y; thin skew quadrupole:
@@ -58,6 +59,7 @@ class Errors:
 
     dx: float = 0.0
     dy: float = 0.0
+    ds: float = 0.0
     roll: float = 0.0
     kick_x: float = 0.0
     kick_y: float = 0.0

@@ -28,7 +28,7 @@ SWAPPED = [0, 1, 2, 3, 5, 4]
 NOTHING = Build()
 
 _STRAIGHT = frozenset({"scale", "dx", "dy", "roll", "kick_x", "kick_y", "entrance", "middle"})
-_CORRECTOR = frozenset({"scale", "roll", "kick_x", "kick_y", "entrance"})
+_CORRECTOR = frozenset({"scale", "ds", "roll", "kick_x", "kick_y", "entrance"})
 _EMPTY = frozenset({"entrance", "middle"})
 _TAKES: Mapping[str, frozenset[str]] = {
     "quadrupole": _STRAIGHT,
@@ -124,8 +124,9 @@ def errors_of(element: Element, energy: float) -> Build:
     if element.kind == "bend" and errors.roll:
         raise LatticeError(f"AT cannot build the bend '{element.name}' with a roll of its own")
     own = Build(
-        dx=errors.dx, dy=errors.dy, roll=errors.roll, kick_x=errors.kick_x, kick_y=errors.kick_y
-    )
+        dx=errors.dx, dy=errors.dy, ds=errors.ds, roll=errors.roll,
+        kick_x=errors.kick_x, kick_y=errors.kick_y,
+    )  # fmt: skip
     if errors.loss:
         own.loss = errors.loss / loss_of(element, energy)
     if errors.k1l or errors.k1sl:
@@ -346,7 +347,11 @@ class Builder:
         y = kick * np.sin(element.tilt) + wrong.kick_y
         cosine, sine = np.cos(wrong.roll), np.sin(wrong.roll)
         turned = [cosine * x - sine * y, sine * x + cosine * y]
-        return [at.Corrector(element.name, element.length, turned)]
+        made = [at.Corrector(element.name, element.length, turned)]
+        if not wrong.ds:
+            return made
+        there, back = (at.Drift(element.name, way) for way in (wrong.ds, -wrong.ds))
+        return [there, *made, back]
 
     _vcorrector = _hcorrector  # OCELOT tilts a vertical corrector by a right angle
 

@@ -249,6 +249,7 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
         kick = errors.kick_x * _in_the_middle(element)
         total = composed(
             [
+                _way(n, errors.ds, energy),
                 _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
                 _shift(n, -errors.dx, -errors.dy),
                 _turn(n, errors.roll),
@@ -258,6 +259,7 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
                 second,
                 _turn(n, -errors.roll),
                 _shift(n, errors.dx, errors.dy),
+                _way(n, -errors.ds, energy),
             ]
         )
     finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
@@ -341,6 +343,16 @@ def _shift(n: int, dx: float, dy: float) -> Quadratic | None:
     B = np.zeros(n)
     B[0], B[2] = dx, dy
     return Quadratic(B, np.eye(n), None)
+
+
+def _way(n: int, length: float, energy: float) -> Quadratic | None:
+    """A drift, forth or back."""
+    if length == 0:
+        return None
+    from tmlattice.lattice.ocelot import elements
+
+    drift = elements.Drift(l=length)
+    return composed(of_ocelot(part, n) for part in parts_of_ocelot(drift, energy, False))
 
 
 def _turn(n: int, roll: float) -> Quadratic | None:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tmlattice.diagnosis.families.corrector_position import CorrectorPosition
 from tmlattice.diagnosis.families.fields import (
     EdgeFocusing,
     QuadrupoleGradient,
@@ -30,6 +31,7 @@ RMS = {
     VerticalFocusing(): 1e-3,
     EdgeFocusing(): 1e-3,
     EnergySpread(): 1.0,
+    CorrectorPosition(): 0.01,
     MonitorRoll(): 1e-3,
     CorrectorRoll(): 1e-3,
     SkewGradient(): 1e-3,

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.families.corrector_position import CorrectorPosition
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
 from tmlattice.diagnosis.families.family import TAILS, Family, Told
 from tmlattice.diagnosis.families.fields import (
@@ -275,6 +276,7 @@ WITHOUT_KICKS = (
     Trial((BendGradient(),), 2, 0),
     Trial((VerticalFocusing(),), 2, 0),
     Trial((EdgeFocusing(),), 2, 0),
+    Trial((CorrectorPosition(),), 2, 0),
     Trial((EnergySpread(),), 2, 0),
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),

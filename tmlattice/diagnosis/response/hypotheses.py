@@ -5,18 +5,19 @@ To add one, write a function that gives its patterns where the fit stands, and p
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.diagnosis.families.corrector_position import between
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
-from tmlattice.lattice.slices import stem
 from tmlattice.observe.orbit_response import DELTA
 
 Array = NDArray[np.float64]
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 BEND_GRADIENT = 1e-4
 """1/m2, of the differences."""
 MILLIMETRE = 1e-3
+ORDERS = 3
+"""Of a drift over all columns, as a polynomial."""
 WAVES = 4
 """Of the leading closed orbits of random kicks in a plane."""
 
@@ -116,17 +119,15 @@ def _position(
     return Hypothesis(name, "m", "< 0.05 m", rows, own=names is None, most=0.05)
 
 
-def _neighbours(state: State) -> list[str]:
-    """Of each corrector its plane and the families that it stands between: their iron moves and
-    shortens its field."""
-    ring, measured = state.data.ring, state.data.measured
-    own = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
-    middles = np.array([e.s for e in own])
-    behind = np.searchsorted(middles, [ring[name].s for name in measured.correctors]) % len(own)
-    return [
-        f"{plane} {stem(own[i - 1].name)} {stem(own[i].name)}"
-        for plane, i in zip(measured.planes, behind, strict=True)
-    ]
+def _position_beside(state: State) -> Hypothesis | None:
+    if state.allows("corrector_position"):
+        return None  # it is in the fit
+
+    def beside(own: State) -> list[str]:
+        measured = own.data.measured
+        return between(own.data.ring, measured.correctors, measured.planes)
+
+    return _position(state, "by the magnets beside it", beside)
 
 
 def _energy_drift(state: State) -> Hypothesis:
@@ -163,6 +164,45 @@ def _tune_drift(state: State) -> Hypothesis:
         "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", total, own=True,
         most=1e-4,
     )  # fmt: skip
+
+
+def _in_time(drift: Hypothesis, effect: str, constant: bool) -> Hypothesis:
+    """A drift that goes on from column to column, smoothly: they are in the order of time.
+
+    Args:
+        drift: what it does to each column by itself.
+        effect: its name.
+        constant: whether one that is alike in all columns is left to it, and not to the fit.
+    """
+    columns = drift.patterns.shape[1] - 1
+    orders = legvander(np.linspace(-1, 1, columns), ORDERS).T[0 if constant else 1 :]
+    rows = drift.patterns[:, None].copy() * np.ones((len(orders), 1, 1))
+    rows[:, :, :-1] *= orders[:, :, None]
+    rows[:, :, -1] = 0
+    return replace(drift, effect=effect, patterns=rows.reshape(-1, *rows.shape[2:]), own=False)
+
+
+def _orbit_in_time(state: State) -> Hypothesis:
+    waves = _orbit_drift(state)
+    planes = [(state.data.plane == p)[:, None] * waves.patterns for p in (0, 1)]
+    each = replace(waves, patterns=np.concatenate(planes))
+    return _in_time(each, "drift of the orbit in order of time", True)
+
+
+def _chromatic_in_time(state: State) -> Hypothesis:
+    """Of the energy at which all columns are read: the tunes and the optics move with it."""
+    return _in_time(_energy_offset(state), "drift of the beam's energy in order of time", False)
+
+
+def _hysteresis(state: State) -> Hypothesis:
+    """What the iron of a corrector keeps of its step stays in the columns after it: of the last one
+    alone, which still relaxes, or of all before it, where all are held against one orbit."""
+    read = state.at.read[:-1]
+    last = np.concatenate([np.zeros_like(read[:1]), read[:-1]])
+    rows = np.zeros((2, *state.data.shape))
+    for row, stays in zip(rows, (last, np.cumsum(last, axis=0)), strict=True):
+        row[:-1] = state.data.pick(np.concatenate([stays, stays[:1]]))[:-1]
+    return Hypothesis("hysteresis: a share of earlier steps", "share", "< 0.01", rows, most=0.01)
 
 
 def _energy_spread(state: State) -> Hypothesis | None:
@@ -276,13 +316,20 @@ HYPOTHESES: dict[str, Callable[[State], Hypothesis | None]] = {
     "energy_drift": _energy_drift,
     "orbit_drift": _orbit_drift,
     "gradient_drift": _tune_drift,
+    "energy_in_time": lambda state: _in_time(
+        _energy_drift(state), "drift of the energy in order of time", True
+    ),
+    "orbit_in_time": _orbit_in_time,
+    "gradients_in_time": lambda state: _in_time(
+        _tune_drift(state), "drift of the gradients in order of time", False
+    ),
+    "chromatic_in_time": _chromatic_in_time,
+    "hysteresis": _hysteresis,
     "corrector_energy": _corrector_energy,
     "corrector_position_family": lambda state: _position(
         state, "by family", lambda own: list(own.data.measured.correctors)
     ),
-    "corrector_position_neighbours": lambda state: _position(
-        state, "by the magnets beside it", _neighbours
-    ),
+    "corrector_position_neighbours": _position_beside,
     "corrector_position": lambda state: _position(state, "each"),
     "energy_spread": _energy_spread,
     "energy_offset": _energy_offset,
