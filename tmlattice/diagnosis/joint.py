@@ -19,7 +19,7 @@ from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, w
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.left_out import spikes, with_silent
 from tmlattice.diagnosis.next_kind import next_kind
-from tmlattice.diagnosis.result import Diagnosis, JointView
+from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.stages import (
     held_out,
     misfit_of,
@@ -39,6 +39,7 @@ from tmlattice.diagnosis.strategy import (
     strongest,
 )
 from tmlattice.diagnosis.suspects import suspects
+from tmlattice.diagnosis.views import JointView
 from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled, rare
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2

@@ -28,9 +28,10 @@ from tmlattice.diagnosis.findings import (
 from tmlattice.diagnosis.next_kind import leading
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
-from tmlattice.diagnosis.result import Diagnosis, Finding, TrajectoryView
+from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.strategy import freedom
 from tmlattice.diagnosis.suspects import suspects
+from tmlattice.diagnosis.views import TrajectoryView
 from tmlattice.effects import Cause, apply, background_rms
 from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2

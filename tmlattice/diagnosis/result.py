@@ -6,26 +6,23 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.numbers import NumberRead
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
+from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
-from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
-from tmlattice.observe.data import Data
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response.dense import Step
     from tmlattice.diagnosis.response.missing import Weighed
+    from tmlattice.diagnosis.response.pulled_apart import PulledApart
     from tmlattice.diagnosis.response.reasons import Reasons
     from tmlattice.diagnosis.suspects import Suspect
 
@@ -154,87 +151,6 @@ def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cau
     return tuple(named.get((cause.effect, cause.element), cause) for cause in causes)
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryView:
-    """What only trajectories have, for plots.
-
-    Attributes:
-        explanation, data, model: the search.
-    """
-
-    explanation: Explanation
-    data: Data
-    model: Model
-
-
-@dataclass(frozen=True, eq=False)
-class ResponseView:
-    """What only an orbit response has, for plots.
-
-    Attributes:
-        measured: the response, its monitors in the ring's order.
-        data: measured, the RF last, m, [column, monitor, 2].
-        design, model: the model's, before and after.
-        held: correctors held out, [column], the RF last.
-        good: monitors kept, [monitor].
-    """
-
-    measured: OrbitResponse
-    data: NDArray[np.float64]
-    design: NDArray[np.float64]
-    model: NDArray[np.float64]
-    held: NDArray[np.bool_]
-    good: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class PartView:
-    """One of several measurements, before and after.
-
-    Attributes:
-        label, kind: what the user calls it, and what it is.
-        readings: their number.
-        before, after: what the design and the result leave.
-        monitors: names.
-        left: rms of what is left at each monitor in units of the noise, before and after,
-            [2, monitor]; NaN where nothing was read.
-        numbers: of tunes, each as read and as both models have it.
-    """
-
-    label: str
-    kind: str
-    readings: int
-    before: Misfit
-    after: Misfit
-    monitors: tuple[str, ...]
-    left: NDArray[np.float64] = field(repr=False)
-    numbers: tuple[NumberRead, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
-        return {
-            "name": self.label,
-            "kind": self.kind,
-            "readings": self.readings,
-            "before": dict(vars(self.before)),
-            "after": dict(vars(self.after)),
-            **({"numbers": [n.as_json() for n in self.numbers]} if self.numbers else {}),
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class JointView:
-    """What a stored beam's measurements, or several together, have for plots.
-
-    Attributes:
-        explanation: the search.
-        parts: the measurements.
-    """
-
-    explanation: Explanation
-    parts: tuple[PartView, ...]
-
-
 @dataclass(frozen=True, repr=False)
 class Diagnosis(ShownDiagnosis):
     """What a measurement says of a ring. See `as_json` for the file format.
@@ -268,6 +184,7 @@ class Diagnosis(ShownDiagnosis):
             see the family.
         degenerate: what the data alone do not settle, in words.
         reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
+        pulled_apart: what the RF's orbit and the correctors' responses disagree about, or None.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
         dispersion: beside that of the ring as found, for `write_calibration`.
@@ -300,6 +217,7 @@ class Diagnosis(ShownDiagnosis):
     prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     reasons: "Reasons | None" = None
+    pulled_apart: "PulledApart | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
@@ -435,6 +353,7 @@ class Diagnosis(ShownDiagnosis):
                 for c, s in zip(self.causes, self.errors, strict=True)
             ],
             "reasons": None if self.reasons is None else self.reasons.as_json(),
+            "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
             "gap": self.gap,

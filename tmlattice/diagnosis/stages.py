@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.numbers import numbers_read
-from tmlattice.diagnosis.result import Finding, PartView
+from tmlattice.diagnosis.result import Finding
+from tmlattice.diagnosis.views import PartView
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.among import Among, Learnt

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import errors_beside
-from tmlattice.diagnosis.result import Diagnosis, JointView, ResponseView
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.views import JointView, ResponseView
 from tmlattice.effects import Cause, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.among import Among, Known

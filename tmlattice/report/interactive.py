@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike
 
-from tmlattice.diagnosis.result import Diagnosis, PartView
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.views import PartView
 from tmlattice.effects import find
 from tmlattice.lattice import Ring
 from tmlattice.lattice.survey import survey

@@ -177,6 +177,28 @@ def outlier_texts(result: Diagnosis) -> list[str]:
     return said
 
 
+def pulled_apart_texts(result: Diagnosis) -> list[str]:
+    """That the RF's orbit and the correctors disagree, and about which gradients."""
+    found = result.pulled_apart
+    if found is None:
+        return []
+    first = (
+        "The RF's orbit and the correctors' responses pull gradients apart: by what the latter ask "
+        f"for, the former is missed by {1e6 * found.missed:.2g} µm, where gradients that make all "
+        f"of it would miss it by {1e6 * found.known:.2g} µm "
+        f"({found.chi2 / found.readings:.1f} of chi² per reading)."
+    )
+    return [
+        first,
+        *(
+            f"{own.name} {100 * own.correctors:+.2f} ± {100 * own.correctors_sigma:.2f} % by the "
+            f"correctors, {100 * own.with_rf:+.2f} ± {100 * own.with_rf_sigma:.2f} % if it has to "
+            f"make the RF's orbit ({abs(own.pull):.0f} standard deviations of the difference)"
+            for own in found.pulls[:SHOWN]
+        ),
+    ]
+
+
 def left_sentence(result: Diagnosis) -> str:
     """What stays: noise, or patterns."""
     left = result.unexplained["patterns"]
@@ -216,6 +238,8 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
             lines += ["", "Further off than magnets are, so that something else is likely there:"]
             for text in outliers:
                 lines += wrapped(text, "   ", width)
+        for i, text in enumerate(pulled_apart_texts(result)):
+            lines += wrapped(text, "   ", width) if i else ["", *wrapped(text, "", width)]
     for said, amounts in error_rows(result):
         lines += ["", *wrapped(said, "", width), *wrapped(amounts, "   ", width)]
     lines += ["", *wrapped(left_sentence(result), "", width)]

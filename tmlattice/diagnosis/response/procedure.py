@@ -46,13 +46,15 @@ from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.response.odd_steps import beside
+from tmlattice.diagnosis.response.pulled_apart import pulled_apart
 from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.rf_by_others import rf_known_to
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.strangers import reversed_ones, strangers
 from tmlattice.diagnosis.response.unnamed import unnamed
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding, ResponseView
+from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
+from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -155,6 +157,7 @@ def diagnose_response(
         degenerate=degenerate,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
+        pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
 

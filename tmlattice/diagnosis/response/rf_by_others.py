@@ -34,13 +34,7 @@ def rf_by_others(state: State, there: Linear | None, found: Posterior | None) ->
         found: solved from that; None: without all that is fitted there.
     """
     column = len(state.data.plane) - 1
-    own = weight(state, 0)[column]
-    read = np.flatnonzero(own > 0)
-    weights = np.diag(own[read])
-    shared = taken(state, 0)
-    if shared is not None:
-        weights -= shared[column, read] @ shared[column, read].T
-    left = state.data.pick(state.at.left)[column, read]
+    read, weights, left = rf_fitted(state)
     precision = weights.diagonal().copy()
     if there is not None:
         rows = there.of_column(column, read, int(state.data.plane[column]))
@@ -49,9 +43,22 @@ def rf_by_others(state: State, there: Linear | None, found: Posterior | None) ->
     if there is not None and found is not None:
         fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
         precision -= (fitted**2).sum(axis=0)
-    out = np.full(len(own), np.nan)
+    out = np.full(state.data.shape[1], np.nan)
     out[read] = weights @ left / np.maximum(precision, LEAST * weights.diagonal())
     return out
+
+
+def rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
+    """The monitors at which the RF's orbit is fitted, the inverse covariance of these readings,
+    1/m2, and what is left of them, m."""
+    column = len(state.data.plane) - 1
+    own = weight(state, 0)[column]
+    read = np.flatnonzero(own > 0)
+    weights = np.diag(own[read])
+    shared = taken(state, 0)
+    if shared is not None:
+        weights -= shared[column, read] @ shared[column, read].T
+    return read, weights, state.data.pick(state.at.left)[column, read]
 
 
 def rf_known_to(state: State) -> float:

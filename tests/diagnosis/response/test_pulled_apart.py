@@ -1,0 +1,78 @@
+"""The RF's orbit against the correctors: apart where gradients do not make it, at one else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import diagnose
+from tmlattice.diagnosis.families.dispersion import USUAL, HorizontalKicks
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.dense import fit_steps
+from tmlattice.diagnosis.response.pulled_apart import CLEAR, pulled_apart
+from tmlattice.effects import Cause
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.split import split_columns
+from tmlattice.report.response_text import pulled_apart_texts
+
+WITHOUT = STEPS[:3]
+"""Calibrations, gains, gradients."""
+WITH = [*WITHOUT, *(step for step in STEPS if isinstance(step.families[0], HorizontalKicks))]
+
+
+def measured(ring, kicks, rf_step=-3000.0):
+    """Of a ring with gradient errors; kicks that add to the RF's orbit, and to the correctors' by
+    the energy, so many times the usual."""
+    rng = np.random.default_rng(3)
+    causes = [
+        Cause("quadrupole_gradient", f"{family}::{i}", 2e-3 * rng.standard_normal())
+        for family in ("QF", "QD")
+        for i in range(16)
+    ]
+    read = simulate_response(
+        ring, causes, kick=1e-5, noise=2e-8, rf_step=rf_step, engine="ocelot", progress=False
+    ).measured
+    if not kicks:
+        return read
+    data, family = response_data(ring, read), HorizontalKicks()
+    drawn = kicks * USUAL * rng.standard_normal(len(family.patterns(data).rf))
+    none = Errors.none(data)
+    added = Predicted(data, family.put(none, drawn, data)).read - Predicted(data, none).read
+    rf = replace(read.rf, orbit=read.rf.orbit + added[-1])
+    return replace(read, response=read.response + added[:-1], rf=rf)
+
+
+def apart(ring, read, steps):
+    data = response_data(ring, read)
+    split = split_columns(data, 0.2, np.random.default_rng(0))
+    return pulled_apart(fit_steps(data, split, steps).state)
+
+
+def test_they_agree_where_gradients_make_the_rfs_orbit(small_ring):
+    assert apart(small_ring, measured(small_ring, 0), WITHOUT) is None
+
+
+@pytest.mark.parametrize("steps", [WITH, WITHOUT])
+def test_kicks_pull_gradients_apart_whether_they_are_in_the_fit_or_not(small_ring, steps):
+    found = apart(small_ring, measured(small_ring, 3), steps)
+    assert found.missed > found.known
+    assert found.chi2 > 2 * found.readings  # 26 and 2.9 times were measured
+    for own in found.pulls:
+        assert abs(own.pull) >= CLEAR
+        assert np.sign(own.with_rf - own.correctors) == np.sign(own.pull)
+        assert own.with_rf_sigma < own.correctors_sigma
+
+
+def test_without_an_rf_there_is_nothing_to_compare(small_ring):
+    read = replace(measured(small_ring, 0), rf=None)
+    assert apart(small_ring, read, WITHOUT) is None
+
+
+def test_a_diagnosis_says_so(small_ring):
+    effects = ["quadrupole_gradient", "dipole_field"]
+    found = diagnose(small_ring, measured(small_ring, 3), effects=effects)
+    told = found.as_json()["pulled_apart"]
+    assert told["chi2"] > 2 * told["readings"]
+    assert f"{told['pulls'][0]['name']} " in pulled_apart_texts(found)[1]
+    assert "pull gradients apart" in found.report()

@@ -1,0 +1,136 @@
+"""Whether the RF's orbit and the correctors' responses ask for the same gradients.
+
+>>> found = pulled_apart(fit.state)
+>>> found.missed, found.known, [(own.name, own.correctors, own.with_rf) for own in found.pulls]
+
+Gradients are fitted to both. What the correctors alone say of them predicts the RF's orbit, if
+nothing else makes it: kicks of the closed orbit do. Where the prediction fails, gradients that have
+to make that orbit too are drawn away from what the correctors ask for; which, Hausman's test says
+(Econometrica 46, 1978): by chance alone two estimates of which one knows more differ by what it
+knows more. All of it linear about the fit, by its weights, without the kicks.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.dispersion import HorizontalKicks
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
+from tmlattice.diagnosis.response.rf_by_others import rf_fitted
+from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.state import State
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.normal import Normal, solve
+
+Array = NDArray[np.float64]
+
+CLEAR = 5.0
+"""Standard deviations, from which on gradients are told."""
+ROUNDING = 1e-6
+"""Share of a variance below which a difference of two is none."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """A gradient that the two disagree about.
+
+    Attributes:
+        name: of a family of quadrupoles, or of one of them.
+        correctors, correctors_sigma: what the correctors' responses say, relative to the design.
+        with_rf, with_rf_sigma: what they say where gradients have to make the RF's orbit, too.
+        pull: the difference, in standard deviations of it.
+    """
+
+    name: str
+    correctors: float
+    correctors_sigma: float
+    with_rf: float
+    with_rf_sigma: float
+    pull: float
+
+
+@dataclass(frozen=True)
+class PulledApart:
+    """That the two disagree.
+
+    Attributes:
+        missed: by how much gradients by the correctors alone miss the RF's orbit, rms, m.
+        known: by how much they would, rms, m: by their errors and the readings'.
+        chi2, readings: of the RF's orbit, with the errors of that prediction.
+        pulls: gradients that stand out, the strongest first: of families, of magnets.
+    """
+
+    missed: float
+    known: float
+    chi2: float
+    readings: int
+    pulls: tuple[Pull, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {**vars(self), "pulls": [dict(vars(own)) for own in self.pulls]}
+
+
+def pulled_apart(state: State, false_alarm: float = DEFAULT.false_alarm) -> PulledApart | None:
+    """What the two disagree about; None where they agree, no gradients were fitted or no RF's orbit
+    was read.
+
+    Args:
+        state: where the fit stands.
+        false_alarm: chance that two are said to disagree that do not.
+    """
+    single = QuadrupoleGradient()
+    read, weights, left = rf_fitted(state)
+    if single.variable not in state.values or not read.size:
+        return None
+    there, column = linear(state, 0), len(state.data.plane) - 1
+    rows = there.of_column(column, read, int(state.data.plane[column]))
+    kicks = {group.name for group in HorizontalKicks().groups(state.data)}
+    groups = [group for group in there.groups if group.name not in kicks]
+    normal = there.normal
+    without = Normal(
+        normal.matrix - rows.T @ weights @ rows, normal.vector - rows.T @ weights @ left
+    )
+    alone, both = (solve(own, groups, there.start, rounds=0) for own in (without, normal))
+    missed = left - rows @ (alone.values - there.start)
+    spread = rows @ alone.spread
+    covariance = np.linalg.inv(weights) + spread @ alone.covariance @ spread.T
+    total = float(missed @ np.linalg.solve(covariance, missed))
+    if chi2.sf(total, read.size) > false_alarm:
+        return None
+    own = magnets(state.data.ring, ("quadrupole",), powered=True)
+    kinds, members = supplied_alike(own)
+    mean = np.vstack([(members / members.sum(axis=0)).T, np.eye(len(own))])
+    names = [*kinds, *(pieces[0].name for pieces in own)]
+    at, said = there.where[single.variable], []
+    for found in (alone, both):
+        spread = mean @ found.spread[at]
+        said.append((mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1)))
+    return PulledApart(
+        float(np.sqrt(np.mean(missed**2))),
+        float(np.sqrt(np.mean(np.diag(covariance)))),
+        total,
+        len(read),
+        _pulls(names, *said[0], *said[1], len(kinds)),
+    )
+
+
+def _pulls(
+    names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
+) -> tuple[Pull, ...]:
+    """Families that stand out, then single magnets."""
+    more = np.maximum(wide - narrow, ROUNDING * wide)  # what the RF's orbit adds to know
+    pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
+    order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))
+    return tuple(
+        Pull(
+            names[i], float(alone[i]), float(np.sqrt(wide[i])), float(both[i]),
+            float(np.sqrt(narrow[i])), float(pulls[i]),
+        )
+        for i in order
+        if abs(pulls[i]) >= CLEAR
+    )  # fmt: skip

@@ -1,0 +1,95 @@
+"""What a diagnosis keeps of its measurement, for plots and tables."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.model import Model
+from tmlattice.diagnosis.numbers import NumberRead
+from tmlattice.inference.judge import Misfit
+from tmlattice.inference.search import Explanation
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.data import Data
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryView:
+    """What only trajectories have, for plots.
+
+    Attributes:
+        explanation, data, model: the search.
+    """
+
+    explanation: Explanation
+    data: Data
+    model: Model
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseView:
+    """What only an orbit response has, for plots.
+
+    Attributes:
+        measured: the response, its monitors in the ring's order.
+        data: measured, the RF last, m, [column, monitor, 2].
+        design, model: the model's, before and after.
+        held: correctors held out, [column], the RF last.
+        good: monitors kept, [monitor].
+    """
+
+    measured: OrbitResponse
+    data: NDArray[np.float64]
+    design: NDArray[np.float64]
+    model: NDArray[np.float64]
+    held: NDArray[np.bool_]
+    good: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class PartView:
+    """One of several measurements, before and after.
+
+    Attributes:
+        label, kind: what the user calls it, and what it is.
+        readings: their number.
+        before, after: what the design and the result leave.
+        monitors: names.
+        left: rms of what is left at each monitor in units of the noise, before and after,
+            [2, monitor]; NaN where nothing was read.
+        numbers: of tunes, each as read and as both models have it.
+    """
+
+    label: str
+    kind: str
+    readings: int
+    before: Misfit
+    after: Misfit
+    monitors: tuple[str, ...]
+    left: NDArray[np.float64] = field(repr=False)
+    numbers: tuple[NumberRead, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {
+            "name": self.label,
+            "kind": self.kind,
+            "readings": self.readings,
+            "before": dict(vars(self.before)),
+            "after": dict(vars(self.after)),
+            **({"numbers": [n.as_json() for n in self.numbers]} if self.numbers else {}),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class JointView:
+    """What a stored beam's measurements, or several together, have for plots.
+
+    Attributes:
+        explanation: the search.
+        parts: the measurements.
+    """
+
+    explanation: Explanation
+    parts: tuple[PartView, ...]
