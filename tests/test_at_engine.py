@@ -246,6 +246,19 @@ def test_corrector_kick_calibration_and_roll_in_their_order(tmp_path, kind, leng
     np.testing.assert_array_equal(unset, exit_state(engine, kick=0.0))
 
 
+@pytest.mark.parametrize(("kind", "plane"), [("Hcor", 0), ("Vcor", 2)])
+@pytest.mark.parametrize("length", [0.0, 0.4])
+def test_a_field_further_down_has_moved_the_beam_by_less_at_the_exit(tmp_path, kind, plane, length):
+    down, kick = 0.03, 5e-5
+    engine = engine_of(tmp_path, f"{kind}(l={length}, eid='it')", ("corrector_position", down))
+    expected = quadrupole(0, length) @ LAUNCH[:4]
+    expected[plane] += kick * (length / 2 - down)
+    expected[plane + 1] += kick
+    np.testing.assert_allclose(exit_state(engine, kick=kick), expected, atol=1e-14)
+    at_rest = quadrupole(0, length) @ LAUNCH[:4]
+    np.testing.assert_allclose(exit_state(engine, kick=0.0), at_rest, atol=1e-14)
+
+
 def test_a_setting_replaces_the_kick_of_the_design(tmp_path):
     engine = engine_of(tmp_path, "Vcor(angle=2e-5, eid='it')")
     np.testing.assert_allclose(exit_state(engine)[3] - LAUNCH[3], 2e-5, atol=1e-14)

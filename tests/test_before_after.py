@@ -99,6 +99,46 @@ def test_a_corrector_that_was_reversed_since_is_named(small_ring, before):
     assert abs(found.amount + 2) < 0.01  # its own calibration is known to a per cent
 
 
+def exchanged(measured, axis, a, b):
+    order = np.arange(measured.response.shape[axis])
+    order[[a, b]] = b, a
+    response = np.take(measured.response, order, axis)
+    if axis == 0:
+        return replace(measured, response=response, kicks=measured.kicks[order])
+    rf = replace(measured.rf, orbit=measured.rf.orbit[order])
+    return replace(measured, response=response, rf=rf, noise=measured.noise[order])
+
+
+@pytest.mark.parametrize(("axis", "a", "b"), [(0, 4, 5), (0, 2, 11), (1, 3, 20)])
+def test_what_was_exchanged_since_is_located(small_ring, before, axis, a, b):
+    """Neighbours, correctors far from one another, and monitors; in a machine that drifts."""
+    other = exchanged(machine(small_ring, seed=5, drift=0.01), axis, a, b)
+    result = diagnose(small_ring, other, reference=before)
+    names = (before.correctors, before.monitors)[axis]
+    (found,) = result.findings
+    assert (result.verdict, found.effect) == ("located", None)
+    assert set(found.elements) == {names[a], names[b]}
+    assert any(names[a] in said and names[b] in said for said in result.warnings)
+    text = " ".join(report_text(result).split())
+    assert "answer each as the other one did. 1." in text  # and no word of small errors, or of
+    assert "--repaired-out" not in text  # gradients to be set
+
+
+def test_what_changed_is_found_beside_two_exchanged_correctors(small_ring, before, after):
+    result = diagnose(small_ring, exchanged(after, 0, 4, 5), reference=before)
+    assert result.verdict == "located"
+    assert {own.element for own in result.findings if own.effect} == {"qf", "QD::5"}
+    (pair,) = (own for own in result.findings if own.effect is None)
+    assert set(pair.elements) == {before.correctors[4], before.correctors[5]}
+
+
+def test_a_table_of_names_that_was_wrong_on_both_days_is_no_change(small_ring, before):
+    both = (exchanged(one, 0, 4, 5) for one in (before, machine(small_ring, seed=5, drift=0.01)))
+    first, second = both
+    same = diagnose(small_ring, second, reference=first)
+    assert (same.verdict, same.findings) == ("nothing", ())
+
+
 def test_monitors_and_correctors_of_one_measurement_alone_do_no_harm(small_ring, before, after):
     fewer = before.select(monitors=before.monitors[2:])
     other = after.select(correctors=after.correctors[:-1], monitors=after.monitors[::-1])

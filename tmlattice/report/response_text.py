@@ -13,6 +13,8 @@ from tmlattice.report.text import columns, wrapped
 
 SHOWN = 8
 """Largest errors of each effect that are listed."""
+PULLS = 4
+"""Gradients that are pulled apart, of those that are listed."""
 
 
 def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
@@ -194,7 +196,7 @@ def pulled_apart_texts(result: Diagnosis) -> list[str]:
             f"{own.name} {100 * own.correctors:+.2f} ± {100 * own.correctors_sigma:.2f} % by the "
             f"correctors, {100 * own.with_rf:+.2f} ± {100 * own.with_rf_sigma:.2f} % if it has to "
             f"make the RF's orbit ({abs(own.pull):.0f} standard deviations of the difference)"
-            for own in found.pulls[:SHOWN]
+            for own in found.pulls[:PULLS]
         ),
     ]
 

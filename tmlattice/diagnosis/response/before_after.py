@@ -27,6 +27,7 @@ from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
+from tmlattice.diagnosis.response.exchanged import PutRight, righted
 from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.first_guess import begun
 from tmlattice.diagnosis.response.judges import score
@@ -34,6 +35,8 @@ from tmlattice.diagnosis.response.left_open import left_open
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import linear, marginal, settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
+from tmlattice.diagnosis.response.strangers import strangers
+from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
@@ -44,7 +47,7 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Predicted, ResponseData, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, response_data
 from tmlattice.observe.response_change import alike, response_change
 from tmlattice.observe.split import Split, split_columns
 
@@ -128,8 +131,9 @@ def diagnose_change(
         errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     else:
         errors = fitted.at.errors
-    there, change = response_change(first, errors, second)
-    data = response_data(there, change)
+    data, exchanges = _change(first, errors, second, holdout, said)
+    there = data.ring
+    found = unnamed(there, exchanges, other="did")
     split = split_columns(data, holdout, rng)
     judgement = Judgement(false_alarm=false_alarm)
     options = {
@@ -141,10 +145,11 @@ def diagnose_change(
     few = few_causes(data, split, asked, max_effects, judgement, seed, progress, left_open(fitted))
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
+        found = _strongest([*few.findings, *found])
         return as_diagnosis(
             there, few.fit, few.fit.state.at.errors.ring, few.told,
-            verdict=few.verdict,
-            findings=with_consequences(there, few.findings, causes),
+            verdict=_least_certain(found, few.verdict),
+            findings=with_consequences(there, found, causes),
             warnings=(*said, *few.said),
             noise_estimated=False,
             provenance=provenance(ring, options, seed, started),
@@ -152,16 +157,17 @@ def diagnose_change(
     fit = _fit_change(data, split, trials, progress)
     progress("what changed")
     whole = _all_columns(fit.state)
-    found = findings_of_change(whole, effects, max_effects, judgement)
-    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in found)
+    named = findings_of_change(whole, effects, max_effects, judgement)
+    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in named)
     told: list[Told] = [
-        (cause, own.amount_sigma or 0.0) for cause, own in zip(causes, found, strict=True)
+        (cause, own.amount_sigma or 0.0) for cause, own in zip(causes, named, strict=True)
     ]
+    found = _strongest([*named, *found])
     have = {(cause.effect, cause.element) for cause in causes}
     told += [row for row in _drifts(whole) if (row[0].effect, row[0].element) not in have]
     return as_diagnosis(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
-        verdict=_verdict(whole, found),
+        verdict=_least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
         warnings=(*said, *_said(data, fit, whole)),
         noise_estimated=True,
@@ -189,6 +195,22 @@ def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
 
 
 # --- the fits -------------------------------------------------------------------------------------
+def _change(
+    first: ResponseData, errors: Errors, second: ResponseData, holdout: float, said: list[str]
+) -> tuple[ResponseData, PutRight]:
+    """What changed as a measurement of the first ring, see `response_change`, pairs of correctors
+    or monitors that were exchanged since put right; which these are, is said."""
+    known = PutRight([], {}, {})
+    while True:
+        data = response_data(*response_change(first, errors, second))
+        state = begin(data, split_columns(data, holdout, np.random.default_rng(0)))
+        right = righted(state, second.measured, known, strangers(state), ())
+        if right is None:
+            return data, known
+        second = response_data(second.ring, right[0])
+        said.append(right[1])
+
+
 def _judged_by_nobody(split: Split) -> Split:
     """All correctors are fitted, and all of the RF's orbit."""
     nobody, half = np.zeros_like(split.held), split.half.copy()
@@ -379,9 +401,17 @@ def _outstanding(state: State, judgement: Judgement) -> list[Finding]:
     return found
 
 
-def _verdict(state: State, found: Sequence[Finding]) -> str:
-    if found:
-        return max((own.verdict for own in found), key=VERDICTS.index)
+def _strongest(found: Sequence[Finding]) -> list[Finding]:
+    """By falling statistic."""
+    return sorted(found, key=lambda own: -own.detection.statistic)
+
+
+def _least_certain(found: Sequence[Finding], without: str) -> str:
+    """The verdict of the least certain finding, or what it is where there is none."""
+    return max((own.verdict for own in found), key=VERDICTS.index) if found else without
+
+
+def _verdict(state: State) -> str:
     group = state.groups.get(QuadrupoleGradient.name)
     return "distributed" if group is not None and group.rms > EVERYWHERE else "nothing"
 

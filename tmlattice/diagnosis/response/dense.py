@@ -432,12 +432,11 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
         if family.per != "ring" or family.block or not own or len(own[0].scale) < 2:
             continue
         loose = np.flatnonzero(posterior.sigma[there.where[family.variable]] > 0.5 * own[0].scale)
-        causes = family.told(state.at.errors, state.values[family.variable],
-                             np.zeros(family.size(state.data)), state.data)  # fmt: skip
-        names = [causes[i][0].element or "" for i in loose] if causes else []
+        moves = family.moves(state.data)  # of each number; a cause is one of its pieces
+        names = [place for i in loose for _, place in list(moves[i])[:1] if place]
         if names:
             said.append(
-                f"{len(names)} gradients that the prior holds more than the data: "
+                f"{len(names)} of {family.title} that the prior holds more than the data: "
                 + first_of(names, 12)
             )
     return tuple(said)

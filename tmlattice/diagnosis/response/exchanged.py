@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.strangers import Strangers
 from tmlattice.measurement import OrbitResponse
 
 Array = NDArray[np.float64]
@@ -31,6 +32,33 @@ class PutRight(NamedTuple):
     planes: list[str]
     correctors: dict[Pair, float]
     monitors: dict[Pair, float]
+
+
+def righted(
+    state: State, measured: OrbitResponse, known: PutRight, odd: Strangers, among: Collection[str]
+) -> tuple[OrbitResponse, str] | None:
+    """The measurement with pairs exchanged that were not known, and what they are, in words; None
+    where there are none.
+
+    Args:
+        state: what the model makes of the readings.
+        measured: what they are of.
+        known: pairs that were put right before; new ones are added.
+        odd: what resembles nothing.
+        among: correctors that seem to stand elsewhere.
+    """
+    pairs = _new(exchanged(state, {*odd.correctors, *among}), known.correctors)
+    if pairs:
+        return put_right(measured, pairs), told(pairs)
+    pairs = _new(exchanged_monitors(state, {name for name, _ in odd.monitors}), known.monitors)
+    return (monitors_back(measured, pairs), told(pairs, "monitors")) if pairs else None
+
+
+def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
+    """Pairs that were not known; they are now."""
+    new = [pair for pair in found if pair not in known]
+    known.update((pair, found[pair]) for pair in new)
+    return new
 
 
 def exchanged(state: State, among: Collection[str] = ()) -> dict[Pair, float]:

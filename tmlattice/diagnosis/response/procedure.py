@@ -30,17 +30,7 @@ from tmlattice.diagnosis.findings import swap_of, with_consequences
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.response.displaced import Displaced, displaced
-from tmlattice.diagnosis.response.exchanged import (
-    Pair,
-    PutRight,
-    exchanged,
-    exchanged_monitors,
-    monitors_back,
-    planes_back,
-    put_right,
-    swapped,
-)
-from tmlattice.diagnosis.response.exchanged import told as told_exchanged
+from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
 from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
@@ -182,16 +172,10 @@ def _families(
         state = begin(data, split) if fit is None else fit.state
         odd = strangers(state)
         far = displaced(state) if fit is not None else []
-        among = {*odd.correctors, *(own.name for own in far)}
-        pairs = _new(exchanged(state, among), known.correctors)
-        if pairs:
-            said.append(told_exchanged(pairs))
-            measured, fit = put_right(measured, pairs), None
-            continue
-        pairs = _new(exchanged_monitors(state, {name for name, _ in odd.monitors}), known.monitors)
-        if pairs:
-            said.append(told_exchanged(pairs, "monitors"))
-            measured, fit = monitors_back(measured, pairs), None
+        right = righted(state, measured, known, odd, {own.name for own in far})
+        if right is not None:
+            measured, fit = right[0], None
+            said.append(right[1])
             continue
         crossed = [name for name in swapped(state) if name not in known.planes]
         if crossed:
@@ -206,13 +190,6 @@ def _families(
         elif fit is not None:
             return fit, measured, [*said, *fit.said], known
         fit = fit_steps(data, split, trials, most, progress)
-
-
-def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
-    """Pairs that were not known; they are now."""
-    new = [pair for pair in found if pair not in known]
-    known.update((pair, found[pair]) for pair in new)
-    return new
 
 
 def _faults(

@@ -22,18 +22,22 @@ NEAR = 0.25
 """Of the ring: two that stand nearer have one place."""
 
 
-def unnamed(ring: Ring, exchanged: PutRight, displaced: Sequence[Displaced]) -> list[Finding]:
+def unnamed(
+    ring: Ring, exchanged: PutRight, displaced: Sequence[Displaced] = (), other: str = "should"
+) -> list[Finding]:
     """All of them.
 
     Args:
         ring: the design.
         exchanged: pairs that were put right.
         displaced: correctors that stand elsewhere.
+        other: what the other one of a pair does as each of them: it "should", by the model, or it
+            "did" in a measurement before.
     """
     found = []
     for what, pairs in (("correctors", exchanged.correctors), ("monitors", exchanged.monitors)):
         for (a, b), gain in pairs.items():
-            words = f"{what} {a} and {b} answer each as the other one should"
+            words = f"{what} {a} and {b} answer each as the other one {other}"
             check = "Follow the cables of both, and look at the table of their names."
             found.append(_finding(ring, (a, b), Detection.among(gain, len(ring.elements)), words,
                                   check))  # fmt: skip
