@@ -150,6 +150,30 @@ def test_derivative_vs_finite_difference(bent, effect):
     assert np.abs(theirs).max() > 0
 
 
+def test_correctors_that_are_not_set_move_no_map_wherever_their_fields_are(bent):
+    """Of a model that is changed, against one that is made anew; two correctors of `bent` are
+    kicks, and their maps do change."""
+    rng = np.random.default_rng(1)
+    model = ResponseModel(bent)
+    causes = [
+        Cause(effect, name, 0.02 * rng.standard_normal())
+        for effect in ("corrector_position", "corrector_roll")
+        for name in model.correctors
+    ]
+    ring = apply(bent, causes)
+    changed, anew = model.changed_to(ring), ResponseModel(ring)
+    scale = np.abs(anew.response()).max()
+    assert_allclose(changed.response(), anew.response(), atol=1e-12 * scale)
+    assert_allclose(changed.readings, anew.readings, atol=1e-15)
+    assert np.abs(changed.response() - model.response()).max() > 0.01 * scale
+    at_rest = [e.name for e in bent.elements if e.name in model.correctors and not e.errors.kick_x
+               and not e.errors.kick_y]  # fmt: skip
+    assert 0 < len(at_rest) < len(model.correctors)
+    for names, count in ((at_rest, 0), (model.correctors, len(model.correctors) - len(at_rest))):
+        moved = apply(bent, [c for c in causes if c.element in names])
+        assert len(model.layers.changed_to(moved)[1]) == count
+
+
 def test_gradient_at_a_marker_moves_the_monitors_behind_it(petra3, model):
     """No magnet stands between: the read-outs themselves change."""
     kinds = "".join(

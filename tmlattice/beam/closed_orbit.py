@@ -24,7 +24,7 @@ from tmlattice.beam.threads import share
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
-from tmlattice.maps.quadratic import Quadratic, difference
+from tmlattice.maps.quadratic import Quadratic, difference, each_after
 from tmlattice.maps.taylor import second_derivatives
 
 Array = NDArray[np.float64]
@@ -113,12 +113,13 @@ class ResponseModel:
             UnstableRingError: no closed orbit.
         """
         other = copy(self)
-        other._forget()
         other.ring = ring
         other.layers, touched = self.layers.changed_to(ring)
-        other.maps = changed_maps(self.maps, other.layers, touched)
-        other._chain = Chain(other.maps)
-        other._close(self.frequency)
+        if touched:  # else what kicks do is another, and the orbit is the same
+            other._forget()
+            other.maps = changed_maps(self.maps, other.layers, touched)
+            other._chain = Chain(other.maps)
+            other._close(self.frequency)
         return other
 
     def _forget(self) -> None:
@@ -296,13 +297,10 @@ class ResponseModel:
         at the entrances, [column, n, n]; the maps are the same on every orbit."""
         memory, key = self.layers.memory, ("kicks", place.tobytes())
         if key not in memory:
-            n = self.dimension
-            W0, W1 = np.zeros((len(place), n)), np.zeros((len(place), n, n))
-            W2 = np.zeros((len(place), n, n * (n + 1) // 2))
-            for row, (i, k) in enumerate(zip(place, layer, strict=True)):
-                slope = self._map_slope(self.ring.elements[i])
-                W0[row], W1[row], W2[row] = slope.after(self.layers.way(int(k))).reduced()
-            memory[key] = W0, W1, second_derivatives(W2)
+            slopes = [self._map_slope(self.ring.elements[i]) for i in place]
+            ways = [self.layers.way(int(k)) for k in layer]
+            B, R, T = each_after(slopes, ways, self.dimension)
+            memory[key] = B, R, 2 * T
         W0, W1, curved = memory[key]
         x = self.path[layer]
         bent = np.einsum("caij,cj->cai", curved, x)

@@ -181,15 +181,17 @@ class LayerMaps:
         self.memory: dict[Hashable, Any] = {}
 
     def changed_to(self, ring: Ring) -> tuple["LayerMaps", list[int]]:
-        """Of a ring some of whose elements are others at the same places, and the layers that hold
-        these; all that was worked out already is shared."""
-        pairs = zip(self.ring.elements, ring.elements, strict=True)
+        """Of a ring some of whose elements are others at the same places, and the layers whose maps
+        are others then; all that was worked out already is shared."""
+        own = self.ring.elements
+        pairs = zip(own, ring.elements, strict=True)
         places = [i for i, (a, b) in enumerate(pairs) if a is not b]
         other = copy(self)
         other.ring = ring
         other.origin = (self, tuple(places))
         other.memory = {}
-        touched = sorted({int(self.layer_of[i]) for i in places})
+        moving = (i for i in places if not _both_at_rest(own[i], ring.elements[i]))
+        touched = sorted({int(self.layer_of[i]) for i in moving})
         other._ways = {k: way for k, way in self._ways.items() if k not in touched}
         return other, touched
 
@@ -264,6 +266,18 @@ class LayerMaps:
             if _moves(element):
                 way = self.map(element).after(way)
         return way.reduced(), readouts
+
+
+def _both_at_rest(one: Element, other: Element) -> bool:
+    """Whether two are one corrector that is not set, with whatever is wrong with what it would kick
+    if it were: a way without field. A fit of a response moves all of them, and no map."""
+    errors = one.errors
+    return (
+        one.kind in ("hcorrector", "vcorrector")
+        and one.angle == other.angle == errors.kick_x == errors.kick_y == 0
+        and (one.data or one.source) is (other.data or other.source)
+        and replace(errors, ds=other.errors.ds, roll=other.errors.roll) == other.errors
+    )
 
 
 def _moves(element: Element) -> bool:

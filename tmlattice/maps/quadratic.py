@@ -7,7 +7,7 @@ each x -> B + R x + x^T T x. The parts are composed to second order.
 import cmath
 import copy
 import functools
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -55,6 +55,27 @@ class Quadratic:
         if self.T is None:
             return self.B, self.R, np.zeros((len(self.B), len(i)))
         return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
+
+
+def each_after(
+    later: Sequence[Quadratic], first: Sequence[Quadratic], n: int
+) -> tuple[Array, Array, Array]:
+    """`Quadratic.after` of many pairs at once: B [pair, n], R [pair, n, n], T [pair, n, n, n]."""
+    (B2, R2, T2), (B1, R1, T1) = _stacked(later, n), _stacked(first, n)
+    fed = (T2 @ B1[:, None, :, None])[..., 0]
+    slope = R2 + 2.0 * fed
+    bent = R1.swapaxes(1, 2)[:, None] @ T2 @ R1[:, None]
+    bent += (slope @ T1.reshape(*T1.shape[:2], -1)).reshape(T1.shape)
+    B = B2 + ((R2 + fed) @ B1[:, :, None])[..., 0]
+    return B, slope @ R1, bent
+
+
+def _stacked(maps: Sequence[Quadratic], n: int) -> tuple[Array, Array, Array]:
+    nothing = np.zeros((n, n, n))
+    B = np.array([m.B for m in maps]).reshape(-1, n)
+    R = np.array([m.R for m in maps]).reshape(-1, n, n)
+    T = np.array([nothing if m.T is None else m.T for m in maps]).reshape(-1, n, n, n)
+    return B, R, T
 
 
 def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
@@ -349,10 +370,18 @@ def _way(n: int, length: float, energy: float) -> Quadratic | None:
     """A drift, forth or back."""
     if length == 0:
         return None
+    metre, eye = _metre(n, energy), np.eye(n)
+    bent = None if metre.T is None else length * metre.T
+    return Quadratic(metre.B, eye + length * (metre.R - eye), bent)
+
+
+@functools.cache
+def _metre(n: int, energy: float) -> Quadratic:
+    """A drift of 1 m: what it does beyond the identity goes with the length."""
     from tmlattice.lattice.ocelot import elements
 
-    drift = elements.Drift(l=length)
-    return composed(of_ocelot(part, n) for part in parts_of_ocelot(drift, energy, False))
+    parts = parts_of_ocelot(elements.Drift(l=1.0), energy, False)
+    return composed(of_ocelot(part, n) for part in parts)
 
 
 def _turn(n: int, roll: float) -> Quadratic | None:
