@@ -174,6 +174,13 @@ def test_correctors_that_are_not_set_move_no_map_wherever_their_fields_are(bent)
         assert len(model.layers.changed_to(moved)[1]) == count
 
 
+def test_a_ring_without_correctors_has_an_empty_response(small_ring):
+    kinds = [e.kind for e in small_ring.elements]
+    assert "vcorrector" in kinds
+    none = ResponseModel(small_ring).response([])
+    assert none.shape == (0, len(small_ring.monitors), 2)
+
+
 def test_gradient_at_a_marker_moves_the_monitors_behind_it(petra3, model):
     """No magnet stands between: the read-outs themselves change."""
     kinds = "".join(

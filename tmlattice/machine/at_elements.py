@@ -178,7 +178,11 @@ class Builder:
             raise LatticeError(f"AT cannot build the {element.kind} '{element.name}'")
         _check(element, wrong)
         entrance = self._thin(element, wrong, "entrance")
-        return [*entrance, *build(element, wrong, defaultdict(float, setting))]
+        made = [*entrance, *build(element, wrong, defaultdict(float, setting))]
+        if not wrong.ds:
+            return made
+        there, back = (at.Drift(element.name, way) for way in (wrong.ds, -wrong.ds))
+        return [there, *made, back]
 
     def _thin(self, element: Element, wrong: Build, where: Where) -> list[Any]:
         """Thin gradients, px -= normal x - skew y, py += normal y + skew x, and other kicks."""
@@ -347,11 +351,7 @@ class Builder:
         y = kick * np.sin(element.tilt) + wrong.kick_y
         cosine, sine = np.cos(wrong.roll), np.sin(wrong.roll)
         turned = [cosine * x - sine * y, sine * x + cosine * y]
-        made = [at.Corrector(element.name, element.length, turned)]
-        if not wrong.ds:
-            return made
-        there, back = (at.Drift(element.name, way) for way in (wrong.ds, -wrong.ds))
-        return [there, *made, back]
+        return [at.Corrector(element.name, element.length, turned)]
 
     _vcorrector = _hcorrector  # OCELOT tilts a vertical corrector by a right angle
 

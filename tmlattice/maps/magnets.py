@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tmlattice import cache
 from tmlattice.by_name import by_name
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Ring
+from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Errors, Ring
 from tmlattice.maps.quadratic import (
     Quadratic,
     Weights,
@@ -269,14 +269,13 @@ class LayerMaps:
 
 
 def _both_at_rest(one: Element, other: Element) -> bool:
-    """Whether two are one corrector that is not set, with whatever is wrong with what it would kick
-    if it were: a way without field. A fit of a response moves all of them, and no map."""
-    errors = one.errors
+    """Whether two are one corrector that is not set, its field elsewhere or rolled and nothing else
+    wrong: a way without field. A fit of a response moves all of them, and no map."""
     return (
         one.kind in ("hcorrector", "vcorrector")
-        and one.angle == other.angle == errors.kick_x == errors.kick_y == 0
+        and one.angle == other.angle == 0
         and (one.data or one.source) is (other.data or other.source)
-        and replace(errors, ds=other.errors.ds, roll=other.errors.roll) == other.errors
+        and all(e == Errors(ds=e.ds, roll=e.roll) for e in (one.errors, other.errors))
     )
 
 

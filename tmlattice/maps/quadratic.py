@@ -65,7 +65,7 @@ def each_after(
     fed = (T2 @ B1[:, None, :, None])[..., 0]
     slope = R2 + 2.0 * fed
     bent = R1.swapaxes(1, 2)[:, None] @ T2 @ R1[:, None]
-    bent += (slope @ T1.reshape(*T1.shape[:2], -1)).reshape(T1.shape)
+    bent += (slope @ T1.reshape(-1, n, n * n)).reshape(T1.shape)
     B = B2 + ((R2 + fed) @ B1[:, :, None])[..., 0]
     return B, slope @ R1, bent
 

@@ -58,6 +58,9 @@ def test_kicks_pull_gradients_apart_whether_they_are_in_the_fit_or_not(small_rin
     found = apart(small_ring, measured(small_ring, 3), steps)
     assert found.missed > found.known
     assert found.chi2 > 2 * found.readings  # 26 and 2.9 times were measured
+    assert (
+        found.pulls or steps is WITHOUT
+    )  # where kicks are missing, gradients have made up for them
     for own in found.pulls:
         assert abs(own.pull) >= CLEAR
         assert np.sign(own.with_rf - own.correctors) == np.sign(own.pull)

@@ -14,6 +14,7 @@ are supplies (magnets whose names begin alike), single magnets, gradients in sex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import finding_of, with_consequences
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
-from tmlattice.diagnosis.response.exchanged import PutRight, righted
+from tmlattice.diagnosis.response.exchanged_since import all_right, since
 from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.first_guess import begun
 from tmlattice.diagnosis.response.judges import score
@@ -35,7 +36,6 @@ from tmlattice.diagnosis.response.left_open import left_open
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import linear, marginal, settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
-from tmlattice.diagnosis.response.strangers import strangers
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
@@ -47,7 +47,7 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData, response_data
+from tmlattice.observe.orbit_response import Predicted, ResponseData, response_data
 from tmlattice.observe.response_change import alike, response_change
 from tmlattice.observe.split import Split, split_columns
 
@@ -120,20 +120,26 @@ def diagnose_change(
     if _same(first, second):
         trials = []
         said.append("the two measurements are the same, to the last digit")
+    before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
     fitted = _reference(first, split_columns(first, holdout, rng), WITHOUT_KICKS if trials else ())
-    bad = [name for name, good in zip(before.monitors, fitted.good, strict=True) if not good]
+    names = first.measured.monitors
+    bad = [name for name, good in zip(names, fitted.good, strict=True) if not good]
     if bad:
-        kept = [name for name in before.monitors if name not in bad]
+        kept = [name for name in names if name not in bad]
         said.append(f"monitors left out, bad in the reference: {', '.join(bad)}")
         first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
         errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     else:
         errors = fitted.at.errors
-    data, exchanges = _change(first, errors, second, holdout, said)
+
+    def change(measured: OrbitResponse) -> ResponseData:
+        return response_data(*response_change(first, errors, response_data(ring, measured)))
+
+    _, data, exchanged_after = all_right(change, second.measured, holdout)
     there = data.ring
-    found = unnamed(there, exchanges, other="did")
+    found = unnamed(there, since(exchanged_before, exchanged_after, said), other="did")
     split = split_columns(data, holdout, rng)
     judgement = Judgement(false_alarm=false_alarm)
     options = {
@@ -195,22 +201,6 @@ def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
 
 
 # --- the fits -------------------------------------------------------------------------------------
-def _change(
-    first: ResponseData, errors: Errors, second: ResponseData, holdout: float, said: list[str]
-) -> tuple[ResponseData, PutRight]:
-    """What changed as a measurement of the first ring, see `response_change`, pairs of correctors
-    or monitors that were exchanged since put right; which these are, is said."""
-    known = PutRight([], {}, {})
-    while True:
-        data = response_data(*response_change(first, errors, second))
-        state = begin(data, split_columns(data, holdout, np.random.default_rng(0)))
-        right = righted(state, second.measured, known, strangers(state), ())
-        if right is None:
-            return data, known
-        second = response_data(second.ring, right[0])
-        said.append(right[1])
-
-
 def _judged_by_nobody(split: Split) -> Split:
     """All correctors are fitted, and all of the RF's orbit."""
     nobody, half = np.zeros_like(split.held), split.half.copy()

@@ -59,7 +59,8 @@ class PulledApart:
 
     Attributes:
         missed: by how much gradients by the correctors alone miss the RF's orbit, rms, m.
-        known: by how much they would, rms, m: by their errors and the readings'.
+        known: by how much they would, rms, m: by their errors and the readings', as many of which
+            the fit takes for independent.
         chi2, readings: of the RF's orbit, with the errors of that prediction.
         pulls: gradients that stand out, the strongest first: of families, of magnets.
     """
