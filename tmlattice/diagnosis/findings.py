@@ -1,6 +1,6 @@
 """What a search found, as findings: each with what else it could be, where it sits, how sure."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -46,7 +46,17 @@ def findings_of(
     for m, detection in explanation.monitors.items():
         found.append(located(ring, ring.monitors[m], detection))
     found += [_dead(ring, ring.monitors[m], amount) for m, amount in dead]
-    return tuple(sorted(found, key=lambda f: -f.detection.statistic))
+    return strongest_first(found)
+
+
+def strongest_first(found: Iterable[Finding]) -> tuple[Finding, ...]:
+    """By falling statistic."""
+    return tuple(sorted(found, key=lambda own: -own.detection.statistic))
+
+
+def least_certain(found: Sequence[Finding], without: str) -> str:
+    """The verdict of the least certain finding, or what it is where there is none."""
+    return max((own.verdict for own in found), key=VERDICTS.index) if found else without
 
 
 def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: float) -> Finding:
@@ -198,9 +208,10 @@ def verdict_of(
             "there anyway"
         )
         return "distributed", (), (said,)
+    clean = "nothing" if p_value >= far_more or estimated else "distributed"
+    worst = least_certain(findings, clean)
     if not findings:
-        return "nothing" if p_value >= far_more or estimated else "distributed", (), ()
-    worst = max(findings, key=lambda f: VERDICTS.index(f.verdict)).verdict
+        return worst, (), ()
     if p_value < more and not estimated:
         return worst, findings, ("what is left is more than the noise: see 'unexplained'",)
     return worst, findings, ()

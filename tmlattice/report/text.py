@@ -144,11 +144,11 @@ def _located_sentence(diagnosis: Diagnosis) -> str:
     told = [f"{f.words[0].upper()}{f.words[1:]}." for f in found if f.words]
     named = [_short(f) for f in found if f.effect is not None]
     also = [f"Besides: {'; '.join(named)}."] if named else []
-    also += [steps_sentence(diagnosis)] if _steps_count(diagnosis) else []
+    also += [steps_sentence(diagnosis)] if _errors_in_steps(diagnosis) else []
     return " ".join([*([acts] if unknown else []), *told, *also])
 
 
-def _steps_count(diagnosis: Diagnosis) -> bool:
+def _errors_in_steps(diagnosis: Diagnosis) -> bool:
     """Whether steps were kept that are errors of the ring, and no drifts since a reference."""
     return len(diagnosis.steps) > 1 and not since_reference(diagnosis)
 
@@ -221,7 +221,7 @@ def advice(diagnosis: Diagnosis) -> str:
         )
     checks = dict.fromkeys(f.to_check for f in diagnosis.findings if f.to_check)
     if diagnosis.verdict == "located" and checks:
-        return " ".join([*checks, *([everywhere] if _steps_count(diagnosis) else [])])
+        return " ".join([*checks, *([everywhere] if _errors_in_steps(diagnosis) else [])])
     if diagnosis.verdict == "located":
         return (
             "Look at what stands there: hardware, apertures, cables of the monitors. More launches "

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.families.corrector_position import CorrectorPosition
 from tmlattice.diagnosis.families.fields import (
+    CorrectorPosition,
     EdgeFocusing,
     QuadrupoleGradient,
     SkewGradient,
@@ -20,8 +20,12 @@ from tmlattice.diagnosis.families.steps import (
     MonitorGain,
     MonitorRoll,
 )
+from tmlattice.diagnosis.response.rounds import settle
+from tmlattice.diagnosis.response.state import allow, begin, jump
+from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.split import split_columns
 
 CALIBRATION, GAIN = CorrectorCalibration(), MonitorGain()
 RMS = {
@@ -115,3 +119,19 @@ def test_straights_are_the_same_wherever_the_lattice_begins():
            ("d2", "drift", 0.9), ("q2", "quadrupole", 0.2), ("d3", "drift", 0.4)]  # fmt: skip
     assert named(ring_of(*cut)) == ["d1"]  # 1.1 m in all
     assert len(named(ring_of(("a", "marker", 0.0), *cut, ("b", "marker", 0.0)))) == 1
+
+
+def test_fields_that_the_iron_beside_them_draws_away_come_out_where_at_has_them(small_ring):
+    """v1 to v15 stand between a bend and QF, and are moved by 15 mm in AT, up or down; v0, between
+    a wiggler and QF, and the horizontal one stand so alone, have no number, and stay."""
+    family, names = CorrectorPosition(), [f"v{i}" for i in range(1, 16)]
+    for by in (0.015, -0.015):
+        measured = simulate_response(
+            small_ring, [Cause("corrector_position", name, by) for name in names],
+            kick=1e-5, noise=2e-8, rf_step=-3000.0, progress=False, seed=2,
+        ).measured  # fmt: skip
+        data = response_data(small_ring, measured)
+        assert [list(own) for own in family.shares(data)] == [names]
+        state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
+        (found,) = settle(jump(allow(state, [family]))).values[family.variable]
+        assert abs(found - by) < 1e-3

@@ -10,7 +10,7 @@ from tmlattice.diagnosis.families.dispersion import USUAL, HorizontalKicks
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.dense import fit_steps
 from tmlattice.diagnosis.response.pulled_apart import CLEAR, pulled_apart
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, apply
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 from tmlattice.observe.split import split_columns
@@ -21,22 +21,26 @@ WITHOUT = STEPS[:3]
 WITH = [*WITHOUT, *(step for step in STEPS if isinstance(step.families[0], HorizontalKicks))]
 
 
-def measured(ring, kicks, rf_step=-3000.0):
-    """Of a ring with gradient errors; kicks that add to the RF's orbit, and to the correctors' by
-    the energy, so many times the usual."""
+def gradients():
+    """Errors of all quadrupoles."""
     rng = np.random.default_rng(3)
-    causes = [
+    return [
         Cause("quadrupole_gradient", f"{family}::{i}", 2e-3 * rng.standard_normal())
         for family in ("QF", "QD")
         for i in range(16)
     ]
+
+
+def measured(ring, kicks, rf_step=-3000.0):
+    """Of a ring with gradient errors; kicks that add to the RF's orbit, and to the correctors' by
+    the energy, so many times the usual."""
     read = simulate_response(
-        ring, causes, kick=1e-5, noise=2e-8, rf_step=rf_step, engine="ocelot", progress=False
+        ring, gradients(), kick=1e-5, noise=2e-8, rf_step=rf_step, engine="ocelot", progress=False
     ).measured
     if not kicks:
         return read
     data, family = response_data(ring, read), HorizontalKicks()
-    drawn = kicks * USUAL * rng.standard_normal(len(family.patterns(data).rf))
+    drawn = kicks * USUAL * np.random.default_rng(5).standard_normal(len(family.patterns(data).rf))
     none = Errors.none(data)
     added = Predicted(data, family.put(none, drawn, data)).read - Predicted(data, none).read
     rf = replace(read.rf, orbit=read.rf.orbit + added[-1])
@@ -79,3 +83,15 @@ def test_a_diagnosis_says_so(small_ring):
     assert told["chi2"] > 2 * told["readings"]
     assert f"{told['pulls'][0]['name']} " in pulled_apart_texts(found)[1]
     assert "pull gradients apart" in found.report()
+
+
+def test_the_correctors_tell_the_gradients_whatever_the_rfs_orbit_asks_for(small_ring):
+    """The RF's orbit of a ring whose QF are 1 % stronger than when the correctors were stepped."""
+    stronger = apply(small_ring, [Cause("family_gradient", "QF", 0.01)])
+    read = replace(measured(small_ring, 0), rf=measured(stronger, 0).rf)
+    found = apart(small_ring, read, WITHOUT)
+    true = {cause.element: cause.amount for cause in gradients()}
+    assert len(found.pulls) > 5
+    for own in found.pulls:
+        assert abs(own.correctors - true[own.name]) < 4 * own.correctors_sigma
+        assert abs(own.with_rf - true[own.name]) > abs(own.correctors - true[own.name])

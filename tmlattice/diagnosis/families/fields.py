@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import TAILS, Family, Told
-from tmlattice.diagnosis.families.magnets import magnets, straights, supplied_alike
+from tmlattice.diagnosis.families.magnets import between, magnets, straights, supplied_alike
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 LARGEST_GRADIENT = 0.02
 """Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
 LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
+FURTHEST = 0.05
+"""m, prior rms of the way to a corrector's field at most: further off is another corrector's."""
 
 
 class _Magnets(Family):
@@ -256,3 +258,41 @@ class EdgeFocusing(_Thin):
             length = sum(e.length for own in bends for e in own)
             largest.append(squares / length if length else 0.0)
         return [Group(self.name, np.diag(largest), 0.1, most=1.0)]
+
+
+class CorrectorPosition(_Magnets):
+    """Where the fields of correctors are: one number for all of a plane that stand between the same
+    two families of magnets, whose iron draws them as much further up or down.
+
+    A corrector that stands so alone has no number: nobody else could confirm it.
+    """
+
+    name = effect = "corrector_position"
+    effects: ClassVar[tuple[str, ...]] = ("corrector_position",)
+    block, variable, trust = 0, "position", 0.02
+
+    def shares(self, data: ResponseData) -> list[dict[str, float]]:
+        """The correctors of each number."""
+        measured = data.measured
+        alike: dict[str, dict[str, float]] = {}
+        where = between(data.ring, measured.correctors, measured.planes)
+        for name, own in zip(measured.correctors, where, strict=True):
+            alike.setdefault(own, {})[name] = 1.0
+        return [correctors for correctors in alike.values() if len(correctors) > 1]
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """Of each."""
+        return [Group(self.name, np.eye(self.size(data)), 5e-3, most=FURTHEST)]
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """A kick that comes later has moved the beam by less, in its own column alone."""
+        data = at.data
+        kicks = data.kicks * (1 + at.errors.calibration)
+        jump = -at.gain(0) * data.pick(at.jumps) * kicks[:, None]
+        column = {name: c for c, name in enumerate(data.measured.correctors)}
+        shares = self.shares(data)
+        out = np.zeros((len(shares), *data.shape))
+        for row, correctors in zip(out, shares, strict=True):
+            own = [column[name] for name in correctors]
+            row[own] = jump[own]
+        return out

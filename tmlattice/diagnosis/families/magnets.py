@@ -49,6 +49,23 @@ def supplied_alike(own: Sequence[tuple[Element, ...]]) -> tuple[list[str], Array
     return kinds, np.hstack([members, *columns])
 
 
+def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> list[str]:
+    """Of each corrector its plane and the families of the magnets before and behind it.
+
+    Args:
+        ring: where they stand.
+        correctors: names.
+        planes: "x" or "y", of each.
+    """
+    others = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
+    places = np.array([e.s for e in others])
+    behind = np.searchsorted(places, [ring[name].s for name in correctors]) % len(others)
+    return [
+        f"{plane} {stem(others[i - 1].name)} {stem(others[i].name)}"
+        for plane, i in zip(planes, behind, strict=True)
+    ]
+
+
 def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:
     """Magnets of some kinds, each with its pieces; pieces that are edges of other magnets are none.
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.corrector_position import CorrectorPosition
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
 from tmlattice.diagnosis.families.family import TAILS, Family, Told
 from tmlattice.diagnosis.families.fields import (
     BendGradient,
+    CorrectorPosition,
     EdgeFocusing,
     FamilyGradient,
     FocusingChange,

@@ -25,7 +25,12 @@ from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
-from tmlattice.diagnosis.findings import finding_of, with_consequences
+from tmlattice.diagnosis.findings import (
+    finding_of,
+    least_certain,
+    strongest_first,
+    with_consequences,
+)
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
 from tmlattice.diagnosis.response.exchanged_since import all_right, since
@@ -37,7 +42,7 @@ from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, tri
 from tmlattice.diagnosis.response.rounds import linear, marginal, settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
+from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
@@ -139,7 +144,7 @@ def diagnose_change(
 
     _, data, exchanged_after = all_right(change, second.measured, holdout)
     there = data.ring
-    found = unnamed(there, since(exchanged_before, exchanged_after, said), other="did")
+    pairs = unnamed(there, since(exchanged_before, exchanged_after, said), other="did")
     split = split_columns(data, holdout, rng)
     judgement = Judgement(false_alarm=false_alarm)
     options = {
@@ -151,10 +156,10 @@ def diagnose_change(
     few = few_causes(data, split, asked, max_effects, judgement, seed, progress, left_open(fitted))
     if few is not None:
         causes = tuple(cause for cause, _ in few.told)
-        found = _strongest([*few.findings, *found])
+        found = strongest_first([*few.findings, *pairs])
         return as_diagnosis(
             there, few.fit, few.fit.state.at.errors.ring, few.told,
-            verdict=_least_certain(found, few.verdict),
+            verdict=least_certain(found, few.verdict),
             findings=with_consequences(there, found, causes),
             warnings=(*said, *few.said),
             noise_estimated=False,
@@ -168,12 +173,12 @@ def diagnose_change(
     told: list[Told] = [
         (cause, own.amount_sigma or 0.0) for cause, own in zip(causes, named, strict=True)
     ]
-    found = _strongest([*named, *found])
+    found = strongest_first([*named, *pairs])
     have = {(cause.effect, cause.element) for cause in causes}
     told += [row for row in _drifts(whole) if (row[0].effect, row[0].element) not in have]
     return as_diagnosis(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
-        verdict=_least_certain(found, _verdict(whole)),
+        verdict=least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
         warnings=(*said, *_said(data, fit, whole)),
         noise_estimated=True,
@@ -335,7 +340,7 @@ def findings_of_change(
         ]
     found += _outstanding(state, judgement)
     wanted = found if effects is None else [own for own in found if own.effect in effects]
-    return tuple(sorted(wanted, key=lambda own: -own.detection.statistic)[:most])
+    return strongest_first(wanted)[:most]
 
 
 def _widened(state: State, block: int) -> float:
@@ -389,16 +394,6 @@ def _outstanding(state: State, judgement: Judgement) -> list[Finding]:
                                judgement.mass)
                 )  # fmt: skip
     return found
-
-
-def _strongest(found: Sequence[Finding]) -> list[Finding]:
-    """By falling statistic."""
-    return sorted(found, key=lambda own: -own.detection.statistic)
-
-
-def _least_certain(found: Sequence[Finding], without: str) -> str:
-    """The verdict of the least certain finding, or what it is where there is none."""
-    return max((own.verdict for own in found), key=VERDICTS.index) if found else without
 
 
 def _verdict(state: State) -> str:

@@ -12,10 +12,9 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.families.corrector_position import between
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import families
+from tmlattice.diagnosis.families.magnets import between, families
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
 from tmlattice.observe.orbit_response import DELTA
@@ -197,11 +196,10 @@ def _chromatic_in_time(state: State) -> Hypothesis:
 def _hysteresis(state: State) -> Hypothesis:
     """What the iron of a corrector keeps of its step stays in the columns after it: of the last one
     alone, which still relaxes, or of all before it, where all are held against one orbit."""
-    read = state.at.read[:-1]
-    last = np.concatenate([np.zeros_like(read[:1]), read[:-1]])
-    rows = np.zeros((2, *state.data.shape))
-    for row, stays in zip(rows, (last, np.cumsum(last, axis=0)), strict=True):
-        row[:-1] = state.data.pick(np.concatenate([stays, stays[:1]]))[:-1]
+    last = np.zeros_like(state.at.read)
+    last[1:-1] = state.at.read[:-2]
+    rows = np.stack([state.data.pick(stays) for stays in (last, np.cumsum(last, axis=0))])
+    rows[:, -1] = 0  # the RF's
     return Hypothesis("hysteresis: a share of earlier steps", "share", "< 0.01", rows, most=0.01)
 
 

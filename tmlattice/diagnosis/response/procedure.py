@@ -26,7 +26,12 @@ from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.steps import STEPS, Trial
-from tmlattice.diagnosis.findings import swap_of, with_consequences
+from tmlattice.diagnosis.findings import (
+    least_certain,
+    strongest_first,
+    swap_of,
+    with_consequences,
+)
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
 from tmlattice.diagnosis.response.displaced import Displaced, displaced
@@ -43,7 +48,7 @@ from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.strangers import reversed_ones, strangers
 from tmlattice.diagnosis.response.unnamed import unnamed
-from tmlattice.diagnosis.result import VERDICTS, Diagnosis, Finding
+from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
@@ -123,9 +128,7 @@ def diagnose_response(
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
         found, degenerate = told(fit.state)
-        verdict = _verdict(fit, false_alarm)
-        if findings:
-            verdict = max((own.verdict for own in findings), key=VERDICTS.index)
+        verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
         fit, found, degenerate = few.fit, few.told, ()
         verdict, findings = few.verdict, few.findings
@@ -212,9 +215,8 @@ def _faults(
         alone = singled_out(sound.data, sound.split, sound, hypotheses, most, judgement, progress)
         fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
-    found = sorted(found, key=lambda own: -own.detection.statistic)[:most]
-    found += unnamed(ring, exchanges, far)
-    return fit, tuple(sorted(found, key=lambda own: -own.detection.statistic))
+    found = [*strongest_first(found)[:most], *unnamed(ring, exchanges, far)]
+    return fit, strongest_first(found)
 
 
 def _without(state: State, far: Sequence[Displaced]) -> State:
