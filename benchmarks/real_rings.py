@@ -44,8 +44,8 @@ from tmlattice.plots.response import plot_gradients, plot_left
 from tmlattice.report.page import shrink
 
 MICRO = 1e6
-SCATTER = ("quadrupole_gradient", "bend_gradient", "vertical_focusing", "energy_spread",
-           "skew_gradient")  # fmt: skip
+SCATTER = ("quadrupole_gradient", "bend_gradient", "vertical_focusing", "energy_offset",
+           "energy_spread", "skew_gradient")  # fmt: skip
 """Effects whose amounts are held against one another between seeds; and shared gradients."""
 FEWEST = 3
 """Seeds that must have told a number."""

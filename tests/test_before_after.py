@@ -110,9 +110,10 @@ def exchanged(measured, axis, a, b):
 
 
 @pytest.mark.parametrize("day", ["before", "after"])
-@pytest.mark.parametrize(("axis", "a", "b"), [(0, 4, 5), (0, 2, 11), (1, 3, 20)])
+@pytest.mark.parametrize(("axis", "a", "b"), [(0, 4, 5), (0, 2, 11), (0, 16, 5), (1, 3, 20)])
 def test_what_was_exchanged_on_one_day_is_located(small_ring, before, axis, a, b, day):
-    """Neighbours, correctors far from one another, and monitors; in a machine that drifts."""
+    """Neighbours, correctors far from one another, one of each plane, and monitors; in a machine
+    that drifts."""
     days = {"before": before, "after": machine(small_ring, seed=5, drift=0.01)}
     days[day] = exchanged(days[day], axis, a, b)
     result = diagnose(small_ring, days["after"], reference=days["before"])

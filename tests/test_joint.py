@@ -14,7 +14,7 @@ from tmlattice.diagnosis import stages
 from tmlattice.diagnosis.kinds import How, part_of, stacked
 from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.machine.stored_beam import simulate_orbits
@@ -101,6 +101,12 @@ def test_turns_name_a_magnet_and_an_exchanged_monitor(small_ring):
     diagnosis = diagnose(small_ring, _turns(small_ring, [WEAK, SWAPPED]))
     assert diagnosis.kind == "turn_by_turn"
     assert _found(diagnosis) == {("monitor_swap", "end_1"), (WEAK.effect, WEAK.element)}
+
+
+def test_the_energy_of_a_launch_and_that_of_a_stored_beam_are_two(small_ring):
+    whole = {"orbit": _orbit(small_ring, [KICK]), "turns": _turns(small_ring, [])}
+    with pytest.raises(EffectError, match="none of these effects can be looked for here"):
+        diagnose(small_ring, whole, effects=["energy_offset"])
 
 
 def test_what_takes_no_part_is_told(small_ring):

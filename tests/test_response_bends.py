@@ -7,8 +7,9 @@ import pytest
 
 from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.dense import fit_steps, told
+from tmlattice.diagnosis.response.dense import fit_steps
 from tmlattice.diagnosis.response.state import allow
+from tmlattice.diagnosis.response.told import told
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response

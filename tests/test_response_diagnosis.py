@@ -11,6 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from numpy.testing import assert_allclose
 
 from tmlattice import diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
@@ -25,6 +26,7 @@ from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
 from tmlattice.machine import draw_background
+from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response as simulated
 from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
@@ -32,7 +34,7 @@ from tmlattice.observe.calibration import calibrated_response, read_calibration
 from tmlattice.observe.orbit_response import Errors, Predicted, response_data
 from tmlattice.observe.response_noise import learnt_noise
 from tmlattice.observe.split import split_columns
-from tmlattice.optics import twiss
+from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
@@ -478,8 +480,7 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
     assert together < 0.98 * rows["none"].heldout_rms_in_plane
 
 
-def test_an_energy_offset_is_taken_up_by_gradients(small_ring, rng):
-    """All gradients scaled alike, by families and magnets: it leaves noise, and needs no name."""
+def test_an_energy_offset_has_its_amount_and_the_tunes_are_the_beams(small_ring, rng):
     measured = simulate_response(
         small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
     ).measured
@@ -488,6 +489,17 @@ def test_an_energy_offset_is_taken_up_by_gradients(small_ring, rng):
     fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)))
     assert fit.steps[0].heldout_chi2_per_dof > 1e4
     assert fit.steps[-1].heldout_chi2_per_dof < 2  # 200 readings: 1 +- 0.1, and curvature
+    energy = fit.state.at.errors.energy
+    assert abs(energy - 5e-5) < 2e-6
+    gradients = fit.state.values.get("gradient", np.zeros(1))
+    assert np.abs(gradients).max() < 1e-5  # which would have made the same tunes, 5e-5 and more
+    h = 1e-4
+    up, down = (np.array(ring_tunes(small_ring, side * h)) for side in (1, -1))
+    lattice = AtEngine(small_ring).lattice()
+    lattice.disable_6d()
+    chromaticity = lattice.get_chrom()[:2]
+    # AT's by energy about the orbit at that energy, in its own thick sextupoles
+    assert_allclose((up - down) / (2 * h), chromaticity, rtol=0.02, atol=0.02)
 
 
 def test_a_wiggler_that_focuses_is_fitted_and_has_its_amount(small_ring):
@@ -600,10 +612,28 @@ def test_more_energy_spread_than_a_beam_has_is_refused(small_ring):
     assert any("where radiation makes 0.11 %" in said for said in found.warnings)
 
 
-def test_predict_reproduces_the_held_out_figure_with_an_energy_spread(tmp_path, small_ring):
-    spread = Cause("energy_spread", None, 1.8e-3)
+def test_a_family_that_is_doubted_draws_no_other_one_along(small_ring):
+    beam = [Cause("energy_spread", None, 4e-3), Cause("energy_offset", None, 1e-3)]
     measured = simulate_response(
-        small_ring, [*CAUSES, spread], kick=1e-5, noise=2e-8, engine="ocelot", progress=False,
+        small_ring, [*CAUSES, *beam], kick=2e-5, noise=5e-9, engine="ocelot", progress=False, seed=2
+    ).measured
+    data = response_data(small_ring, measured)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    asked = ("quadrupole_gradient", "energy_offset", "energy_spread")
+    trials = [own for own in STEPS if own.families[0].name in asked]
+    found, without = (fit_steps(data, split, some) for some in (trials, trials[:1] + trials[2:]))
+    assert [own.families[0].name for own in trials] == [asked[0], asked[2], asked[1]]
+    assert "energy_spread" in [step.effect for step in found.refused]
+    assert any("an energy spread of" in said for said in found.said)
+    assert found.state.values.keys() == without.state.values.keys()
+    for name, values in found.state.values.items():
+        assert np.abs(values - without.state.values[name]).max() < 1e-5
+
+
+def test_predict_reproduces_the_held_out_figure_with_the_beams_energies(tmp_path, small_ring):
+    beam = [Cause("energy_spread", None, 1.2e-3), Cause("energy_offset", None, -2e-3)]
+    measured = simulate_response(
+        small_ring, [*CAUSES, *beam], kick=1e-5, noise=2e-8, engine="ocelot", progress=False,
         seed=3,
     ).measured  # fmt: skip
     write_measurement(tmp_path / "m", measured)
@@ -615,7 +645,11 @@ def test_predict_reproduces_the_held_out_figure_with_an_energy_spread(tmp_path, 
     ):
         done = CliRunner().invoke(tmlattice, [str(word) for word in words])
         assert done.exit_code == 0, done.output
-    assert "energy_spread" in calibration.read_text()
+    written = {
+        own["effect"]: own["amount"] for own in json.loads(calibration.read_text())["effects"]
+    }
+    for cause in beam:
+        assert abs(written[cause.effect] - cause.amount) < 0.1 * abs(cause.amount)
     figure = json.loads(told.read_text())["steps"][-1]["heldout_rms_in_plane"]
     with out.open(encoding="utf-8") as table:
         rows = {(row["corrector"], row["monitor"]): row for row in csv.DictReader(table)}

@@ -9,7 +9,7 @@ from tmlattice import diagnose
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.dense import fit_steps, one_by_one, told
+from tmlattice.diagnosis.response.dense import fit_steps, one_by_one
 from tmlattice.diagnosis.response.exchanged import (
     exchanged,
     exchanged_monitors,
@@ -22,6 +22,8 @@ from tmlattice.diagnosis.response.other_kicks import other_kicks
 from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.strangers import ODD, strangers
+from tmlattice.diagnosis.response.told import told
 from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
@@ -322,6 +324,20 @@ def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
 
 
+def test_two_that_answer_as_others_should_are_no_strangers(small_ring, clean):
+    """A fit leaves more of them than of all others: that is enough to look at both. Two that are
+    odd, each in its own way, are not exchanged."""
+    wrong = put_right(clean, [("v5", "v7")])
+    odd = clean.response.copy()
+    odd[5] += 0.4 * odd[2]
+    odd[7] += 0.4 * odd[12]
+    for measured, pairs in ((wrong, [("v5", "v7")]), (replace(clean, response=odd), [])):
+        state = fitted(small_ring, measured)
+        assert strangers(state).correctors == ()
+        assert strangers(state, ODD).correctors == ("v5", "v7")
+        assert list(exchanged(state, {"v5", "v7"})) == pairs
+
+
 def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
     """Anywhere in the ring; without the names both had been left out as strangers. Where nothing is
     exchanged, and of monitors that are not strangers, nothing is told."""
@@ -342,6 +358,7 @@ EXCHANGED = {
     "neighbours": ("correctors", "v5", "v6"),
     "far ones": ("correctors", "v5", "v9"),
     "as if displaced": ("correctors", "v5", "v7"),
+    "one of each plane": ("correctors", "generated_a", "v5"),
     "about the lattice's first place": ("correctors", "v0", "v15"),
     "monitors": ("monitors", "end_1", "end_14"),
 }

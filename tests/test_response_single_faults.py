@@ -161,3 +161,14 @@ def test_a_reversed_monitor_with_few_correctors_in_its_plane_is_named(small_ring
     the search did not begin."""
     cause = Cause("monitor_gain_x", "end_1", -1.33)
     named(small_ring, measured_with(cause), cause)
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-7])
+def test_the_energy_of_the_beam_alone_is_named(small_ring, noise):
+    """However well it is seen; it moves all columns, as no pattern of columns by readings does."""
+    measured = simulate_response(
+        small_ring, [Cause("energy_offset", None, 2e-3)], noise=noise, progress=False, seed=3
+    ).measured
+    (found,) = diagnose(small_ring, measured).findings
+    assert (found.effect, found.element) == ("energy_offset", None)
+    assert abs(found.amount - 2e-3) < 2e-5  # maps of second order

@@ -254,3 +254,21 @@ def test_unset_orbit_is_found_once(small_ring, monkeypatch):
     fresh = AtEngine(small_ring, [Cause("quadrupole_offset_x", "QF::5", 1e-4)])
     assert_allclose(fresh.closed_orbits([{"v6": {"kick": 2e-5}}]), two, atol=0)
     assert np.abs(one - two).max() > 1e-6
+
+
+@pytest.mark.parametrize("deviation", [1e-3, -1e-3])
+def test_the_orbit_at_another_energy_vs_at(petra3, model, engine, deviation):
+    """AT is told the energy, and not the frequency that makes it."""
+    lattice = engine.lattice()
+    lattice.disable_6d()
+    monitors = [i for i, e in enumerate(lattice) if isinstance(e, at.Monitor)]
+    _, theirs = at.find_orbit4(lattice, dp=deviation, refpts=monitors)
+    there = model.at_energy(deviation)
+    # that energy is linear in the frequency is as good as the ring's second order: 2e-3 of it
+    assert_allclose(there.state[5], deviation, rtol=5e-3)
+    size = np.abs(theirs[:, 0]).max()
+    assert size > 1e-4
+    assert_allclose(there.readings[:, 0], theirs[:, 0], rtol=0, atol=5e-3 * size)
+    # and from there as far back
+    back = there.at_energy(-deviation)
+    assert np.abs(back.readings).max() < 5e-3 * size

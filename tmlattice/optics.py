@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.assembly import Assembly
 from tmlattice.beam.chain import LayerChain, products
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.lattice import Ring
@@ -144,9 +145,18 @@ def matrix_tunes(matrix: Array) -> Array:
     return _fractions(values)
 
 
-def ring_tunes(ring: Ring) -> list[float] | None:
-    """Fractions of Qx, Qy about the axis; None where there are none."""
+def ring_tunes(ring: Ring, energy: float = 0.0) -> list[float] | None:
+    """Fractions of Qx, Qy about the axis, or about the closed orbit of another energy; None where
+    there are none.
+
+    Args:
+        ring: with its errors.
+        energy: relative deviation of the beam's.
+    """
     try:
+        if energy:
+            turn = ResponseModel(ring).at_energy(energy).tangents[-1]
+            return [float(q) for q in matrix_tunes(turn[:4, :4])]
         return [float(q) for q in matrix_tunes(ring_matrix(ring))]
     except (UnstableRingError, np.linalg.LinAlgError):
         return None

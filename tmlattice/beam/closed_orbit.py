@@ -105,6 +105,15 @@ class ResponseModel:
         other._close(frequency)
         return other
 
+    def at_energy(self, deviation: float) -> "ResponseModel":
+        """The same ring at the RF frequency that changes the closed orbit's energy by so much from
+        here, relative, to first order.
+
+        Raises:
+            UnstableRingError: no closed orbit.
+        """
+        return self.at_frequency(self.frequency + deviation / self.rf_start[5])
+
     def changed_to(self, ring: Ring) -> "ResponseModel":
         """Of a ring that differs in some elements, not in their places: only their layers are made
         anew.

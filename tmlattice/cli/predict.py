@@ -14,8 +14,8 @@ from tmlattice.cli.options import FILE, Careful, console, lattice_options, open_
     "--calibration",
     type=FILE,
     metavar="FILE",
-    help="JSON with the gains, rolls and couplings of monitors and the calibrations and rolls of "
-    "correctors.",
+    help="JSON with the gains, rolls and couplings of monitors, the calibrations and rolls of "
+    "correctors, and the energies of the beam.",
 )
 @click.option(
     "--corrector",

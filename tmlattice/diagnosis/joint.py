@@ -157,8 +157,9 @@ def _named(label: str, measured: Measured, how: How) -> Part:
 
 def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
     chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
+    # what shifts all launches is not the stored beam's, nor seen where each shot has a launch
     launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
-    chosen = [name for name in chosen if name not in launch or find(name).responds]
+    chosen = [name for name in chosen if name not in launch or name == "energy_spread"]
     if not chosen:
         raise EffectError("none of these effects can be looked for here; name another one")
     return chosen

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.dispersion import errors_beside
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView
-from tmlattice.effects import Cause, RingEffect, background_rms, find
+from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.among import Among, Known
 from tmlattice.inference.metric import Hypothesis
@@ -139,8 +139,9 @@ def _each_alone(
 
 
 def _beside(cause: Cause) -> bool:
-    """Whether it stands beside the ring as found: first turns have no energy spread."""
-    return not _in_ring(cause) and cause.effect != "energy_spread"
+    """Whether it stands beside the ring as found: first turns have energies of
+    their own."""
+    return not _in_ring(cause) and not isinstance(find(cause.effect), LaunchEffect)
 
 
 def _in_ring(cause: Cause) -> bool:

@@ -14,20 +14,24 @@ NODES = 5
 
 @register
 class EnergyOffset(LaunchEffect):
-    """All shots arrive with another energy than the ring's."""
+    """The beam has another energy than the ring's magnets are set for: all shots arrive with it; in
+    an orbit response a stored beam has it, where the frequency of the RF does not fit to the way
+    around the ring."""
 
     name = "energy_offset"
     words = "energy deviation of the beam"
+    responds = True
+    calibrates = True
     headline = True
     energy = True
     shifts = 5
     unit = "relative"
-    sign = "p of the launch += amount, common to all shots"
+    sign = "p += amount: of the launch, common to all shots, or of a response's closed orbit"
     quantity = "energy deviation"
     remedy = "match the energy of the beam to the ring"
     to_check = (
-        "Compare the injector's energy with the field of the ring's bends, which all may be off by "
-        "as much the other way."
+        "Compare the injector's energy, or of a stored beam the frequency of the RF, with the "
+        "field of the ring's bends, which all may be off by as much the other way."
     )
     largest = 5e-3
 

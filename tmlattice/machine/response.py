@@ -19,7 +19,7 @@ from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.machine import ENGINES, true_causes
 from tmlattice.machine.shots import draw_background, stream
 from tmlattice.measurement import OrbitResponse, RfStep
-from tmlattice.observe.calibration import corrector_scales
+from tmlattice.observe.calibration import corrector_scales, offset_of
 
 Array = NDArray[np.float64]
 
@@ -176,6 +176,8 @@ def _centroids(
     Three nodes of Gauss and Hermite; a particle's energy is that of another RF frequency.
     """
     weights, nodes = energies(ring, causes)
+    if offset := offset_of(causes):
+        nodes = nodes + offset / ResponseModel(apply(ring, causes)).rf_start[5]
     each = [engine(ring, causes, steps, float(node)) for node in nodes]
     for orbits in zip(*each, strict=True):
         down, up = np.tensordot(weights, np.array(orbits), 1)

@@ -117,6 +117,11 @@ def corrector_scales(ring: Ring, causes: Iterable[Cause], names: Sequence[str]) 
     return np.array(list(scale.values()))
 
 
+def offset_of(causes: Iterable[Cause]) -> float:
+    """The relative deviation of the beam's mean energy."""
+    return sum(cause.amount for cause in causes if cause.effect == "energy_offset")
+
+
 def calibrated_response(
     ring: Ring,
     causes: Sequence[Cause] = (),
@@ -127,7 +132,7 @@ def calibrated_response(
 
     Args:
         ring: the design.
-        causes: on the ring, on its monitors, and an energy spread of the beam.
+        causes: on the ring, on its monitors, and of the beam's energies.
         correctors: names; None: all, in beam order.
         dispersion: beside that of the ring.
 
@@ -140,6 +145,8 @@ def calibrated_response(
         UnstableRingError: no closed orbit.
     """
     model = ResponseModel(apply(ring, causes))
+    if offset := offset_of(causes):
+        model = model.at_energy(offset)
     columns = model.columns(correctors)
     monitors = monitors_with(ring, causes)
     scales = corrector_scales(ring, causes, columns.names)
@@ -172,8 +179,7 @@ def _of_centroid(
     square = sum(cause.amount**2 for cause in causes if cause.effect == "energy_spread")
     if not square:
         return one
-    step = ENERGY / model.rf_start[5]
-    up, down = (response(model.at_frequency(f)) for f in (step, -step))
+    up, down = (response(model.at_energy(side * ENERGY)) for side in (1, -1))
     return np.asarray(one + square / ENERGY**2 * ((up + down) / 2 - one))
 
 

@@ -20,7 +20,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
-from tmlattice.errors import EffectError
+from tmlattice.errors import EffectError, UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_noise import learnt_noise
@@ -139,6 +139,8 @@ class Errors:
         monitors: d reading / d beam, [monitor, 2, 2].
         calibration, roll: of the columns, 0 for the RF, [column].
         ring: causes in the ring.
+        energy: relative deviation of the beam's mean energy from the one that its magnets are set
+            for.
         spread: mean square energy deviation, in units of `DELTA` squared.
         dispersion: what the RF's orbit has of kicks, see `beam.kicks`, m, [monitor, 2].
         at_correctors: the dispersion of these kicks in each one's plane, m, [corrector].
@@ -148,6 +150,7 @@ class Errors:
     calibration: Array
     roll: Array
     ring: tuple[Cause, ...] = ()
+    energy: float = 0.0
     spread: float = 0.0
     dispersion: Array | float = 0.0
     at_correctors: Array | float = 0.0
@@ -159,6 +162,19 @@ class Errors:
         eye = np.tile(np.eye(2), (monitors, 1, 1))
         return cls(eye, np.zeros(columns), np.zeros(columns))
 
+    @property
+    def kick(self) -> Array:
+        """Of both planes, as a share of what a corrector is told; negative for a reversed one,
+        [column]."""
+        own = 1 + self.calibration
+        return np.where(own < 0, -1.0, 1.0) * np.hypot(own, self.roll)
+
+    @property
+    def angle(self) -> Array:
+        """Of each kick to its plane, rad: a right one where it has nothing in that, [column]."""
+        kick = self.kick
+        return np.asarray(np.arcsin(np.clip(self.roll / np.where(kick == 0, 1.0, kick), -1, 1)))
+
     def with_causes(self, data: ResponseData, causes: Sequence[Cause]) -> "Errors":
         """These and more; an energy spread adds in square.
 
@@ -166,10 +182,12 @@ class Errors:
             EffectError: an effect of the launch, which a closed orbit does not have.
         """
         ring = list(self.ring)
-        scale, spread = np.ones(len(data.kicks)), self.spread
+        scale, energy, spread = np.ones(len(data.kicks)), self.energy, self.spread
         for cause in causes:
             if cause.effect == "energy_spread":
                 spread += (cause.amount / DELTA) ** 2
+            elif cause.effect == "energy_offset":
+                energy += cause.amount
             elif isinstance(find(cause.effect), RingEffect):
                 ring.append(cause)
                 if cause.effect == "corrector_calibration":  # of the steps, beside the setting's
@@ -180,8 +198,9 @@ class Errors:
         calibration = (1 + self.calibration) * scale - 1
         monitors = more @ self.monitors
         return replace(
-            self, monitors=monitors, calibration=calibration, ring=tuple(ring), spread=spread
-        )
+            self, monitors=monitors, calibration=calibration, ring=tuple(ring), energy=energy,
+            spread=spread,
+        )  # fmt: skip
 
 
 def _column(data: ResponseData, name: str | None) -> list[int]:
@@ -205,11 +224,12 @@ class Predicted:
 
     @cached_property
     def model(self) -> ResponseModel:
-        """Of the ring with its errors; UnstableRingError where it has no closed orbit."""
-        design = self.data.design
-        if not self.errors.ring:
-            return design
-        return design.changed_to(apply(design.ring, self.errors.ring))
+        """Of the ring with its errors, at the beam's energy; UnstableRingError where it has no
+        closed orbit."""
+        model, errors = self.data.design, self.errors
+        if errors.ring:
+            model = model.changed_to(apply(model.ring, errors.ring))
+        return model.at_energy(errors.energy) if errors.energy else model
 
     def orbits(self, model: ResponseModel) -> Array:
         """Orbit changes of the steps, the RF's last, m, [column, monitor, 2].
@@ -257,9 +277,24 @@ class Predicted:
         A monitor reads the centroid of particles whose orbits answer each as its energy has it:
         half the second derivative by the energy, times the mean square.
         """
-        step = DELTA / self.model.rf_start[5]
-        up, down = (self.orbits(self.model.at_frequency(f)) for f in (step, -step))
+        up, down = self._off_energy
         return np.asarray((up + down) / 2 - self.straight)
+
+    @cached_property
+    def chromatic(self) -> Array:
+        """d orbit changes / d relative energy of the beam, m, [column, monitor, 2]; 0 where a ring
+        stores no beam so far off, for that says nothing of it."""
+        try:
+            up, down = self._off_energy
+        except UnstableRingError:
+            return np.zeros_like(self.straight)
+        return np.asarray((up - down) / (2 * DELTA))
+
+    @cached_property
+    def _off_energy(self) -> tuple[Array, Array]:
+        """Orbit changes of one particle `DELTA` above and below."""
+        up, down = (self.orbits(self.model.at_energy(side * DELTA)) for side in (1, -1))
+        return up, down
 
     @cached_property
     def across(self) -> Array:
@@ -369,6 +404,8 @@ class Predicted:
             elif effect == "energy_spread":  # by the square of the amount
                 scale = (1 + self.errors.calibration)[:, None, None] / DELTA**2
                 yield self.seen(scale * self.curved)
+            elif effect == "energy_offset":
+                yield self.seen((1 + self.errors.calibration)[:, None, None] * self.chromatic)
             else:
                 raise EffectError(f"'{effect}' does not act on a closed orbit")
 

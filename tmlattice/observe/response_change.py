@@ -82,9 +82,9 @@ def response_change(
     change = np.einsum("mij,cmj->cmi", mend, after.orbits * scale - before.orbits)
     noise = np.hypot(before.noise, after.noise * np.abs(np.median(scale)))
     noise = np.sqrt(np.einsum("mij,mj->mi", mend**2, noise**2))
-    rolls = _rolls(columns, errors.roll)
+    rolls = _rolls(columns, errors.angle)
     ring = apply(before.ring, (*errors.ring, *rolls))
-    kicks = before.kicks[:-1] * (1 + errors.calibration[:-1])
+    kicks = before.kicks[:-1] * errors.kick[:-1]
     model = ResponseModel(ring)
     response = model.response(columns)[:, before.at] * kicks[:, None, None]
     rf = before.measured.rf

@@ -77,7 +77,8 @@ class Response(Steady):
 
     def sees(self, hypothesis: Hypothesis) -> bool:
         """A closed orbit has no launch; of the beam it sees the energies."""
-        return hypothesis[0] == "energy_spread" or not isinstance(find(hypothesis[0]), LaunchEffect)
+        effect = find(hypothesis[0])
+        return effect.responds or not isinstance(effect, LaunchEffect)
 
     def view(self, causes: Sequence[Cause]) -> Predicted:
         """What monitors read with these."""

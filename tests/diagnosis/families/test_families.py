@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tmlattice.diagnosis.families.energy import EnergyOffset, EnergySpread
 from tmlattice.diagnosis.families.fields import (
     CorrectorPosition,
     EdgeFocusing,
@@ -16,7 +17,6 @@ from tmlattice.diagnosis.families.magnets import straights
 from tmlattice.diagnosis.families.steps import (
     CorrectorCalibration,
     CorrectorRoll,
-    EnergySpread,
     MonitorGain,
     MonitorRoll,
 )
@@ -34,6 +34,7 @@ RMS = {
     QuadrupoleGradient(): 1e-3,
     VerticalFocusing(): 1e-3,
     EdgeFocusing(): 1e-3,
+    EnergyOffset(): 1e-3,
     EnergySpread(): 1.0,
     CorrectorPosition(): 0.01,
     MonitorRoll(): 1e-3,
@@ -135,3 +136,39 @@ def test_fields_that_the_iron_beside_them_draws_away_come_out_where_at_has_them(
         state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
         (found,) = settle(jump(allow(state, [family]))).values[family.variable]
         assert abs(found - by) < 1e-3
+
+
+@pytest.mark.parametrize("by", [1.5e-3, -1.5e-3])
+def test_the_beams_energy_comes_out_as_at_has_it(small_ring, by):
+    """AT's closed orbits at the RF frequency of that energy."""
+    measured = simulate_response(
+        small_ring, [Cause("energy_offset", None, by)],
+        kick=1e-5, noise=2e-8, rf_step=-3000.0, progress=False, seed=2,
+    ).measured  # fmt: skip
+    data = response_data(small_ring, measured)
+    state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
+    (found,) = settle(allow(state, [EnergyOffset()])).values["energy"]
+    assert abs(found - by) < 0.01 * abs(by)
+
+
+@pytest.mark.parametrize("own", [0.0, 0.6, -0.6])
+def test_a_corrector_that_kicks_across_is_turned(data, own):
+    """By a right angle where nothing is left in its plane; a reversed one kicks the other way."""
+    turned = CorrectorRoll()
+    values = {CALIBRATION: np.zeros(18), turned: np.zeros(18)}
+    values[CALIBRATION][4], values[turned][4] = own - 1, 0.8
+    errors = Errors.none(data)
+    for family, numbers in values.items():
+        errors = family.put(errors, numbers, data)
+    (kick, roll) = (
+        family.told(errors, numbers, np.full(18, 0.01), data)[4]
+        for family, numbers in values.items()
+    )
+    size = np.hypot(own, 0.8)
+    assert np.isclose(kick[0].amount, (-size if own < 0 else size) - 1)
+    assert np.isclose(roll[0].amount, np.arcsin(0.8 / size) * (-1 if own < 0 else 1))
+    assert np.isclose(roll[1], 0.01 / size)
+    fitted = Predicted(data, errors).read
+    told = Predicted(data, Errors.none(data).with_causes(data, [kick[0], roll[0]])).read
+    change = np.abs(fitted - Predicted(data, Errors.none(data)).read).max()
+    assert np.abs(told - fitted).max() < 1e-5 * change

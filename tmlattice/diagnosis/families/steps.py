@@ -1,8 +1,8 @@
 """Families of errors that a dense fit of an orbit response may have: each is one object.
 
 To add one, write a class with its places, prior, rows, how its values are put among the errors and
-how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`); and
-name it in `STEPS`, which says when it is tried.
+how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`, of the
+beam's energies in `energy`); and name it in `STEPS`, which says when it is tried.
 
 Families that move the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
+from tmlattice.diagnosis.families.energy import EnergyOffset, EnergySpread
 from tmlattice.diagnosis.families.family import TAILS, Family, Told
 from tmlattice.diagnosis.families.fields import (
     BendGradient,
@@ -27,21 +28,11 @@ from tmlattice.diagnosis.families.fields import (
     VerticalFocusing,
 )
 from tmlattice.diagnosis.families.magnets import families
-from tmlattice.effects import Cause, expected_spread
+from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import (
-    DELTA,
-    Errors,
-    Hypothesis,
-    Predicted,
-    ResponseData,
-)
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
 
 Array = NDArray[np.float64]
-
-WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
-"""By how much a beam's energy spread may be more than radiation makes it (instabilities, wigglers
-that the lattice has no field of), as rms; and what is usual where radiation says nothing."""
 
 
 class _Monitors(Family):
@@ -126,6 +117,10 @@ class MonitorRoll(_Monitors):
         ]
 
 
+LEAST_KICK = 1e-3
+"""Share of what it is told, of a corrector that has an angle to its plane."""
+
+
 class _Columns(Family):
     per = "column"
 
@@ -175,8 +170,8 @@ class CorrectorCalibration(_Columns):
         return replace(errors, calibration=values)
 
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
-        """As it stands."""
-        return self._told(values, sigma, data)
+        """Of the whole kick, of which a rolled corrector has a part in the other plane."""
+        return self._told(errors.kick - 1, sigma, data)
 
 
 class CorrectorRoll(_Columns):
@@ -198,61 +193,8 @@ class CorrectorRoll(_Columns):
         return replace(errors, roll=values)
 
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
-        """As a share of what it kicks."""
-        return self._told(values / (1 + errors.calibration), sigma, data)
-
-
-class EnergySpread(Family):
-    """Of the beam: mean square energy deviation, in units of `DELTA` squared."""
-
-    name, effects = "energy_spread", ("energy_spread",)
-    block, per, variable, trust = 0, "ring", "spread", 10.0
-
-    def size(self, data: ResponseData) -> int:
-        """One."""
-        return 1
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """As much as it can be."""
-        return [Group(self.name, np.eye(1), (self._most(data) / DELTA) ** 2, fixed=True)]
-
-    def _most(self, data: ResponseData) -> float:
-        return WIDENED * (expected_spread(data.ring) or UNKNOWN_SPREAD)
-
-    def rows(self, at: Predicted, values: Array) -> Array:
-        """The second derivative by the energy."""
-        scale = (1 + at.errors.calibration)[:, None, None]
-        return np.asarray((at.gain(0) * at.data.pick(at.curved * scale))[None])
-
-    def lowest(self, data: ResponseData) -> Array | float:
-        """A square is not negative."""
-        return 0.0
-
-    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """As it stands."""
-        return replace(errors, spread=float(values[0]))
-
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
-        """The relative rms; nothing where it is zero."""
-        if not values[0] > 0:
-            return []
-        amount = DELTA * float(np.sqrt(values[0]))
-        return [(Cause("energy_spread", None, amount), DELTA**2 * float(sigma[0]) / (2 * amount))]
-
-    def doubt(self, values: Array, data: ResponseData) -> str | None:
-        """More than a beam has stands for something else of second order."""
-        rms, most = DELTA * float(np.sqrt(values[0])), self._most(data)
-        if not rms > most:
-            return None
-        usual = "radiation makes" if expected_spread(data.ring) else "a beam has usually"
-        return (
-            f"an energy spread of {100 * rms:.2g} % would be asked for, where {usual} "
-            f"{100 * most / WIDENED:.2g} %: it stands for something else, and is refused"
-        )
-
-    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """By the square of the amount."""
-        return [{("energy_spread", None): DELTA**2}]
+        """The angle of its kick to its plane: a right one where it has none in that."""
+        return self._told(errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data)
 
 
 @dataclass(frozen=True)
@@ -288,9 +230,11 @@ second order, which the gradients then take back."""
 STEPS = (
     *WITHOUT_KICKS,
     Trial((HorizontalKicks(),), 2, 0),
+    Trial((EnergyOffset(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),
 )
-"""What is tried, one after another."""
+"""What is tried, one after another. A beam off its energy has another dispersion: it comes in once
+that has what else may be wrong with it."""
 
 CHANGES = (
     Trial((CorrectorCalibration(),), 3, 0),

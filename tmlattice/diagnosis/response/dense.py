@@ -7,14 +7,13 @@ Gradients and skew gradients are fitted together, because skew ones move the tun
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import MOSTLY, Jitter, sought
@@ -48,9 +47,8 @@ from tmlattice.diagnosis.response.state import (
     forbid,
     jump,
 )
-from tmlattice.diagnosis.response.stated import stated
-from tmlattice.errors import TmlatticeError, first_of
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.errors import TmlatticeError
+from tmlattice.inference.normal import Posterior
 from tmlattice.observe.orbit_response import ResponseData
 from tmlattice.observe.split import Split
 
@@ -175,9 +173,8 @@ def fit_steps(
         more, steps_gone = odd_steps(state)
         readings = readings.and_more(more)
     odd = readings.and_more(steps_gone)
-    state = beside(state, odd.unread)
     progress("all together")
-    state = taken_back(settle(bend(jump(replace(state, independent=np.ones((2, 2)))))))
+    state, doubts = _together(beside(state, odd.unread), stages)
     log.info("independent readings: %s", state.independent)
     odd = odd.and_more(*odd_steps(state))  # what is usual is less now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
@@ -192,20 +189,8 @@ def fit_steps(
         for trial, own in stages.items()
     }  # fmt: skip
     stages.clear()
-    refused: list[Step] = []
-    doubts: list[str] = []
-    worth, without = _worth(state, steps, progress)
-    while worth and (min(worth.values()) <= 0 or len(worth) > most):
-        least = min(worth, key=lambda trial: worth[trial])
-        doubts += _doubts(state, least)
-        state = without[least] if least in without else _without(state, least)
-        refused.append(replace(steps.pop(least), kept=False))
-        doubted = [trial for trial in steps if worth[trial] <= 0]
-        del worth[least]
-        without = {}
-        if doubted:
-            again, without = _worth(state, doubted, progress)
-            worth |= again
+    state, gone, others = _needed(state, steps, most, progress)
+    refused, doubts = [replace(steps.pop(own), kept=False) for own in gone], [*doubts, *others]
     spoilt = -lost(inner(replace(design, jitter=state.jitter)), inner(state))[0]
     nothing = DenseFit(
         design, design, (Step.scored("design", 0, before),),
@@ -239,6 +224,30 @@ def fit_steps(
     return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
 
 
+def _needed(
+    state: State, trials: Collection[Trial], most: int, progress: Callable[[str], Any]
+) -> tuple[State, list[Trial], list[str]]:
+    """The state with families that are needed alone, `most` trials at most; those that are not; and
+    why some cannot be what they stand for."""
+    there = {family.name for family in state.families}
+    needed = [own for own in trials if there & {family.name for family in own.families}]
+    gone = [own for own in trials if own not in needed]
+    doubts: list[str] = []
+    worth, without = _worth(state, needed, progress)
+    while worth and (min(worth.values()) <= 0 or len(worth) > most):
+        least = min(worth, key=lambda trial: worth[trial])
+        doubts += _doubts(state, least)
+        state = without[least] if least in without else _without(state, least)
+        gone.append(least)
+        del worth[least]
+        unsure = [trial for trial, own in worth.items() if own <= 0]
+        without = {}
+        if unsure:
+            again, without = _worth(state, unsure, progress)
+            worth |= again
+    return state, gone, doubts
+
+
 def _in_turn(
     design: State, trials: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, State], State]:
@@ -248,6 +257,21 @@ def _in_turn(
     for trial, state in one_by_one(begun(design, trials), trials, progress):
         stages[trial] = replace(state, kept={})
     return stages, state
+
+
+def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
+    """All families settled, but those whose numbers cannot be what they stand for, which would draw
+    the others along; and why. One after another, the last that came in first: one may have drawn
+    another along."""
+    state = replace(state, independent=np.ones((2, 2)))
+    doubts: list[str] = []
+    while True:
+        settled = taken_back(settle(bend(jump(state))))
+        doubted = [trial for trial in trials if _doubts(settled, trial)]
+        if not doubted:
+            return settled, doubts
+        doubts += _doubts(settled, doubted[-1])
+        state = forbid(state, doubted[-1].families)
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
@@ -327,7 +351,8 @@ def _worth(
 
 def _doubts(state: State, trial: Trial) -> list[str]:
     """Why what was found of a trial's families cannot be what they stand for."""
-    doubts = (family.doubt(state.values[family.variable], state.data) for family in trial.families)
+    own = [family for family in trial.families if state.allows(family.name)]
+    doubts = (family.doubt(state.values[family.variable], state.data) for family in own)
     return [doubt for doubt in doubts if doubt is not None]
 
 
@@ -388,55 +413,3 @@ def _quickly(
 def _without(state: State, trial: Trial) -> State:
     """All the others settled anew; the other block does not feel it, to first order."""
     return settle(forbid(state, trial.families), _blocks(trial), FIRST, ROUGH)
-
-
-# --- what was found -------------------------------------------------------------------------------
-def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
-    """What is wrong as causes, with errors; and what the data alone do not settle, in words."""
-    found: list[Told] = []
-    said: tuple[str, ...] = ()
-    for block in (0, 1):
-        families = {f.variable: f for f in state.of_block(block)}
-        if not families:
-            continue
-        there = linear(state, block)
-        posterior = solve(there.normal, there.groups, there.start, rounds=0)
-        sigma = stated(state, block, there, posterior)
-        for name, family in families.items():
-            own = sigma[there.where[name]]
-            found += family.told(state.at.errors, state.values[name], own, state.data)
-        if block == 0:
-            said = _degenerate(state, there, posterior)
-    return [row for row in found if row[0].amount != 0 or row[1] != 0], said
-
-
-def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
-    """Directions that the prior holds and not the data."""
-    said = []
-    columns, monitors = state.data.shape
-    m = 2 * monitors
-    spread = posterior.spread
-    factor = np.linalg.cholesky(posterior.covariance + 1e-12 * np.eye(len(spread.T)))
-    draws = spread @ factor
-    scale = draws[:m].mean(axis=0)
-    kick = draws[m : m + columns - 1].mean(axis=0)
-    if scale.any() and kick.any():  # both are fitted
-        both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
-        said.append(
-            f"mean monitor gain against mean corrector scale: known to "
-            f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
-            f"{both:+.2f}"
-        )
-    for family in state.families:
-        own = [g for g in there.groups if g.name == family.name]
-        if family.per != "ring" or family.block or not own or len(own[0].scale) < 2:
-            continue
-        loose = np.flatnonzero(posterior.sigma[there.where[family.variable]] > 0.5 * own[0].scale)
-        moves = family.moves(state.data)  # of each number; a cause is one of its pieces
-        names = [place for i in loose for _, place in list(moves[i])[:1] if place]
-        if names:
-            said.append(
-                f"{len(names)} of {family.title} that the prior holds more than the data: "
-                + first_of(names, 12)
-            )
-    return tuple(said)

@@ -5,9 +5,9 @@ A table of names, or two cables, may be wrong in one place. The orbit of such a 
 the model's far too well for a stranger: it seems displaced by the way to its neighbour.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +45,7 @@ def righted(
         measured: what they are of.
         known: pairs that were put right before; new ones are added.
         odd: what resembles nothing.
-        among: correctors that seem to stand elsewhere.
+        among: correctors that may answer as others should.
     """
     pairs = _new(exchanged(state, {*odd.correctors, *among}), known.correctors)
     if pairs:
@@ -62,36 +62,52 @@ def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
 
 
 def exchanged(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
-    """Pairs of a plane, and by how much chi-square falls: neighbours, in beam order, and then any
-    two of some that resemble nothing, or seem to stand elsewhere. None stands in two of them.
+    """Pairs, and by how much chi-square falls: neighbours of a plane, in beam order, then any two
+    of some that may be exchanged, and any two that move the beam in each other's plane. None
+    stands in two of them.
 
     Args:
         state: what the model makes of the readings.
         among: names of those that may be exchanged with one another anywhere in the ring.
     """
     data = state.data
-    model, orbits = data.pick(state.at.seen(state.at.beam)), data.pick(data.orbits)
-    names = data.measured.correctors
+    model, names = state.at.seen(state.at.beam), data.measured.correctors
 
-    def left(column: int, as_one: int) -> float:
-        seen = np.isfinite(orbits[column]) & state.good
-        u, d = model[as_one, seen], orbits[column, seen]
+    def left(column: int, as_one: int, planes: list[int]) -> float:
+        own = data.orbits[column][:, planes]
+        seen = np.isfinite(own) & state.good[:, None]
+        u, d = model[as_one][:, planes][seen], own[seen]
         gain = max(float(u @ d) / max(float(u @ u), 1e-300), 0.0)
         return float(np.sum((d - gain * u) ** 2))
 
     found: dict[Pair, float] = {}
+    for planes, pairs in _suspects(state, among):
+        noise = float(np.median(data.noise[:, planes]))
+        for a, b in pairs:
+            if any(names[c] in pair for pair in found for c in (a, b)):
+                continue
+            stays = left(a, a, planes), left(b, b, planes)
+            crossed = left(a, b, planes), left(b, a, planes)
+            if all(one < SHARE * other for one, other in zip(crossed, stays, strict=True)):
+                found[names[a], names[b]] = (sum(stays) - sum(crossed)) / noise**2
+    return found
+
+
+def _suspects(
+    state: State, among: Collection[str]
+) -> Iterator[tuple[list[int], Iterable[tuple[int, int]]]]:
+    """Columns that may be exchanged, two by two, and the planes in which they tell."""
+    data, names = state.data, state.data.measured.correctors
     for p in (0, 1):
         mine = np.flatnonzero(data.plane[:-1] == p)
         order = mine[np.argsort([data.ring[names[c]].s for c in mine])]
         far = combinations([c for c in order if names[c] in among], 2)
-        noise = float(np.median(data.noise[:, p]))
-        for a, b in (*zip(order, np.roll(order, -1), strict=True), *far):
-            if any(names[c] in pair for pair in found for c in (a, b)):
-                continue
-            stays, crossed = (left(a, a), left(b, b)), (left(a, b), left(b, a))
-            if all(one < SHARE * other for one, other in zip(crossed, stays, strict=True)):
-                found[names[a], names[b]] = (sum(stays) - sum(crossed)) / noise**2
-    return found
+        yield [p], (*zip(order, np.roll(order, -1), strict=True), *far)
+    own, across = (
+        np.nansum(data.pick(data.orbits, block)[:-1, state.good] ** 2, axis=1) for block in (0, 1)
+    )
+    turned = np.flatnonzero(across > own)
+    yield [0, 1], product(*(turned[data.plane[turned] == p] for p in (0, 1)))
 
 
 def told(pairs: Iterable[Pair], what: str = "correctors") -> str:

@@ -20,7 +20,7 @@ from tmlattice.diagnosis.response.left_open import Blur, LeftOpen
 from tmlattice.diagnosis.response.one_change import OneChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.result import Finding
-from tmlattice.effects import find, rare
+from tmlattice.effects import LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
@@ -222,8 +222,10 @@ def _hopeless(
     enough: quick, where the search for each is not."""
     if _beyond(problem, left, PATTERNS * number + SPARE, enough) <= enough:
         return False
-    kicks = [h for h in hypotheses if not find(h[0]).responds]
-    seen = scan(problem.metric(left.point), kicks, left.residual, effective=1.0)
+    # a kick, and another energy of the beam, are no pattern of columns by readings
+    others = [h for h in hypotheses
+              if not find(h[0]).responds or isinstance(find(h[0]), LaunchEffect)]  # fmt: skip
+    seen = scan(problem.metric(left.point), others, left.residual, effective=1.0)
     fault = np.abs(seen.amount) < LARGER * np.array([find(h[0]).largest for h in seen.hypotheses])
     return bool(seen.statistic[fault].max(initial=0.0) < (left.chi2 - problem.used.sum()) / 2)
 

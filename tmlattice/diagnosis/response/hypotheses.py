@@ -11,7 +11,6 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import between, families
@@ -67,7 +66,7 @@ def _orders(state: State) -> tuple[Array, Array]:
     up, down = (
         np.concatenate([
             model.closed_orbits(state.data.measured.correctors, side * kicks),
-            model.at_frequency(side * f).readings[None],
+            model.at_frequency(model.frequency + side * f).readings[None],
         ])[:, state.data.at]
         for side in (1, -1)
     )  # fmt: skip
@@ -94,10 +93,11 @@ def _third_order(state: State) -> Hypothesis:
 
 
 def _corrector_energy(state: State) -> Hypothesis:
-    ring = state.at.model.ring
-    flat = ResponseModel(ring, 4).response(state.data.measured.correctors)[:, state.data.at]
-    shift = state.at.orbits(state.at.model)
-    shift[:-1] -= flat * state.data.kicks[:-1, None, None]
+    model, names = state.at.model, state.data.measured.correctors
+    own = model.rf_response() / model.rf_start[5]
+    flat = model.response(names) - model.columns(names).start[:, 5, None, None] * own
+    shift = state.at.orbits(model)
+    shift[:-1] -= flat[:, state.data.at] * state.data.kicks[:-1, None, None]
     shift[-1] = 0
     return Hypothesis(
         "corrector's energy shift", "beyond the model's", "0; -1: the energy stays",
@@ -190,7 +190,7 @@ def _orbit_in_time(state: State) -> Hypothesis:
 
 def _chromatic_in_time(state: State) -> Hypothesis:
     """Of the energy at which all columns are read: the tunes and the optics move with it."""
-    return _in_time(_energy_offset(state), "drift of the beam's energy in order of time", False)
+    return _in_time(_chromatic(state), "drift of the beam's energy in order of time", False)
 
 
 def _hysteresis(state: State) -> Hypothesis:
@@ -213,12 +213,14 @@ def _energy_spread(state: State) -> Hypothesis | None:
     )
 
 
-def _energy_offset(state: State) -> Hypothesis:
+def _energy_offset(state: State) -> Hypothesis | None:
+    return None if state.allows("energy_offset") else _chromatic(state)  # it is in the fit
+
+
+def _chromatic(state: State) -> Hypothesis:
     """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
-    f = DELTA / state.at.model.rf_start[5]
-    up, down = (state.at.orbits(state.at.model.at_frequency(side * f)) for side in (1, -1))
-    scale = np.append(1 + state.at.errors.calibration[:-1], 1)[:, None, None]
-    slope = _readings(state, (up - down) / 2 * scale)
+    scale = (1 + state.at.errors.calibration)[:, None, None] * DELTA
+    slope = _readings(state, state.at.chromatic * scale)
     return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
 
 
@@ -288,7 +290,7 @@ def _bend_gradient(state: State) -> Hypothesis:
             for i in bends
             if round(ring.elements[i].length, 3) == kind
         }
-        model = ResponseModel(ring.with_elements(changed))
+        model = state.at.model.changed_to(ring.with_elements(changed))
         slope = (state.at.orbits(model) - state.at.orbits(state.at.model)) / BEND_GRADIENT
         scale = np.append(1 + state.at.errors.calibration[:-1], 1)[:, None, None]
         rows.append(_readings(state, slope * scale))
@@ -299,9 +301,8 @@ def _second_order_coupling(state: State) -> Hypothesis | None:
     if not state.values.get("skew", np.zeros(1)).any():
         return None
     causes = [c for c in state.at.errors.ring if c.effect != "skew_gradient"]
-    change = state.at.orbits(state.at.model) - state.at.orbits(
-        ResponseModel(apply(state.data.ring, causes))
-    )
+    flat = state.at.model.changed_to(apply(state.data.ring, causes))
+    change = state.at.orbits(state.at.model) - state.at.orbits(flat)
     return Hypothesis(
         "coupling to second order", "beyond the model's", "0; -1: none",
         _readings(state, change)[None], most=1.1,

@@ -33,7 +33,7 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps, told
+from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps
 from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
 from tmlattice.diagnosis.response.few import few_causes
@@ -46,7 +46,8 @@ from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.rf_by_others import rf_known_to
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.strangers import reversed_ones, strangers
+from tmlattice.diagnosis.response.strangers import ODD, reversed_ones, strangers
+from tmlattice.diagnosis.response.told import told
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.views import ResponseView
@@ -174,8 +175,8 @@ def _families(
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
         odd = strangers(state)
-        far = displaced(state) if fit is not None else []
-        right = righted(state, measured, known, odd, {own.name for own in far})
+        others = set() if fit is None else _anothers(state)
+        right = righted(state, measured, known, odd, others)
         if right is not None:
             measured, fit = right[0], None
             said.append(right[1])
@@ -193,6 +194,12 @@ def _families(
         elif fit is not None:
             return fit, measured, [*said, *fit.said], known
         fit = fit_steps(data, split, trials, most, progress)
+
+
+def _anothers(state: State) -> set[str]:
+    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
+    leaves far more of them than of the others."""
+    return {*(own.name for own in displaced(state)), *strangers(state, ODD).correctors}
 
 
 def _faults(
@@ -248,7 +255,10 @@ def as_diagnosis(
         heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
         heldout_shots=(),
         unexplained=_unexplained(fit),
-        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
+        tunes={
+            "before": ring_tunes(ring),
+            "after": ring_tunes(repaired, fit.state.at.errors.energy),
+        },
         next=None,
         sensitivity={},
         noise=(noise_x, noise_y),

@@ -19,6 +19,8 @@ Flags = NDArray[np.bool_]
 STRANGE, TIMES = 0.5, 9.0
 """Share of the mean square that the model leaves of what resembles nothing; and how many times the
 share that it leaves of the typical one."""
+ODD = 0.05
+"""The least such share of what may be another one's."""
 ENOUGH = 4
 """Readings that it takes to say so."""
 SILENT = 0.3
@@ -89,8 +91,13 @@ def reversed_ones(state: State) -> list[str]:
     return said
 
 
-def strangers(state: State) -> Strangers:
-    """Those among the readings in each column's own plane."""
+def strangers(state: State, least: float = STRANGE) -> Strangers:
+    """Those among the readings in each column's own plane.
+
+    Args:
+        state: what the model makes of them.
+        least: share of the mean square that the model leaves of a stranger.
+    """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]
     monitors: list[tuple[str, str]] = []
@@ -100,14 +107,14 @@ def strangers(state: State) -> Strangers:
         if not len(rows):
             continue
         there = np.isfinite(orbits[rows]) & state.good
-        bad = _strange(read[rows], orbits[rows], there)
+        bad = _strange(read[rows], orbits[rows], there, least)
         monitors += [(data.measured.monitors[m], "xy"[p]) for m in np.flatnonzero(bad)]
-        odd = _strange(read[rows].T, orbits[rows].T, (there & ~bad).T)
+        odd = _strange(read[rows].T, orbits[rows].T, (there & ~bad).T, least)
         correctors += [data.measured.correctors[rows[c]] for c in np.flatnonzero(odd)]
     return Strangers(tuple(monitors), tuple(correctors))
 
 
-def _strange(model: Array, read: Array, there: Flags) -> Flags:
+def _strange(model: Array, read: Array, there: Flags, least: float) -> Flags:
     """Of each column of [reading, one]: whether no multiple of the model explains it."""
     u, d = np.where(there, model, 0.0), np.where(there, read, 0.0)
     size = (d**2).sum(axis=0)
@@ -117,5 +124,5 @@ def _strange(model: Array, read: Array, there: Flags) -> Flags:
     seen = (there.sum(axis=0) >= ENOUGH) & (size > SILENT**2 * (u**2).sum(axis=0))
     if seen.sum() < ENOUGH:
         return np.zeros(len(share), dtype=bool)
-    strange = seen & (share > max(STRANGE, TIMES * float(np.median(share[seen]))))
+    strange = seen & (share > max(least, TIMES * float(np.median(share[seen]))))
     return strange if strange.sum() <= MOST * seen.sum() else np.zeros_like(strange)
