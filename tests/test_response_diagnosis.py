@@ -480,7 +480,7 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
     assert together < 0.98 * rows["none"].heldout_rms_in_plane
 
 
-def test_an_energy_offset_has_its_amount_and_the_tunes_are_the_beams(small_ring, rng):
+def test_an_energy_offset_has_its_amount_and_no_gradient_makes_it(small_ring, rng):
     measured = simulate_response(
         small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
     ).measured
@@ -493,6 +493,9 @@ def test_an_energy_offset_has_its_amount_and_the_tunes_are_the_beams(small_ring,
     assert abs(energy - 5e-5) < 2e-6
     gradients = fit.state.values.get("gradient", np.zeros(1))
     assert np.abs(gradients).max() < 1e-5  # which would have made the same tunes, 5e-5 and more
+
+
+def test_tunes_go_with_the_energy_as_ats(small_ring):
     h = 1e-4
     up, down = (np.array(ring_tunes(small_ring, side * h)) for side in (1, -1))
     lattice = AtEngine(small_ring).lattice()

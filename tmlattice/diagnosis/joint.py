@@ -40,7 +40,16 @@ from tmlattice.diagnosis.strategy import (
 )
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.diagnosis.views import JointView
-from tmlattice.effects import Cause, LaunchEffect, apply, background_rms, find, modelled, rare
+from tmlattice.effects import (
+    Cause,
+    Effect,
+    LaunchEffect,
+    apply,
+    background_rms,
+    find,
+    modelled,
+    rare,
+)
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Known, Learnt, small_errors_of
@@ -157,12 +166,16 @@ def _named(label: str, measured: Measured, how: How) -> Part:
 
 def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
     chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
-    # what shifts all launches is not the stored beam's, nor seen where each shot has a launch
-    launch = [name for name in chosen if isinstance(find(name), LaunchEffect)]
-    chosen = [name for name in chosen if name not in launch or name == "energy_spread"]
+    chosen = [name for name in chosen if not _of_launches(find(name))]
     if not chosen:
         raise EffectError("none of these effects can be looked for here; name another one")
     return chosen
+
+
+def _of_launches(effect: Effect) -> bool:
+    """Whether it is the launches' alone; what shifts all of them is not the stored beam's, nor seen
+    where each shot has a launch of its own."""
+    return isinstance(effect, LaunchEffect) and (effect.shifts is not None or not effect.responds)
 
 
 # --- the search ----

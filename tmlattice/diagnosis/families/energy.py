@@ -1,5 +1,6 @@
 """Families of errors of the beam's energies: their mean, and their spread."""
 
+from abc import abstractmethod
 from dataclasses import replace
 
 import numpy as np
@@ -19,25 +20,37 @@ WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
 that the lattice has no field of), as rms; and what is usual where radiation says nothing."""
 
 
-class EnergyOffset(Family):
+class _OfBeam(Family):
+    """One number of the beam, that all columns have a part of."""
+
+    block, per = 0, "ring"
+
+    def size(self, data: ResponseData) -> int:
+        return 1
+
+    @abstractmethod
+    def change(self, at: Predicted) -> Array:
+        """Of the beam's orbit changes, correctors as they are told, m, [column, monitor, 2]."""
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        scale = (1 + at.errors.calibration)[:, None, None]
+        return np.asarray((at.gain(0) * at.data.pick(self.change(at) * scale))[None])
+
+
+class EnergyOffset(_OfBeam):
     """Of the beam from the energy that its magnets are set for: the RF's frequency does not fit to
     the way around the ring."""
 
     name, effects = "energy_offset", ("energy_offset",)
-    block, per, variable, trust = 0, "ring", "energy", 1e-3
-
-    def size(self, data: ResponseData) -> int:
-        """One."""
-        return 1
+    variable, trust = "energy", 1e-3
 
     def groups(self, data: ResponseData) -> list[Group]:
         """As much as is usual."""
         return [Group(self.name, np.eye(1), USUAL_OFFSET, fixed=True)]
 
-    def rows(self, at: Predicted, values: Array) -> Array:
+    def change(self, at: Predicted) -> Array:
         """The first derivative by the energy."""
-        scale = (1 + at.errors.calibration)[:, None, None]
-        return np.asarray((at.gain(0) * at.data.pick(at.chromatic * scale))[None])
+        return at.chromatic
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """As it stands."""
@@ -62,15 +75,11 @@ class EnergyOffset(Family):
         return [{(self.name, None): 1.0}]
 
 
-class EnergySpread(Family):
+class EnergySpread(_OfBeam):
     """Of the beam: mean square energy deviation, in units of `DELTA` squared."""
 
     name, effects = "energy_spread", ("energy_spread",)
-    block, per, variable, trust = 0, "ring", "spread", 10.0
-
-    def size(self, data: ResponseData) -> int:
-        """One."""
-        return 1
+    variable, trust = "spread", 10.0
 
     def groups(self, data: ResponseData) -> list[Group]:
         """As much as it can be."""
@@ -79,10 +88,9 @@ class EnergySpread(Family):
     def _most(self, data: ResponseData) -> float:
         return WIDENED * (expected_spread(data.ring) or UNKNOWN_SPREAD)
 
-    def rows(self, at: Predicted, values: Array) -> Array:
+    def change(self, at: Predicted) -> Array:
         """The second derivative by the energy."""
-        scale = (1 + at.errors.calibration)[:, None, None]
-        return np.asarray((at.gain(0) * at.data.pick(at.curved * scale))[None])
+        return at.curved
 
     def lowest(self, data: ResponseData) -> Array | float:
         """A square is not negative."""
