@@ -120,7 +120,8 @@ def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """The stored beam by the design and as found: (what, design, found)."""
+    """The stored beam by the design and as found, of the energy that the magnets are set for
+    whatever it has: (what, design, found)."""
     told = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
 
     def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
@@ -142,7 +143,7 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     ]
 
 
-OPTICS = ("stored beam", "design", "as found")
+OPTICS = ("stored beam on energy", "design", "as found")
 """Head of `optics_rows`."""
 
 NUMBERS = ("tunes", "read", "design", "as found")
