@@ -13,12 +13,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky
-from scipy.linalg.lapack import dpotri, dtrtri
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.inference.priors import Group
 from tmlattice.inference.slopes import Slopes, weighed_sums
+from tmlattice.inference.triangles import inverse_of_lower, lower_factor
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -189,10 +190,10 @@ def solve(
         scaled *= prior[:, None]
         # above the rounding of sums over all readings
         scaled[np.diag_indices(len(A))] += 1 + ROUNDING * np.diag(scaled)
-        factor = cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
+        factor = lower_factor(scaled)
         found = prior * cho_solve((factor, True), prior * b)
         if turn < rounds:
-            half = dtrtri(factor, lower=1)[0]
+            half = inverse_of_lower(factor)
             left = np.einsum("ij,ij->j", half, half)  # the diagonal of the covariance
             parts = np.split(found**2, edges), np.split(left, edges)
             groups = tuple(g.learn(own, left) for g, own, left in zip(groups, *parts, strict=True))

@@ -166,7 +166,8 @@ def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
         atom.k2 = 0.0
     if supported is None or SecondTM in supported:
         try:
-            second = [_body(atom, energy, *part) for part in parts]
+            made = {part: _body(atom, energy, *part) for part in parts}  # two halves are alike
+            second = [made[part] for part in parts]
             if faint:
                 for i, (where, length) in enumerate(parts):
                     if where is TMTypes.MAIN:
