@@ -21,7 +21,7 @@ from tmlattice.inference.normal import Normal, normal_equations, solve
 from tmlattice.inference.priors import Group
 from tmlattice.inference.slopes import Slopes
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.orbit_response import Errors, response_data
 from tmlattice.observe.split import split_columns
 
 
@@ -282,3 +282,21 @@ def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
     monkeypatch.setattr(dense, "_title", str)
     state = SimpleNamespace(good=None, independent=None)
     assert dense._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})
+
+
+@pytest.mark.parametrize(
+    ("own", "across", "kick", "angle"),
+    [
+        (1.0, 0.1, np.hypot(1, 0.1), np.arctan(0.1)),
+        (-1.0, 0.1, -np.hypot(1, 0.1), -np.arctan(0.1)),  # reversed: its roll has the other sign
+        (0.01, 1.0, np.hypot(1, 0.01), np.arctan2(1.0, 0.01)),
+        (-0.01, -1.0, np.hypot(1, 0.01), np.arctan2(-1.0, -0.01)),  # turned, and not reversed
+        (0.0, 0.0, 0.0, 0.0),
+    ],
+)
+def test_a_kick_and_its_angle_make_its_parts(own, across, kick, angle):
+    errors = Errors(np.eye(2)[None], np.array([own - 1]), np.array([across]))
+    assert_allclose(errors.kick, kick)
+    assert_allclose(errors.angle, angle)
+    assert_allclose(errors.kick * np.cos(errors.angle), own, atol=1e-15)
+    assert_allclose(errors.kick * np.sin(errors.angle), across)

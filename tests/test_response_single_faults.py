@@ -70,6 +70,19 @@ def test_a_reversed_corrector_that_is_held_out_is_named(small_ring, measured_wit
     named(small_ring, measured, cause)
 
 
+@pytest.mark.parametrize("roll", [np.pi / 2, -2.0])
+def test_a_corrector_that_kicks_the_other_plane_is_turned_and_not_off(
+    small_ring, measured_with, roll
+):
+    """It was a calibration of -100 %, and of -202 % with a roll of the other sign."""
+    cause = Cause("corrector_roll", "v5", roll)
+    result = named(small_ring, measured_with(cause), cause)
+    rows = {(own.effect, own.element): own.amount for own in result.causes}
+    assert abs(rows["corrector_roll", "v5"] - roll) < 0.05  # as the row of its family says
+    assert abs(rows["corrector_calibration", "v5"]) < 0.2  # usual ones are 0.04
+    assert not any("wrong sign" in said for said in result.warnings)
+
+
 def test_a_reversed_monitor_among_usual_errors_is_named(small_ring, measured_with):
     cause = Cause("monitor_gain_y", "bpm::6", -2.0)
     named(small_ring, measured_with(cause), cause)

@@ -75,7 +75,7 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     remedy = "calibrate {}"
     to_check = (
         "Step its setting and read back its current; near -200 % its cables are exchanged, near "
-        "-100 % it is off."
+        "-100 % it is off, or kicks in the other plane where that was not read."
     )
     background = 0.04
     largest = 2.0

@@ -163,17 +163,22 @@ class Errors:
         return cls(eye, np.zeros(columns), np.zeros(columns))
 
     @property
+    def turned(self) -> Flags:
+        """Columns of correctors that kick more in the other plane than in their own."""
+        return np.abs(self.roll) > np.abs(1 + self.calibration)
+
+    @property
     def kick(self) -> Array:
         """Of both planes, as a share of what a corrector is told; negative for a reversed one,
-        [column]."""
+        which is told from one that is turned by more than half a right angle, [column]."""
         own = 1 + self.calibration
-        return np.where(own < 0, -1.0, 1.0) * np.hypot(own, self.roll)
+        return np.where((own < 0) & ~self.turned, -1.0, 1.0) * np.hypot(own, self.roll)
 
     @property
     def angle(self) -> Array:
         """Of each kick to its plane, rad: a right one where it has nothing in that, [column]."""
-        kick = self.kick
-        return np.asarray(np.arcsin(np.clip(self.roll / np.where(kick == 0, 1.0, kick), -1, 1)))
+        sign = np.sign(self.kick)
+        return np.arctan2(sign * self.roll, sign * (1 + self.calibration))
 
     def with_causes(self, data: ResponseData, causes: Sequence[Cause]) -> "Errors":
         """These and more; an energy spread adds in square.

@@ -151,9 +151,10 @@ def test_the_beams_energy_comes_out_as_at_has_it(small_ring, by):
     assert abs(found - by) < 0.01 * abs(by)
 
 
-@pytest.mark.parametrize("own", [0.0, 0.6, -0.6])
+@pytest.mark.parametrize("own", [0.0, 0.6, -0.6, -0.9])
 def test_a_corrector_that_kicks_across_is_turned(data, own):
-    """By a right angle where nothing is left in its plane; a reversed one kicks the other way."""
+    """By a right angle where nothing is left in its plane, by more where less than nothing is; one
+    that kicks the other way, and mostly so in its plane, is reversed."""
     turned = CorrectorRoll()
     values = {CALIBRATION: np.zeros(18), turned: np.zeros(18)}
     values[CALIBRATION][4], values[turned][4] = own - 1, 0.8
@@ -165,8 +166,9 @@ def test_a_corrector_that_kicks_across_is_turned(data, own):
         for family, numbers in values.items()
     )
     size = np.hypot(own, 0.8)
-    assert np.isclose(kick[0].amount, (-size if own < 0 else size) - 1)
-    assert np.isclose(roll[0].amount, np.arcsin(0.8 / size) * (-1 if own < 0 else 1))
+    sign = -1 if own < -0.8 else 1
+    assert np.isclose(kick[0].amount, sign * size - 1)
+    assert np.isclose(roll[0].amount, np.arctan2(sign * 0.8, sign * own))
     assert np.isclose(roll[1], 0.01 / size)
     fitted = Predicted(data, errors).read
     told = Predicted(data, Errors.none(data).with_causes(data, [kick[0], roll[0]])).read

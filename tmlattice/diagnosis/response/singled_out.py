@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from tmlattice.diagnosis.families.orbit_modes import HorizontalOrbit, VerticalOrbit
-from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.response.dense import ROUGH, DenseFit, Step, fit_chi2
+from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.judges import Chi2, score
 from tmlattice.diagnosis.response.others import KINDS, with_number
 from tmlattice.diagnosis.response.rounds import Linear, linear, log_evidence, settle
@@ -29,16 +29,14 @@ from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, sma
 from tmlattice.diagnosis.response.state import Apart, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
-from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
-from tmlattice.inference.rivals import Detection, linear_evidence
+from tmlattice.inference.rivals import linear_evidence
 from tmlattice.inference.scan import Scan
-from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Hypothesis, ResponseData
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import Split
@@ -71,34 +69,6 @@ WORSE = 1.02
 """What held-out correctors may be left more with the faults than without, at most."""
 MEMBERS = 16
 """As many as an orbit's patterns, where there are none."""
-
-
-@dataclass(frozen=True, eq=False)
-class Fault:
-    """One that stands out.
-
-    Attributes:
-        cause: with its amount.
-        sigma: standard error, with what its family scatters.
-        statistic, p_value: by how much it stands out.
-        rivals: other causes in its place, by falling evidence; the first is itself.
-        evidence: of each.
-    """
-
-    cause: Cause
-    sigma: float
-    statistic: float
-    p_value: float
-    rivals: tuple[Cause, ...]
-    evidence: Array
-
-    def finding(self, ring: Ring, judgement: Judgement) -> Finding:
-        """As it is told."""
-        chance = np.exp(self.evidence - self.evidence.max())
-        chance /= chance.sum()
-        shown = self.rivals[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
-        seen = Detection(self.statistic, CLEAR, self.p_value)
-        return finding_of(ring, self.rivals, chance, shown, self.sigma, seen, judgement.mass)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +118,8 @@ def singled_out(
             break
         seen_before.append(chosen)
     seen = search.seen(search.state)
-    faults = [search.fault(seen, one) for one in search.state.apart]
+    errors = search.state.at.errors
+    faults = [as_turned(search.fault(seen, one), errors, data) for one in search.state.apart]
     return SingledOut(search.state, tuple(sorted(faults, key=lambda fault: -fault.statistic)))
 
 

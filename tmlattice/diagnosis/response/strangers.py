@@ -83,7 +83,7 @@ def reversed_ones(state: State) -> list[str]:
             for m, p in np.argwhere((gains < 0) & state.good[:, None])
         ]),
         ("correctors that kick", [
-            measured.correctors[c] for c in np.flatnonzero(errors.calibration[:-1] < -1)
+            measured.correctors[c] for c in np.flatnonzero(errors.kick[:-1] < 0)
         ]),
     ):  # fmt: skip
         if names:
