@@ -13,7 +13,7 @@ are supplies (magnets whose names begin alike), single magnets, gradients in sex
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import families
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import (
     finding_of,
@@ -39,15 +38,15 @@ from tmlattice.diagnosis.response.first_guess import begun
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import left_open
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
-from tmlattice.diagnosis.response.rounds import linear, marginal, settle
+from tmlattice.diagnosis.response.rounds import linear, settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
+from tmlattice.diagnosis.response.what_changed import REPRODUCED, what_changed
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.levels import Levels, Reason
 from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
@@ -60,18 +59,10 @@ Array = NDArray[np.float64]
 
 MOST = 40
 """Findings at most: many supplies may be changed on purpose."""
-REPRODUCED = 1e-4
-"""Relative: as well a magnet comes back, and half of it a supply; a smaller change is none."""
-STRAY = 3e-5
-"""1/m: as well a gradient beside the quadrupoles comes back: the orbit in a sextupole moves."""
-USUAL = 1e-2
-"""Prior rms of a change: relative, or of integrated gradients in 1/m."""
 ANY = 6.0
 """rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets from which a change of all of them is told though none stands out."""
-ALONE = 2.0
-"""Log odds of a supply that changed against one of its magnets alone, or a field elsewhere."""
 LEAST_NOISE = 0.2
 """Share of the stated noise that two measurements differ by at least."""
 DRIFT, OUTSTANDING = 0.03, 8.0
@@ -168,7 +159,10 @@ def diagnose_change(
     fit = _fit_change(data, split, trials, progress)
     progress("what changed")
     whole = _all_columns(fit.state)
-    named = findings_of_change(whole, effects, max_effects, judgement)
+    changed, scatter = what_changed(whole, max_effects, judgement)
+    changed += _outstanding(whole, judgement)
+    wanted = changed if effects is None else [own for own in changed if own.effect in effects]
+    named = strongest_first(wanted)[:max_effects]
     causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in named)
     told: list[Told] = [
         (cause, own.amount_sigma or 0.0) for cause, own in zip(causes, named, strict=True)
@@ -180,7 +174,7 @@ def diagnose_change(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
         verdict=least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
-        warnings=(*said, *_said(data, fit, whole)),
+        warnings=(*said, *_said(data, fit, whole, scatter)),
         noise_estimated=True,
         provenance=provenance(ring, options, seed, started),
     )  # fmt: skip
@@ -280,88 +274,7 @@ def _all_columns(state: State) -> State:
     return settle(replace(state, split=_judged_by_nobody(state.split)))
 
 
-# --- what changed ---------------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """What may have changed, as causes of amount one, and what each moves."""
-
-    causes: tuple[tuple[str, str], ...]
-    members: Array  # [number, candidate]
-    scatter: Array  # covariance of single numbers, [number, number]
-
-
-def _candidates(state: State, variables: Sequence[str]) -> _Candidates:
-    causes: list[tuple[str, str]] = []
-    blocks: list[Array] = []
-    scatter: list[Array] = []
-    for family in {f.variable: f for f in state.families if f.variable in variables}.values():
-        places = family.places(state.data)  # type: ignore[attr-defined]
-        rms = state.groups[family.name].rms if family.name in state.groups else 0.0
-        own = np.eye(len(places))
-        if isinstance(family, QuadrupoleGradient):
-            kinds, members = families(places)
-            supply = (REPRODUCED / 2) ** 2 * members @ members.T
-            scatter.append(max(rms, REPRODUCED) ** 2 * np.eye(len(places)) + supply)
-            causes += [(FamilyGradient.name, kind) for kind in kinds]
-            own = np.hstack([members, own])
-        else:
-            scatter.append(max(rms, STRAY) ** 2 * np.eye(len(places)))
-        effect = QuadrupoleGradient.name if isinstance(family, QuadrupoleGradient) else family.name
-        causes += [(effect, place) for place in places]
-        blocks.append(own)
-    from scipy.linalg import block_diag
-
-    return _Candidates(tuple(causes), block_diag(*blocks), block_diag(*scatter))
-
-
-def findings_of_change(
-    state: State, effects: Sequence[str] | None, most: int, judgement: Judgement
-) -> tuple[Finding, ...]:
-    """Supplies, magnets and devices that changed, then monitors and correctors that stand out."""
-    found: list[Finding] = []
-    for block in (0, 1):
-        variables = [f.variable for f in state.of_block(block) if f.per == "ring"]
-        variables = list(dict.fromkeys(variables))
-        if not variables:
-            continue
-        there = linear(state, block)
-        information, pull = marginal(there, variables)
-        among = _candidates(state, variables)
-        wider = _widened(state, block)
-        levels = Levels(
-            information / wider**2, pull / wider**2, among.members, among.scatter,
-            np.full(len(among.causes), USUAL),
-            np.array([0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]),
-        )  # fmt: skip
-        chosen = levels.choose(most)
-        found += [
-            _finding(state.data.ring, among.causes, own, judgement)
-            for own in levels.reasons(chosen)
-        ]
-    found += _outstanding(state, judgement)
-    wanted = found if effects is None else [own for own in found if own.effect in effects]
-    return strongest_first(wanted)[:most]
-
-
-def _widened(state: State, block: int) -> float:
-    """By what errors grow, for the noise was learnt from readings that were fitted."""
-    there = linear(state, block)
-    posterior = solve(there.normal, there.groups, there.start, rounds=0)
-    fitted = float(np.sum(1 - np.diag(posterior.covariance)))
-    count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
-    return float(np.sqrt(count / max(count - fitted, count / 4)))
-
-
-def _finding(
-    ring: Ring, names: Sequence[tuple[str, str]], own: Reason, judgement: Judgement
-) -> Finding:
-    chance = np.array([p for _, p in own.rivals])
-    causes = [Cause(*names[c], own.amount) for c, _ in own.rivals]
-    shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
-    seen = Detection.among(own.statistic, len(names))
-    return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)
-
-
+# --- what is told ---------------------------------------------------------------------------------
 def _drifts(state: State) -> list[Told]:
     """What monitors and correctors do otherwise than before, with errors."""
     found: list[Told] = []
@@ -401,8 +314,8 @@ def _verdict(state: State) -> str:
     return "distributed" if group is not None and group.rms > EVERYWHERE else "nothing"
 
 
-def _said(data: ResponseData, fit: DenseFit, state: State) -> list[str]:
-    """How well two measurements agree, and what drifted."""
+def _said(data: ResponseData, fit: DenseFit, state: State, scatter: float | None) -> list[str]:
+    """How well two measurements agree, and by how much magnets of a supply scatter."""
     left = data.pick(state.at.left)[:-1][:, state.good]
     agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
     stated = 1e6 * float(np.median(data.noise))
@@ -410,10 +323,9 @@ def _said(data: ResponseData, fit: DenseFit, state: State) -> list[str]:
         f"with what changed the two measurements agree to {agree:.2g} µm (their stated noise makes "
         f"{stated:.2g})"
     ]
-    group = state.groups.get(QuadrupoleGradient.name)
-    if group is not None:
+    if scatter is not None:
         said.append(
-            f"magnets of one supply differ in their change by {group.rms:.1g} (rms, relative), "
+            f"magnets of one supply differ in their change by {scatter:.1g} (rms, relative), "
             f"which is in the errors; changes below {REPRODUCED:g} are taken for none"
         )
     return said

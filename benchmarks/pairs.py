@@ -1,0 +1,184 @@
+"""Two days of a measured ring: `TMLATTICE_DATA=... python benchmarks/pairs.py [RING ...]`.
+
+The response that was measured is the first day. The second is the same, with what changes of some
+supplies and of some single magnets do to the readings of all that was fitted to the first (AT's
+closed orbits, with less without), drifts of monitors and correctors, and noise of its own.
+What the model of the ring lacks is in both days, as it is in two real ones.
+
+Each case is drawn by its number: three supplies by 0.1 to 0.6 %, three single quadrupoles by 0.3 to
+1 %, of either sign; or nothing (`--null`). Told are what was found of what was changed, what else
+was named, and by how many of their stated errors the amounts are off. `--cases N` that many of
+each ring, `--first N` from another number on.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from real_rings import imported, sources
+
+import tmlattice
+from tmlattice import Cause, read_measurement
+from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
+from tmlattice.diagnosis.response import procedure
+from tmlattice.errors import TmlatticeError
+from tmlattice.machine.response import simulate_response
+
+SUPPLIES, SINGLE = 3, 3
+DRIFT = 2e-3
+"""rms, relative, of gains and kicks from one day to the other."""
+KICK = 2e-5
+"""rad; of AT's steps, small enough for orbits in proportion to them."""
+
+
+def drawn(ring, rng, null):
+    """Changes: (what it is told of, amount, {magnet: relative change})."""
+    own = magnets(ring, ("quadrupole",), powered=True)
+    kinds, members = supplied_alike(own)
+    several = [i for i in range(len(kinds)) if members[:, i].sum() > 1]
+    changes, taken = [], set()
+    if null:
+        return changes
+    for i in rng.permutation(several)[:SUPPLIES]:
+        amount = rng.choice([-1, 1]) * np.exp(rng.uniform(np.log(1e-3), np.log(6e-3)))
+        of = np.flatnonzero(members[:, i])
+        taken.update(of)
+        changes.append((kinds[i], amount, {own[m][0].name: amount for m in of}, own, of))
+    for m in rng.permutation(len(own)):
+        if len(changes) == SUPPLIES + SINGLE:
+            break
+        if m in taken:
+            continue
+        taken.update(np.flatnonzero(members[m] @ members.T))  # no other of its supply
+        amount = rng.choice([-1, 1]) * np.exp(rng.uniform(np.log(3e-3), np.log(1e-2)))
+        changes.append((own[m][0].name, amount, {own[m][0].name: amount}, own, [m]))
+    return changes
+
+
+def second_day(measured, ring, known, changes, rng):
+    """What would have been measured then, of a ring with some causes on the first day."""
+    causes = [
+        Cause("quadrupole_gradient", piece.name, amount)
+        for _, amount, _, own, of in changes
+        for m in of
+        for piece in own[m]
+    ]
+    names = list(measured.correctors)
+    rf = measured.rf
+    step = 0.0 if rf is None or rf.orbit is None else rf.step
+    orbits = []
+    for more in ([], causes):
+        made = simulate_response(
+            ring, [*known, *more], correctors=names, kick=KICK, rf_step=step, noise=0.0,
+            progress=False,
+        ).measured.select(monitors=measured.monitors)  # fmt: skip
+        orbits.append(made)
+    before, after = orbits
+    kicks = (np.asarray(measured.kicks) / KICK)[:, None, None]
+    noise = np.zeros(2) if measured.noise is None else measured.noise
+    gain = 1 + DRIFT * rng.standard_normal((len(measured.monitors), 2))
+    scale = 1 + DRIFT * rng.standard_normal((len(names), 1, 1))
+    response = measured.response + (after.response - before.response) * kicks
+    response = gain * scale * response + noise * rng.standard_normal(response.shape)
+    if rf is not None and rf.orbit is not None:
+        orbit = rf.orbit + after.rf.orbit - before.rf.orbit
+        rf = replace(rf, orbit=gain * orbit + noise * rng.standard_normal(orbit.shape))
+    return replace(measured, response=response, rf=rf)
+
+
+def judged(ring, result, changes):
+    """Names of what was found and missed, findings that are none, and pulls."""
+    own = magnets(ring, ("quadrupole",), powered=True)
+    kinds, members = supplied_alike(own)
+    true = {magnet[0].name: 0.0 for magnet in own}
+    for _, _, of, _, _ in changes:
+        true.update(of)
+    found, wrong, pulls = set(), [], []
+    for one in result.findings:
+        if one.effect == "quadrupole_gradient":
+            about = [next(m[0].name for m in own if one.element in [piece.name for piece in m])]
+        elif one.effect == "family_gradient":
+            names = [kind.casefold() for kind in kinds]
+            column = (
+                names.index(one.element.casefold()) if one.element.casefold() in names else None
+            )
+            about = [m[0].name for i, m in enumerate(own)
+                     if (members[i, column] if column is not None
+                         else m[0].family.casefold() == one.element.casefold())]  # fmt: skip
+        else:
+            about = []
+        amounts = [true[name] for name in about]
+        if not about or not any(amounts):
+            wrong.append((one.effect, one.element, one.amount, one.amount_sigma))
+            continue
+        pulls.append((one.amount - np.mean(amounts)) / one.amount_sigma)
+        found |= {what for what, _, of, _, _ in changes if set(of) & set(about)}
+    missed = [(what, amount) for what, amount, _, _, _ in changes if what not in found]
+    return found, missed, wrong, pulls
+
+
+def cases(name, files, data, place, options):
+    """Each as it comes; and the counts."""
+    lattice, folder, _ = imported(name, files, data, place, "last")
+    ring, measured = tmlattice.load_ring(lattice), read_measurement(folder)
+    found = tmlattice.diagnose(ring, measured)
+    # a spread would take three times the orbits, and changes theirs by next to nothing
+    known = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
+    total = np.zeros(4, dtype=int)
+    every = []
+    for case in range(options.first, options.first + options.cases):
+        rng = np.random.default_rng(case)
+        changes = drawn(ring, rng, options.null)
+        begun = time.process_time()
+        try:
+            after = second_day(measured, ring, known, changes, rng)
+            begun = time.process_time()
+            result = tmlattice.diagnose(ring, after, reference=measured)
+        except TmlatticeError as error:
+            print(f"{name}, case {case}: {error}", flush=True)
+            total += [0, len(changes), 0, 1]
+            continue
+        found, missed, wrong, pulls = judged(ring, result, changes)
+        every += pulls
+        total += [len(found), len(changes), len(wrong), 0]
+        told = ", ".join(f"{what} {100 * amount:+.2f} %" for what, amount in missed)
+        others = ", ".join(f"{effect} {where} {amount:+.2g} ± {error:.1g}"
+                           for effect, where, amount, error in wrong)  # fmt: skip
+        print(f"{name}, case {case}: {result.verdict}, {len(found)} of {len(changes)}; missed: "
+              f"{told or 'none'}; others: {others or 'none'}; pulls "
+              f"{' '.join(f'{pull:+.1f}' for pull in pulls)}; "
+              f"{time.process_time() - begun:.0f} s", flush=True)  # fmt: skip
+    rms = np.sqrt(np.mean(np.square(every))) if every else np.nan
+    return f"| {name} | {total[0]} of {total[1]} | {total[2]} | {rms:.2f} | {total[3]} |"
+
+
+def main():
+    """Of all rings, or of those that are named."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rings", nargs="*")
+    parser.add_argument("--cases", type=int, default=5)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--null", action="store_true")
+    options = parser.parse_args()
+    data = os.environ.get("TMLATTICE_DATA")
+    if not data:
+        sys.exit("set TMLATTICE_DATA to the folder that holds real_rings")
+    procedure.LARGE = 0  # the ring alone is wanted of the first day
+    known = sources(Path(data))
+    rows = []
+    with tempfile.TemporaryDirectory() as place:
+        rows.extend(
+            cases(name, known[name], Path(data), Path(place), options)
+            for name in options.rings or known
+        )
+    print("\n| ring | found | others | pulls, rms | refused |\n|---|---|---|---|---|")
+    print("\n".join(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""Which supplies, magnets and devices changed: candidates weighed by evidence.
+
+>>> findings, scatter = what_changed(state, most, judgement)
+
+Magnets of a supply scatter in their change, and by how much says how well a change of a supply is
+known. What a fit of every magnet learns of it has the changes of single magnets in it; so the
+scatter, too, is what the evidence of the candidates beside it wants.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.magnets import families
+from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.response.rounds import linear, marginal
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.result import Finding
+from tmlattice.effects import Cause
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.levels import Levels, Reason
+from tmlattice.inference.normal import solve
+from tmlattice.inference.rivals import Detection
+from tmlattice.lattice import Ring
+
+Array = NDArray[np.float64]
+
+REPRODUCED = 1e-4
+"""Relative: as well a magnet comes back, and half of it a supply; a smaller change is none."""
+STRAY = 3e-5
+"""1/m: as well a gradient beside the quadrupoles comes back: the orbit in a sextupole moves."""
+USUAL = 1e-2
+"""Prior rms of a change: relative, or of integrated gradients in 1/m."""
+ALONE = 2.0
+"""Log odds of a supply that changed against one of its magnets alone, or a field elsewhere."""
+FINER = 0.5
+"""Steps in which less scatter is tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """What may have changed, as causes of amount one, and what each moves."""
+
+    causes: tuple[tuple[str, str], ...]
+    members: Array  # [number, candidate]
+    scatter: Array  # covariance of single numbers, [number, number]
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """Candidates beside some scatter, those that are there, and the log evidence of all that."""
+
+    among: _Candidates
+    levels: Levels
+    chosen: list[int]
+    evidence: float
+
+
+def what_changed(
+    state: State, most: int, judgement: Judgement
+) -> tuple[list[Finding], float | None]:
+    """Supplies, magnets and devices that changed.
+
+    Args:
+        state: of a fit of the change.
+        most: findings of a plane at most.
+        judgement: of the sets of rivals.
+
+    Returns:
+        The findings; and by how much magnets of a supply scatter in their change, rms, relative;
+        None where no quadrupoles were fitted.
+    """
+    found: list[Finding] = []
+    between = None
+    for block in (0, 1):
+        variables = [f.variable for f in state.of_block(block) if f.per == "ring"]
+        variables = list(dict.fromkeys(variables))
+        if not variables:
+            continue
+        scatter, own = _by_evidence(state, block, variables, most)
+        between = scatter.get(QuadrupoleGradient.name, between)
+        found += [
+            _finding(state.data.ring, own.among.causes, reason, judgement)
+            for reason in own.levels.reasons(own.chosen)
+        ]
+    return found, between
+
+
+def _by_evidence(
+    state: State, block: int, variables: Sequence[str], most: int
+) -> tuple[dict[str, float], _Weighed]:
+    """The scatter of each family, at most what a fit of all has learnt, and what is there."""
+    information, pull = marginal(linear(state, block), variables)
+    wider = _widened(state, block)
+
+    def weighed(scatter: Mapping[str, float]) -> _Weighed:
+        among = _candidates(state, variables, scatter)
+        odds = [0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]
+        levels = Levels(
+            information / wider**2, pull / wider**2, among.members, among.scatter,
+            np.full(len(odds), USUAL), np.array(odds),
+        )  # fmt: skip
+        chosen = levels.choose(most)
+        return _Weighed(among, levels, chosen, levels.background + levels.log_evidence(chosen))
+
+    fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}.values()
+    least = {f.name: REPRODUCED if isinstance(f, QuadrupoleGradient) else STRAY for f in fitted}
+    known = {name: group.rms for name, group in state.groups.items()}
+    scatter = {name: max(known.get(name, 0.0), lowest) for name, lowest in least.items()}
+    best = weighed(scatter)
+    for name, learnt in dict(scatter).items():
+        finer = learnt
+        while finer > least[name]:
+            finer = max(FINER * finer, least[name])
+            other = weighed({**scatter, name: finer})
+            if other.evidence > best.evidence:
+                best, scatter = other, {**scatter, name: finer}
+    return scatter, best
+
+
+def _candidates(
+    state: State, variables: Sequence[str], scatter: Mapping[str, float]
+) -> _Candidates:
+    causes: list[tuple[str, str]] = []
+    blocks: list[Array] = []
+    covariance: list[Array] = []
+    for family in {f.variable: f for f in state.families if f.variable in variables}.values():
+        places = family.places(state.data)  # type: ignore[attr-defined]
+        own = np.eye(len(places))
+        quadrupoles = isinstance(family, QuadrupoleGradient)
+        name = QuadrupoleGradient.name if quadrupoles else family.name
+        alone = scatter[family.name] ** 2 * own
+        if quadrupoles:
+            kinds, members = families(places)
+            alone = alone + (REPRODUCED / 2) ** 2 * members @ members.T
+            causes += [(FamilyGradient.name, kind) for kind in kinds]
+            own = np.hstack([members, own])
+        covariance.append(alone)
+        causes += [(name, place) for place in places]
+        blocks.append(own)
+    return _Candidates(tuple(causes), block_diag(*blocks), block_diag(*covariance))
+
+
+def _widened(state: State, block: int) -> float:
+    """By what errors grow, for the noise was learnt from readings that were fitted."""
+    there = linear(state, block)
+    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    fitted = float(np.sum(1 - np.diag(posterior.covariance)))
+    count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
+    return float(np.sqrt(count / max(count - fitted, count / 4)))
+
+
+def _finding(
+    ring: Ring, names: Sequence[tuple[str, str]], own: Reason, judgement: Judgement
+) -> Finding:
+    chance = np.array([p for _, p in own.rivals])
+    causes = [Cause(*names[c], own.amount) for c, _ in own.rivals]
+    shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
+    seen = Detection.among(own.statistic, len(names))
+    return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)
