@@ -25,30 +25,28 @@ from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import (
-    finding_of,
     least_certain,
     strongest_first,
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
+from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
 from tmlattice.diagnosis.response.exchanged_since import all_right, since
-from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.few import Few, few_causes
 from tmlattice.diagnosis.response.first_guess import begun
 from tmlattice.diagnosis.response.judges import score
-from tmlattice.diagnosis.response.left_open import left_open
+from tmlattice.diagnosis.response.left_open import LeftOpen, left_open
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
-from tmlattice.diagnosis.response.rounds import linear, settle
+from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.response.what_changed import REPRODUCED, what_changed
-from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.normal import solve
-from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Predicted, ResponseData, response_data
@@ -63,11 +61,11 @@ ANY = 6.0
 """rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets from which a change of all of them is told though none stands out."""
+LESS = 0.98
+"""Of what a few causes leave, both planes' rms multiplied: small errors everywhere have to leave
+less, or the few have it."""
 LEAST_NOISE = 0.2
 """Share of the stated noise that two measurements differ by at least."""
-DRIFT, OUTSTANDING = 0.03, 8.0
-"""A monitor or a corrector is told where it changed by more than this, and by so many times as much
-as others do."""
 
 
 def diagnose_change(
@@ -120,15 +118,13 @@ def diagnose_change(
     progress("the reference")
     rng = np.random.default_rng(seed)
     fitted = _reference(first, split_columns(first, holdout, rng), WITHOUT_KICKS if trials else ())
-    names = first.measured.monitors
-    bad = [name for name, good in zip(names, fitted.good, strict=True) if not good]
-    if bad:
-        kept = [name for name in names if name not in bad]
-        said.append(f"monitors left out, bad in the reference: {', '.join(bad)}")
+    bad = ~fitted.good
+    errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
+    if bad.any():
+        names = np.array(first.measured.monitors)
+        said.append(f"monitors left out, bad in the reference: {', '.join(names[bad])}")
+        kept = names[fitted.good].tolist()
         first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
-        errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
-    else:
-        errors = fitted.at.errors
 
     def change(measured: OrbitResponse) -> ResponseData:
         return response_data(*response_change(first, errors, response_data(ring, measured)))
@@ -143,33 +139,32 @@ def diagnose_change(
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    asked = changes() if effects is None else effects
-    few = few_causes(data, split, asked, max_effects, judgement, seed, progress, left_open(fitted))
-    if few is not None:
-        causes = tuple(cause for cause, _ in few.told)
-        found = strongest_first([*few.findings, *pairs])
+    fit = _few_or_all(
+        data, split, trials, effects, max_effects, judgement, seed, progress, left_open(fitted)
+    )
+    if isinstance(fit, Few):
+        causes = tuple(cause for cause, _ in fit.told)
+        found = strongest_first([*fit.findings, *pairs])
         return as_diagnosis(
-            there, few.fit, few.fit.state.at.errors.ring, few.told,
-            verdict=least_certain(found, few.verdict),
+            there, fit.fit, fit.fit.state.at.errors.ring, fit.told,
+            verdict=least_certain(found, fit.verdict),
             findings=with_consequences(there, found, causes),
-            warnings=(*said, *few.said),
+            warnings=(*said, *fit.said),
             noise_estimated=False,
             provenance=provenance(ring, options, seed, started),
         )  # fmt: skip
-    fit = _fit_change(data, split, trials, progress)
     progress("what changed")
     whole = _all_columns(fit.state)
     changed, scatter = what_changed(whole, max_effects, judgement)
-    changed += _outstanding(whole, judgement)
+    changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
     causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in named)
-    told: list[Told] = [
-        (cause, own.amount_sigma or 0.0) for cause, own in zip(causes, named, strict=True)
-    ]
+    known = [own.amount_sigma or 0.0 for own in named]
+    told: list[Told] = list(zip(causes, known, strict=True))
     found = strongest_first([*named, *pairs])
     have = {(cause.effect, cause.element) for cause in causes}
-    told += [row for row in _drifts(whole) if (row[0].effect, row[0].element) not in have]
+    told += [row for row in drifts(whole) if (row[0].effect, row[0].element) not in have]
     return as_diagnosis(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
         verdict=least_certain(found, _verdict(whole)),
@@ -275,38 +270,33 @@ def _all_columns(state: State) -> State:
 
 
 # --- what is told ---------------------------------------------------------------------------------
-def _drifts(state: State) -> list[Told]:
-    """What monitors and correctors do otherwise than before, with errors."""
-    found: list[Told] = []
-    for block in (0, 1):
-        own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
-        if not own:
-            continue
-        there = linear(state, block)
-        posterior = solve(there.normal, there.groups, there.start, rounds=0)
-        for name, family in own.items():
-            sigma = posterior.sigma[there.where[name]]
-            found += family.told(state.at.errors, state.values[name], sigma, state.data)
-    return found
+def _few_or_all(
+    data: ResponseData,
+    split: Split,
+    trials: Sequence[Trial],
+    effects: Sequence[str] | None,
+    most: int,
+    judgement: Judgement,
+    seed: int,
+    progress: Callable[[str], Any],
+    open_: LeftOpen,
+) -> Few | DenseFit:
+    """The few causes that explain a change, or the fit of everything that may have changed."""
+    asked = changes() if effects is None else effects
+    few = few_causes(data, split, asked, most, judgement, seed, progress, open_)
+    if few is not None and any(is_drift(cause) for cause, _ in few.told):
+        few = None
+    if few is not None and few.noise:
+        return few
+    fit = _fit_change(data, split, trials, progress)
+    return fit if few is None or _knows_more(fit, few.fit) else few
 
 
-def _outstanding(state: State, judgement: Judgement) -> list[Finding]:
-    """Monitors and correctors whose change is another thing than everybody's drift."""
-    told = _drifts(state)
-    found = []
-    for effect in dict.fromkeys(cause.effect for cause, _ in told):
-        rows = [row for row in told if row[0].effect == effect]
-        usual = float(np.median([abs(cause.amount) for cause, _ in rows])) / 0.6745
-        for cause, sigma in rows:
-            size = abs(cause.amount)
-            if size > max(DRIFT, OUTSTANDING * usual) and size > 5 * sigma:
-                square = (size / max(sigma, 1e-12)) ** 2
-                seen = Detection.among(square, len(rows))
-                found.append(
-                    finding_of(state.data.ring, [cause], np.ones(1), [cause], sigma, seen,
-                               judgement.mass)
-                )  # fmt: skip
-    return found
+def _knows_more(fit: DenseFit, few: DenseFit) -> bool:
+    """Whether correctors that were not fitted say that a fit of everything knows more than a few
+    causes, which leave more than noise."""
+    (_, of_all), (_, of_few) = fit.heldout, few.heldout
+    return of_all.in_plane * of_all.coupling < LESS * of_few.in_plane * of_few.coupling
 
 
 def _verdict(state: State) -> str:

@@ -73,6 +73,8 @@ class Few:
         verdict: the least certain of theirs.
         told: the causes with their errors.
         said: what a reader should know.
+        noise: whether what they leave is noise, as much as is stated: no more, and no less, for
+            beside less there is room for other causes.
     """
 
     fit: DenseFit
@@ -80,6 +82,7 @@ class Few:
     verdict: str
     told: list[Told]
     said: tuple[str, ...]
+    noise: bool
 
 
 def few_causes(
@@ -278,4 +281,7 @@ def _told(
     heldout = (score(design, split.held), score(state, split.held))
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
     dense = DenseFit(design, state, tuple(steps), (), heldout)
-    return Few(dense, findings, verdict, list(zip(causes, errors, strict=True)), said)
+    told = list(zip(causes, errors, strict=True))
+    less = float(chi2.sf(found.fit.chi2, count)) > 1 - judgement.noise[1]
+    noise = p_value >= judgement.noise[1] and not less
+    return Few(dense, findings, verdict, told, said, noise)

@@ -1,0 +1,63 @@
+"""What monitors and correctors do otherwise on the second of two days.
+
+Everybody drifts a little; who changed far more than the others is a finding.
+"""
+
+import numpy as np
+
+from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.steps import CHANGES
+from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.result import Finding
+from tmlattice.effects import Cause
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.normal import solve
+from tmlattice.inference.rivals import Detection
+
+DRIFT, OUTSTANDING = 0.03, 8.0
+"""A monitor or a corrector is told where it changed by more than this, and by so many times as much
+as others do."""
+
+
+def drifts(state: State) -> list[Told]:
+    """What monitors and correctors do otherwise than before, with errors."""
+    found: list[Told] = []
+    for block in (0, 1):
+        own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
+        if not own:
+            continue
+        there = linear(state, block)
+        posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        for name, family in own.items():
+            sigma = posterior.sigma[there.where[name]]
+            found += family.told(state.at.errors, state.values[name], sigma, state.data)
+    return found
+
+
+def outstanding(state: State, judgement: Judgement) -> list[Finding]:
+    """Monitors and correctors whose change is another thing than everybody's drift."""
+    told = drifts(state)
+    found = []
+    for effect in dict.fromkeys(cause.effect for cause, _ in told):
+        rows = [row for row in told if row[0].effect == effect]
+        usual = float(np.median([abs(cause.amount) for cause, _ in rows])) / 0.6745
+        for cause, sigma in rows:
+            size = abs(cause.amount)
+            if size > max(DRIFT, OUTSTANDING * usual) and size > 5 * sigma:
+                square = (size / max(sigma, 1e-12)) ** 2
+                seen = Detection.among(square, len(rows))
+                found.append(
+                    finding_of(state.data.ring, [cause], np.ones(1), [cause], sigma, seen,
+                               judgement.mass)
+                )  # fmt: skip
+    return found
+
+
+def is_drift(cause: Cause) -> bool:
+    """Whether it is no more than what monitors and correctors do from day to day: everybody may
+    have it, and the largest of them is no finding."""
+    of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
+               for name in family.effects}  # fmt: skip
+    return cause.effect in of_each and abs(cause.amount) <= DRIFT
