@@ -36,6 +36,9 @@ SHIFT = 0.03
 """Of a tune, at most: who changes a ring in use keeps its tunes."""
 DRIFT = 2e-3
 """rms, relative, of gains and kicks from one day to the other."""
+STRANGE = 0.05
+"""Share of the square of a column, or a monitor, that a multiple of its model leaves where it takes
+no part: what is exchanged, say, would have the change of another one."""
 KICK = 2e-5
 """rad; of AT's steps, small enough for orbits in proportion to them."""
 
@@ -76,7 +79,51 @@ def drawn(ring, rng, null):
     return changes
 
 
-def second_day(measured, ring, known, changes, rng):
+def first_day(ring, measured):
+    """What was measured by what resembles its model, what the model has, and the orbits of that."""
+    found = tmlattice.diagnose(ring, measured)
+    # a spread would take three times the orbits, and changes theirs by next to nothing
+    known = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
+    model = simulated(ring, known, measured)
+    read, told, kicks = as_kicked(measured, model)
+    good = stranger(read, told, 1) < STRANGE
+    correctors = [name for name, own in zip(measured.correctors, good, strict=True) if own]
+    of_plane = [good & (np.array(measured.planes) == plane) for plane in "xy"]
+    left = np.max([stranger(read[own], kicks[own, None] * told[own], 0) for own in of_plane], 0)
+    monitors = [name for name, own in zip(measured.monitors, left, strict=True) if own < STRANGE]
+    measured, model = (own.select(correctors, monitors) for own in (measured, model))
+    return known, measured, model
+
+
+def as_kicked(measured, model):
+    """Readings and model of each column in the plane that it kicks, [column, monitor], and what it
+    has of the model's kick, [column]: held-out correctors have no calibration."""
+    planes = [int(plane == "y") for plane in measured.planes]
+    read, told = (own[np.arange(len(planes)), :, planes]
+                  for own in (measured.response, model.response))  # fmt: skip
+    told = np.where(np.isfinite(read), told, 0.0)
+    read = np.where(np.isfinite(read), read, 0.0)
+    return read, told, (read * told).sum(axis=1) / (told**2).sum(axis=1)
+
+
+def stranger(read, told, axis):
+    """Share of the square that a multiple of the model leaves, of each column or monitor."""
+    both, size, whole = ((a * b).sum(axis=axis) for a, b in
+                         ((read, told), (told, told), (read, read)))  # fmt: skip
+    return 1 - both**2 / np.maximum(size * whole, 1e-300)
+
+
+def simulated(ring, causes, measured):
+    """AT's response with the monitors, the correctors and the RF step of a measurement."""
+    rf = measured.rf
+    made = simulate_response(
+        ring, causes, correctors=list(measured.correctors), kick=KICK, noise=0.0, progress=False,
+        rf_step=0.0 if rf is None or rf.orbit is None else rf.step,
+    ).measured  # fmt: skip
+    return made.select(monitors=measured.monitors)
+
+
+def second_day(measured, ring, known, before, changes, rng):
     """What would have been measured then, of a ring with some causes on the first day."""
     causes = [
         Cause("quadrupole_gradient", piece.name, amount)
@@ -84,23 +131,14 @@ def second_day(measured, ring, known, changes, rng):
         for m in of
         for piece in own[m]
     ]
-    names = list(measured.correctors)
-    rf = measured.rf
-    step = 0.0 if rf is None or rf.orbit is None else rf.step
-    orbits = []
-    for more in ([], causes):
-        made = simulate_response(
-            ring, [*known, *more], correctors=names, kick=KICK, rf_step=step, noise=0.0,
-            progress=False,
-        ).measured.select(monitors=measured.monitors)  # fmt: skip
-        orbits.append(made)
-    before, after = orbits
-    kicks = (np.asarray(measured.kicks) / KICK)[:, None, None]
+    after = simulated(ring, [*known, *causes], measured)
+    kicks = as_kicked(measured, before)[2]
     noise = np.zeros(2) if measured.noise is None else measured.noise
     gain = 1 + DRIFT * rng.standard_normal((len(measured.monitors), 2))
-    scale = 1 + DRIFT * rng.standard_normal((len(names), 1, 1))
-    response = measured.response + (after.response - before.response) * kicks
+    scale = 1 + DRIFT * rng.standard_normal((len(kicks), 1, 1))
+    response = measured.response + (after.response - before.response) * kicks[:, None, None]
     response = gain * scale * response + noise * rng.standard_normal(response.shape)
+    rf = measured.rf
     if rf is not None and rf.orbit is not None:
         orbit = rf.orbit + after.rf.orbit - before.rf.orbit
         rf = replace(rf, orbit=gain * orbit + noise * rng.standard_normal(orbit.shape))
@@ -142,9 +180,7 @@ def cases(name, files, data, place, options):
     """Each as it comes; and the counts."""
     lattice, folder, _ = imported(name, files, data, place, "last")
     ring, measured = tmlattice.load_ring(lattice), read_measurement(folder)
-    found = tmlattice.diagnose(ring, measured)
-    # a spread would take three times the orbits, and changes theirs by next to nothing
-    known = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
+    known, measured, before = first_day(ring, measured)
     total = np.zeros(4, dtype=int)
     every = []
     for case in range(options.first, options.first + options.cases):
@@ -152,7 +188,7 @@ def cases(name, files, data, place, options):
         changes = drawn(ring, rng, options.null)
         begun = time.process_time()
         try:
-            after = second_day(measured, ring, known, changes, rng)
+            after = second_day(measured, ring, known, before, changes, rng)
             begun = time.process_time()
             result = tmlattice.diagnose(ring, after, reference=measured)
         except TmlatticeError as error:
