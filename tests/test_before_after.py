@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 
 from tmlattice import diagnose, load_ring
 from tmlattice.cli.command import tmlattice
+from tmlattice.diagnosis.response import before_after
 from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
@@ -85,6 +87,41 @@ def test_single_magnets_do_not_hide_a_small_change_of_their_supply(small_ring, b
     for place, own in found.items():
         assert abs(own.amount - true[place]) < 4 * own.amount_sigma
         assert own.amount_sigma < 3e-4
+
+
+def test_a_limit_of_findings_does_not_make_the_others_scatter(small_ring, before, after):
+    few = diagnose(small_ring, after, reference=before, max_effects=1)
+    (own,) = few.findings
+    assert own.amount_sigma < 3e-4
+
+
+def test_the_largest_drift_is_no_finding(small_ring, before):
+    """A gain that changed by 0.6 %, where nobody else did, explained all that differs."""
+    drift = Cause("monitor_gain_y", "bpm::6", 0.006)
+    assert (
+        diagnose(small_ring, machine(small_ring, [drift], seed=2), reference=before).findings == ()
+    )
+    broken = Cause("monitor_gain_y", "bpm::6", 0.2)
+    (own,) = diagnose(small_ring, machine(small_ring, [broken], seed=2), reference=before).findings
+    assert (own.effect, own.element) == ("monitor_gain_y", "bpm::6")
+
+
+def test_a_fit_of_everything_is_held_against_few_causes_in_the_planes_that_were_read():
+    """NaN of a plane that nobody read counts for neither."""
+
+    def fit(in_plane, coupling):
+        said = SimpleNamespace(in_plane=in_plane, coupling=coupling)
+        split = SimpleNamespace(held=None)
+        return SimpleNamespace(state=SimpleNamespace(good=None, split=split, said=said))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(before_after, "score", lambda state, held: state.said)
+        patch.setattr(before_after, "replace", lambda state, good: state)
+        knows = before_after._knows_more
+        assert knows(fit(1e-6, np.nan), fit(2e-6, np.nan))
+        assert not knows(fit(2e-6, np.nan), fit(2e-6, np.nan))
+        assert knows(fit(2e-6, 1e-6), fit(2e-6, 2e-6))
+        assert not knows(fit(2e-6, 2e-6), fit(1e-6, 2e-6))
 
 
 def test_the_changed_supply_and_the_changed_magnet_are_found_and_no_other(change):

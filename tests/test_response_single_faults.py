@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.families.orbit_modes import orbit_families
 from tmlattice.diagnosis.response.exchanged import planes_back, swapped
+from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.singled_out import singled_out
@@ -16,7 +17,7 @@ from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import NOISE, simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.orbit_response import Errors, response_data
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 
@@ -81,6 +82,23 @@ def test_a_corrector_that_kicks_the_other_plane_is_turned_and_not_off(
     assert abs(rows["corrector_roll", "v5"] - roll) < 0.05  # as the row of its family says
     assert abs(rows["corrector_calibration", "v5"]) < 0.2  # usual ones are 0.04
     assert not any("wrong sign" in said for said in result.warnings)
+
+
+def test_a_corrector_that_is_off_is_not_turned(small_ring, measured_with):
+    """It kicks in neither plane: what is larger of two noises says nothing."""
+    cause = Cause("corrector_calibration", "v2", -1.0)
+    findings = diagnose(small_ring, measured_with(cause, seed=9)).findings
+    told = [(found.effect, found.element) for found in findings]
+    assert (cause.effect, cause.element) in told
+    assert ("corrector_roll", cause.element) not in told
+    data, _ = parted(small_ring, measured_with(cause, seed=9))
+    errors = Errors.none(data)
+    column = list(data.measured.correctors).index("v2")
+    errors.calibration[column], errors.roll[column] = -0.9995, 0.0008
+    fault = Fault(cause, 0.04, 600.0, 1e-9, (cause,), np.zeros(1))
+    assert as_turned(fault, errors, data).cause == cause
+    errors.roll[column] = 0.9
+    assert as_turned(fault, errors, data).cause.effect == "corrector_roll"
 
 
 def test_a_reversed_monitor_among_usual_errors_is_named(small_ring, measured_with):

@@ -131,6 +131,10 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
     )
 
 
+OFF = 0.1
+"""Share of what a corrector is told, below which what it kicks says nothing of its plane."""
+
+
 @dataclass(frozen=True, eq=False)
 class Errors:
     """What is wrong with monitors, correctors, ring and beam.
@@ -164,8 +168,9 @@ class Errors:
 
     @property
     def turned(self) -> Flags:
-        """Columns of correctors that kick more in the other plane than in their own."""
-        return np.abs(self.roll) > np.abs(1 + self.calibration)
+        """Columns of correctors that kick more in the other plane than in their own, and not next
+        to nothing: these are off."""
+        return np.abs(self.roll) > np.maximum(np.abs(1 + self.calibration), OFF)
 
     @property
     def kick(self) -> Array:

@@ -41,7 +41,7 @@ from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, tri
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
-from tmlattice.diagnosis.response.what_changed import REPRODUCED, what_changed
+from tmlattice.diagnosis.response.what_changed import MOST, REPRODUCED, what_changed
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
@@ -55,8 +55,6 @@ from tmlattice.observe.split import Split, split_columns
 
 Array = NDArray[np.float64]
 
-MOST = 40
-"""Findings at most: many supplies may be changed on purpose."""
 ANY = 6.0
 """rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
@@ -155,7 +153,7 @@ def diagnose_change(
         )  # fmt: skip
     progress("what changed")
     whole = _all_columns(fit.state)
-    changed, scatter = what_changed(whole, max_effects, judgement)
+    changed, scatter = what_changed(whole, judgement)
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
@@ -294,9 +292,11 @@ def _few_or_all(
 
 def _knows_more(fit: DenseFit, few: DenseFit) -> bool:
     """Whether correctors that were not fitted say that a fit of everything knows more than a few
-    causes, which leave more than noise."""
-    (_, of_all), (_, of_few) = fit.heldout, few.heldout
-    return of_all.in_plane * of_all.coupling < LESS * of_few.in_plane * of_few.coupling
+    causes do, of the monitors that it takes for good and the planes that were read."""
+    good = replace(few.state, good=fit.state.good)
+    of_all, of_few = (score(own, own.split.held) for own in (fit.state, good))
+    gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
+    return bool(np.nansum(gained) < np.log(LESS))
 
 
 def _verdict(state: State) -> str:

@@ -45,15 +45,20 @@ class Fault:
         return finding_of(ring, self.rivals, chance, shown, self.sigma, seen, judgement.mass)
 
 
+CLEARLY = 5.0
+"""Errors of what a corrector kicks in the other plane, by which it has to be seen there."""
+
+
 def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
     """A corrector that kicks more in the other plane than in its own, which has one number for
-    each, is told as turned: what its own plane lacks is no calibration."""
+    each, is told as turned: what its own plane lacks is no calibration. One that is off kicks in
+    neither."""
     if fault.cause.effect != "corrector_calibration":
         return fault
     ring, name = data.ring, fault.cause.element
     columns = [ring[own].name for own in data.measured.correctors]
     column = columns.index(ring[name or ""].name)
-    if not errors.turned[column]:
+    if not errors.turned[column] or abs(errors.roll[column]) < CLEARLY * fault.sigma:
         return fault
     roll = Cause("corrector_roll", name, float(errors.angle[column]))
     others = [i for i, own in enumerate(fault.rivals)

@@ -282,6 +282,6 @@ def _told(
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
     dense = DenseFit(design, state, tuple(steps), (), heldout)
     told = list(zip(causes, errors, strict=True))
-    less = float(chi2.sf(found.fit.chi2, count)) > 1 - judgement.noise[1]
+    less = p_value > 1 - judgement.noise[1]
     noise = p_value >= judgement.noise[1] and not less
     return Few(dense, findings, verdict, told, said, noise)

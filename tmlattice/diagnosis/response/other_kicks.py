@@ -85,11 +85,13 @@ def left_in_plane(state: State, suspects: Sequence[int]) -> list[int]:
 
 @dataclass(frozen=True)
 class _Column:
-    """What a column leaves in one plane, m, and the pattern of its own amplitude, [reading]."""
+    """What a column reads, and leaves, in one plane, m, and the pattern of its own amplitude,
+    [reading]."""
 
     column: int
     seen: Indices
     own: Array
+    orbit: Array
     left: Array
 
     @property
@@ -97,6 +99,12 @@ class _Column:
         """Beside its own amplitude."""
         every = np.ones(len(self.left), dtype=bool)
         return rms_of([amplitudes(self.own[:, None], self.left, every, every)[1]])
+
+    @property
+    def explained(self) -> float:
+        """rms of the orbit that its own kick makes: of a corrector that is turned nearly all of it
+        is in the plane across, m."""
+        return float(np.sqrt(np.maximum(np.mean(self.orbit**2) - self.rms**2, 0.0)))
 
 
 def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
@@ -114,7 +122,8 @@ def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
         left = data.orbits[c, :, plane] - kick * at.read[c, :, plane]
         seen = np.flatnonzero(np.isfinite(left) & state.good)
         if len(seen) >= ENOUGH:
-            found.append(_Column(int(c), seen, pattern[c, seen], left[seen]))
+            orbit = data.orbits[c, seen, plane]
+            found.append(_Column(int(c), seen, pattern[c, seen], orbit, left[seen]))
     return found
 
 
@@ -125,7 +134,9 @@ def _of_planes(state: State, kicked: int, plane: int) -> list[OtherKick]:
     data, model = state.data, state.at.model
     sizes = np.array([one.rms for one in columns])
     typical = max(float(np.median(sizes)), float(np.median(data.noise[:, plane])))
-    shares = sizes / orbits_of(state, np.array([one.column for one in columns]))
+    orbits = orbits_of(state, np.array([one.column for one in columns]))
+    explained = np.array([one.explained for one in columns])
+    shares = sizes / np.maximum(orbits, explained)
     usual = float(np.median(shares))  # a larger step leaves more
     odd = [
         one

@@ -55,13 +55,12 @@ def torn(state: State) -> Flags:
 
 
 def orbits_of(state: State, columns: NDArray[np.int64]) -> Array:
-    """rms of what was measured of columns, m, of both planes together, for one that is turned has
-    its orbit in the other; at least the noise, [column]."""
-    read = state.data.orbits[columns][:, state.good]
+    """rms of what was measured of columns in their own plane, m, at least the noise, [column]."""
+    read = state.data.pick(state.data.orbits)[columns][:, state.good]
     noise = float(np.median(state.data.noise))
-    seen = np.isfinite(read).any(axis=2).sum(axis=1)
-    squares = np.nansum(read**2, axis=(1, 2))
-    return np.asarray(np.sqrt(squares / np.maximum(seen, 1) + noise**2))
+    there = np.isfinite(read)
+    squares = np.where(there, read, 0.0) ** 2
+    return np.asarray(np.sqrt(squares.sum(axis=1) / np.maximum(there.sum(axis=1), 1) + noise**2))
 
 
 def _broken(state: State, column: int, plane: int) -> float:

@@ -1,6 +1,6 @@
 """Which supplies, magnets and devices changed: candidates weighed by evidence.
 
->>> findings, scatter = what_changed(state, most, judgement)
+>>> findings, scatter = what_changed(state, judgement)
 
 Magnets of a supply scatter in their change, and by how much says how well a change of a supply is
 known. What a fit of every magnet learns of it has the changes of single magnets in it; so the
@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.findings import finding_of
-from tmlattice.diagnosis.response.rounds import linear, marginal
+from tmlattice.diagnosis.response.rounds import Linear, linear, marginal
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
@@ -29,6 +29,8 @@ from tmlattice.lattice import Ring
 
 Array = NDArray[np.float64]
 
+MOST = 40
+"""Changes of a plane at most: many supplies may be changed on purpose."""
 REPRODUCED = 1e-4
 """Relative: as well a magnet comes back, and half of it a supply; a smaller change is none."""
 STRAY = 3e-5
@@ -60,14 +62,11 @@ class _Weighed:
     evidence: float
 
 
-def what_changed(
-    state: State, most: int, judgement: Judgement
-) -> tuple[list[Finding], float | None]:
-    """Supplies, magnets and devices that changed.
+def what_changed(state: State, judgement: Judgement) -> tuple[list[Finding], float | None]:
+    """Supplies, magnets and devices that changed: all of them, for what is left out is scatter.
 
     Args:
         state: of a fit of the change.
-        most: findings of a plane at most.
         judgement: of the sets of rivals.
 
     Returns:
@@ -81,7 +80,7 @@ def what_changed(
         variables = list(dict.fromkeys(variables))
         if not variables:
             continue
-        scatter, own = _by_evidence(state, block, variables, most)
+        scatter, own = _by_evidence(state, block, variables)
         between = scatter.get(QuadrupoleGradient.name, between)
         found += [
             _finding(state.data.ring, own.among.causes, reason, judgement)
@@ -91,11 +90,12 @@ def what_changed(
 
 
 def _by_evidence(
-    state: State, block: int, variables: Sequence[str], most: int
+    state: State, block: int, variables: Sequence[str]
 ) -> tuple[dict[str, float], _Weighed]:
     """The scatter of each family, at most what a fit of all has learnt, and what is there."""
-    information, pull = marginal(linear(state, block), variables)
-    wider = _widened(state, block)
+    there = linear(state, block)
+    information, pull = marginal(there, variables)
+    wider = _widened(state, block, there)
 
     def weighed(scatter: Mapping[str, float]) -> _Weighed:
         among = _candidates(state, variables, scatter)
@@ -104,7 +104,7 @@ def _by_evidence(
             information / wider**2, pull / wider**2, among.members, among.scatter,
             np.full(len(odds), USUAL), np.array(odds),
         )  # fmt: skip
-        chosen = levels.choose(most)
+        chosen = levels.choose(MOST)
         return _Weighed(among, levels, chosen, levels.background + levels.log_evidence(chosen))
 
     fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}.values()
@@ -145,9 +145,8 @@ def _candidates(
     return _Candidates(tuple(causes), block_diag(*blocks), block_diag(*covariance))
 
 
-def _widened(state: State, block: int) -> float:
+def _widened(state: State, block: int, there: Linear) -> float:
     """By what errors grow, for the noise was learnt from readings that were fitted."""
-    there = linear(state, block)
     posterior = solve(there.normal, there.groups, there.start, rounds=0)
     fitted = float(np.sum(1 - np.diag(posterior.covariance)))
     count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
