@@ -222,12 +222,11 @@ def main():
         sys.exit("set TMLATTICE_DATA to the folder that holds real_rings")
     procedure.LARGE = 0  # the ring alone is wanted of the first day
     known = sources(Path(data))
-    rows = []
     with tempfile.TemporaryDirectory() as place:
-        rows.extend(
+        rows = [
             cases(name, known[name], Path(data), Path(place), options)
             for name in options.rings or known
-        )
+        ]
     print("\n| ring | found | others | pulls, rms | refused |\n|---|---|---|---|---|")
     print("\n".join(rows))
 

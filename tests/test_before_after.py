@@ -112,7 +112,8 @@ def test_a_fit_of_everything_is_held_against_few_causes_in_the_planes_that_were_
     def fit(in_plane, coupling):
         said = SimpleNamespace(in_plane=in_plane, coupling=coupling)
         split = SimpleNamespace(held=None)
-        return SimpleNamespace(state=SimpleNamespace(good=None, split=split, said=said))
+        state = SimpleNamespace(good=None, split=split, said=said)
+        return SimpleNamespace(state=state, heldout=(None, said))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(before_after, "score", lambda state, held: state.said)

@@ -293,8 +293,8 @@ def _few_or_all(
 def _knows_more(fit: DenseFit, few: DenseFit) -> bool:
     """Whether correctors that were not fitted say that a fit of everything knows more than a few
     causes do, of the monitors that it takes for good and the planes that were read."""
-    good = replace(few.state, good=fit.state.good)
-    of_all, of_few = (score(own, own.split.held) for own in (fit.state, good))
+    of_all = fit.heldout[1]
+    of_few = score(replace(few.state, good=fit.state.good), few.state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
     return bool(np.nansum(gained) < np.log(LESS))
 

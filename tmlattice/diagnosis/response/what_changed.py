@@ -7,13 +7,14 @@ known. What a fit of every magnet learns of it has the changes of single magnets
 scatter, too, is what the evidence of the candidates beside it wants.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.findings import finding_of
@@ -76,11 +77,10 @@ def what_changed(state: State, judgement: Judgement) -> tuple[list[Finding], flo
     found: list[Finding] = []
     between = None
     for block in (0, 1):
-        variables = [f.variable for f in state.of_block(block) if f.per == "ring"]
-        variables = list(dict.fromkeys(variables))
-        if not variables:
+        fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}
+        if not fitted:
             continue
-        scatter, own = _by_evidence(state, block, variables)
+        scatter, own = _by_evidence(state, block, fitted)
         between = scatter.get(QuadrupoleGradient.name, between)
         found += [
             _finding(state.data.ring, own.among.causes, reason, judgement)
@@ -90,15 +90,15 @@ def what_changed(state: State, judgement: Judgement) -> tuple[list[Finding], flo
 
 
 def _by_evidence(
-    state: State, block: int, variables: Sequence[str]
+    state: State, block: int, fitted: Mapping[str, Family]
 ) -> tuple[dict[str, float], _Weighed]:
     """The scatter of each family, at most what a fit of all has learnt, and what is there."""
     there = linear(state, block)
-    information, pull = marginal(there, variables)
+    information, pull = marginal(there, list(fitted))
     wider = _widened(state, block, there)
 
     def weighed(scatter: Mapping[str, float]) -> _Weighed:
-        among = _candidates(state, variables, scatter)
+        among = _candidates(state, fitted.values(), scatter)
         odds = [0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]
         levels = Levels(
             information / wider**2, pull / wider**2, among.members, among.scatter,
@@ -107,8 +107,9 @@ def _by_evidence(
         chosen = levels.choose(MOST)
         return _Weighed(among, levels, chosen, levels.background + levels.log_evidence(chosen))
 
-    fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}.values()
-    least = {f.name: REPRODUCED if isinstance(f, QuadrupoleGradient) else STRAY for f in fitted}
+    least = {
+        f.name: REPRODUCED if isinstance(f, QuadrupoleGradient) else STRAY for f in fitted.values()
+    }
     known = {name: group.rms for name, group in state.groups.items()}
     scatter = {name: max(known.get(name, 0.0), lowest) for name, lowest in least.items()}
     best = weighed(scatter)
@@ -123,12 +124,12 @@ def _by_evidence(
 
 
 def _candidates(
-    state: State, variables: Sequence[str], scatter: Mapping[str, float]
+    state: State, fitted: Iterable[Family], scatter: Mapping[str, float]
 ) -> _Candidates:
     causes: list[tuple[str, str]] = []
     blocks: list[Array] = []
     covariance: list[Array] = []
-    for family in {f.variable: f for f in state.families if f.variable in variables}.values():
+    for family in fitted:
         places = family.places(state.data)  # type: ignore[attr-defined]
         own = np.eye(len(places))
         quadrupoles = isinstance(family, QuadrupoleGradient)
