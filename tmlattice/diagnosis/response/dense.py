@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
-from tmlattice.diagnosis.response.jitter import MOSTLY, Jitter, sought
+from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.judges import (
     WORTH,
     Chi2,
     Score,
     against,
-    in_favour,
     inner,
     lost,
     score,
@@ -275,8 +274,7 @@ def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
-    """With a jitter of the beam, where one stands out and those who choose do not object; or where
-    one is seen and they fare better with it."""
+    """With a jitter of the beam, where one stands out and those who choose do not object."""
     moving = sought(state)
     if moving is None:
         return state, None
@@ -285,8 +283,7 @@ def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State,
     with_it = settle(beside_it)
     said = lost(inner(beside_it), inner(with_it))
     log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
-    taken = not against(said, WORTH) if moving.share > MOSTLY else in_favour(said)
-    return (with_it, moving) if taken else (state, None)
+    return (state, None) if against(said, WORTH) else (with_it, moving)
 
 
 def one_by_one(

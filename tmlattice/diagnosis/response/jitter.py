@@ -41,9 +41,6 @@ LEAST = 5.0
 SHARE = 0.25
 """Of what a typical column has left beside its own roll, in the mean square, that a jitter is at
 least: less is not worth a covariance."""
-MOSTLY = 0.5
-"""From which share on it needs no other witness: less may be waves of another origin, whose
-covariance mends nothing."""
 SIZES = np.geomspace(0.01, 3.0, 30)
 """That are tried, in units of what a typical column has left."""
 PASSES = 3
@@ -64,13 +61,10 @@ class Jitter:
         orbits: as large as they typically are, m, [plane that is read, pattern, monitor]; a plane
             with fewer of them has zeros.
         places: magnets behind which a kick makes them, of each plane.
-        share: of what a typical column has left beside its own roll, in the mean square, in the
-            plane where it is less.
     """
 
     orbits: Array
     places: tuple[tuple[str, ...], tuple[str, ...]]
-    share: float
 
     @property
     def planes(self) -> tuple[int, ...]:
@@ -104,23 +98,21 @@ def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
     x, y = (_in_plane(still, plane) if plane in planes else _nothing(state) for plane in (0, 1))
     if not (x.places or y.places):
         return None
-    share = min(own.share for own in (x, y) if own.places)
     orbits = np.zeros((2, max(len(x.places), len(y.places)), len(state.data.at)))
     for plane, own in enumerate((x, y)):
         orbits[plane, : len(own.places)] = own.orbits
-    return Jitter(orbits, (x.places, y.places), share)
+    return Jitter(orbits, (x.places, y.places))
 
 
 class _OfPlane(NamedTuple):
-    """Orbits [pattern, monitor] of one plane, where they come from, their share of what is left."""
+    """Orbits [pattern, monitor] of one plane, and where they come from."""
 
     orbits: Array
     places: tuple[str, ...]
-    share: float
 
 
 def _nothing(state: State) -> _OfPlane:
-    return _OfPlane(np.zeros((0, len(state.data.at))), (), 0.0)
+    return _OfPlane(np.zeros((0, len(state.data.at))), ())
 
 
 def _in_plane(state: State, plane: int) -> _OfPlane:
@@ -154,7 +146,7 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
         return nothing
     log.info("plane %d: %s leave %.3g of %.3g m", plane, places, after, before)
     share = 1 - float((after / before) ** 2)
-    return nothing if share < SHARE else _OfPlane(found, places, share)
+    return nothing if share < SHARE else _OfPlane(found, places)
 
 
 def _weights(seen: Flags, rest: Array, least: Array) -> Array:

@@ -21,8 +21,8 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 reading a monitor), and by how much their sum may fall without a step that stays all the same:
 evidence takes what the model lacks for noise, and gladly fits it."""
 SURELY, WORTH = 1.0, 0.05
-"""Standard errors of a fall, or a rise, from which on it counts; and how much a rise is at least
-that is a reason by itself, or a fall that refuses what most of the readings ask for."""
+"""Standard errors of a fall from which on it counts; and how much one is at least that refuses what
+most of the readings ask for."""
 
 
 class Chi2(NamedTuple):
@@ -229,8 +229,3 @@ def lost(without: Judged, within: Judged) -> tuple[float, float]:
 def against(said: tuple[float, float], least: float = VETO) -> bool:
     """Whether the judges would rather be without, by what `lost` says, and by so much at least."""
     return said[0] < -max(least, SURELY * said[1])
-
-
-def in_favour(said: tuple[float, float]) -> bool:
-    """Whether the judges alone are reason enough, by what `lost` says."""
-    return said[0] > max(WORTH, SURELY * said[1])
