@@ -46,7 +46,8 @@ from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import scan
 from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.measurement import OrbitResponse, TurnByTurn, read_measurement, write_measurement
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.spectra import lines
 from tmlattice.observe.turn_by_turn import many_turns

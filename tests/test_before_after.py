@@ -19,8 +19,9 @@ from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_change import response_change
+from tmlattice.observe.response_data import response_data
 from tmlattice.report.plain import report_text
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
@@ -296,6 +297,6 @@ def test_correctors_of_the_machine_before_kick_as_they_were_fitted(small_ring, b
     calibration, roll = np.zeros((2, len(data.kicks)))
     calibration[[4, 5, 6]], roll[[4, 5, 6]] = (0.01, -2.0, -1.0), (0.05, 0.05, 0.9)
     errors = replace(Errors.none(data), calibration=calibration, roll=roll)
-    _, change = response_change(data, errors, data)
+    change = response_change(data, errors, {}, data).measured
     fitted = Predicted(data, errors).kicked[:-1]
     assert np.abs(change.response - fitted).max() < 1e-5 * np.abs(fitted).max()

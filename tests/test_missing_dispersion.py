@@ -37,7 +37,8 @@ from tmlattice.observe.calibration import (
     read_dispersion,
     write_calibration,
 )
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 STEP = -2000.0

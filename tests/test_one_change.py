@@ -7,13 +7,14 @@ from scipy.stats import multivariate_normal
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.dense import one_by_one
-from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, left_open
+from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, and_orbits, left_open
 from tmlattice.diagnosis.response.one_change import OneChange, _Line
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import split_columns
 
@@ -79,7 +80,7 @@ def test_every_number_of_a_fit_is_told_as_what_it_does(fitted):
 
 def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
     """Against differences of the full model, with the change and without."""
-    whole = left_open(fitted)
+    whole = and_orbits(fitted.data.ring, left_open(fitted))
     alone = np.array([effect != "energy_spread" for effect, _ in whole.hypotheses])
     open_ = LeftOpen(whole.hypotheses, whole.root * alone[:, None])  # that goes with the square
     change = Cause("quadrupole_gradient", "QF::3", 0.01)
@@ -133,6 +134,6 @@ def test_a_supply_of_quadrupoles_is_not_one_of_its_magnets(small_ring, before):
 
 
 def test_a_change_that_readings_do_not_want_is_none(fitted, problem):
-    same = OneChange(Blur(problem, left_open(fitted)))
+    same = OneChange(Blur(problem, and_orbits(fitted.data.ring, left_open(fitted))))
     same.left = np.zeros_like(same.left)
     assert same.likeliest(("quadrupole_gradient", "QF::3")) is None

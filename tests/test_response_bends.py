@@ -13,7 +13,7 @@ from tmlattice.diagnosis.response.told import told
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 GRADIENT = -0.05

@@ -7,7 +7,8 @@ from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.observe.steady import NOTHING

@@ -11,7 +11,8 @@ from tmlattice.diagnosis.families.fields import FocusingChange, QuadrupoleGradie
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response import dense, rounds
 from tmlattice.diagnosis.response.dense import one_by_one
-from tmlattice.diagnosis.response.rounds import linear, one_round
+from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.rounds import one_round
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.effects import Cause
@@ -21,7 +22,8 @@ from tmlattice.inference.normal import Normal, normal_equations, solve
 from tmlattice.inference.priors import Group
 from tmlattice.inference.slopes import Slopes
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, response_data
+from tmlattice.observe.orbit_response import Errors
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 
@@ -239,9 +241,7 @@ def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):
     start, none = np.zeros(size), np.zeros((0, 0))
     normal = Normal(jacobian.T @ jacobian, jacobian.T @ data)
     group = Group("all", np.eye(size), 1.0, fixed=True)
-    there = rounds.Linear(
-        normal, start, np.full(size, 1e9), none, none, none, {}, (group,), {}, lowest
-    )
+    there = Linear(normal, start, np.full(size, 1e9), none, none, none, {}, (group,), {}, lowest)
     found = rounds._within(there, 1.0).values
     referee = lsq_linear(
         np.vstack([jacobian, np.eye(size)]), np.append(data, np.zeros(size)), (lowest, np.inf),

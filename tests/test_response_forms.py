@@ -19,7 +19,7 @@ from tmlattice.diagnosis.response.strangers import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}

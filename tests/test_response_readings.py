@@ -16,10 +16,10 @@ from tmlattice.diagnosis.response.exchanged import (
     monitors_back,
     put_right,
 )
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.odd_readings import odd_readings
 from tmlattice.diagnosis.response.odd_steps import odd_steps
 from tmlattice.diagnosis.response.other_kicks import other_kicks
-from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.strangers import ODD, strangers
@@ -28,7 +28,8 @@ from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 WITH_ROLLS = {"corrector_calibration", "monitor_gain", "quadrupole_gradient", "monitor_roll",

@@ -9,7 +9,7 @@ from tmlattice.diagnosis.families.orbit_modes import orbit_families
 from tmlattice.diagnosis.response.exchanged import planes_back, swapped
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.few import few_causes
-from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.singled_out import singled_out
 from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
 from tmlattice.diagnosis.response.state import begin
@@ -17,7 +17,8 @@ from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import NOISE, simulate_response
-from tmlattice.observe.orbit_response import Errors, response_data
+from tmlattice.observe.orbit_response import Errors
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 

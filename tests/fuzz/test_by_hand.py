@@ -19,7 +19,7 @@ from tmlattice import diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.families.fields import VerticalFocusing
 from tmlattice.diagnosis.families.steps import MonitorGain, Trial
 from tmlattice.diagnosis.response.dense import fit_steps
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 TURNS = ("diagnose", "ring.json", "turns")

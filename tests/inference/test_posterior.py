@@ -22,7 +22,8 @@ from tmlattice.inference.posterior import posterior
 from tmlattice.inference.whitening import Projection
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe import response_metric
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 
 USUAL = background_rms({"all": None})

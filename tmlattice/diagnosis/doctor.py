@@ -37,7 +37,7 @@ from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.evidence import Names, Verdict, certain
 from tmlattice.observe.global_errors import Judge
 from tmlattice.observe.noise import random_part
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_errors import ANOTHER, ResponseJudge, ResponseVerdict
 from tmlattice.observe.sections import Found, Passes
 

@@ -29,8 +29,9 @@ from tmlattice.measurement import (
 )
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import split_columns
 from tmlattice.observe.stored import Kept, Stored

@@ -30,8 +30,9 @@ from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, RfStep, TuneReading
 from tmlattice.measurement import TurnByTurn as Turns
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.spectra import Lines
 from tmlattice.observe.tune_readings import tune_readings

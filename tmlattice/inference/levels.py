@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
+from scipy.special import expit
 
 Array = NDArray[np.float64]
 
@@ -161,11 +162,26 @@ class Levels:
             chosen = [c for i, c in enumerate(chosen) if i != least]
         return chosen
 
+    def averaged(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Amounts of some candidates and their variances, over whether each other one is there
+        beside them: one that is not clear may be, and take its share of them."""
+        amounts, covariance = self.fitted(chosen)
+        gain = self.gains(chosen)[0]
+        there = expit(gain)
+        across = covariance @ self.information[list(chosen)]
+        own = np.diag(self.information) - np.sum(self.information[list(chosen)] * across, axis=0)
+        score = self.score - amounts @ self.information[list(chosen)]
+        moved = -across * (score / (np.maximum(own, 0.0) + self.slab**-2.0))
+        return (
+            amounts + moved @ there,
+            np.diag(covariance) + moved**2 @ (there * (1 - there)),
+        )
+
     def reasons(self, chosen: Sequence[int]) -> list[Reason]:
         """With amounts, errors and rivals, by falling chi-square."""
         if not chosen:
             return []
-        amounts, covariance = self.fitted(chosen)
+        amounts, variance = self.averaged(chosen)
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])
@@ -175,7 +191,7 @@ class Levels:
                           key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
             found.append(
                 Reason(
-                    own, float(amounts[i]), float(np.sqrt(covariance[i, i])), float(square[own]),
+                    own, float(amounts[i]), float(np.sqrt(variance[i])), float(square[own]),
                     tuple((c, float(p)) for c, p in told),
                 )
             )  # fmt: skip

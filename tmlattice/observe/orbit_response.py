@@ -1,12 +1,10 @@
-"""A measured orbit response as a ring has it: data, who judges, readings with errors, and rows.
+"""What is read of an orbit response with errors of ring, monitors, correctors and beam; and rows.
 
 >>> data = response_data(ring, measured)
->>> split = split_columns(data, 0.2, np.random.default_rng(1))
 >>> there = Predicted(data, Errors.none(data))
 >>> data.orbits - there.read                       # what the design leaves, [column, monitor, 2]
 
-A column is a corrector, in the order of the measurement, or the RF, which is the last. Block 0 is
-the plane in which a column kicks, block 1 the other one.
+Columns and blocks are those of `response_data`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,10 +19,7 @@ from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
 from tmlattice.errors import EffectError, UnstableRingError
-from tmlattice.lattice import Ring
-from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.response_noise import learnt_noise
-from tmlattice.observe.response_rf import read
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -36,101 +31,8 @@ DELTA = 1e-3
 the unit in which the spread's is fitted."""
 TURN = 0.1
 """Roll that shows a corrector's kick in the other plane, rad."""
-NO_RF = 1e-6
-"""Relative step of an RF that was not stepped: its orbit is missing."""
 SMALL = 1e-3
 """Of a monitor's largest error: the step of the differences."""
-
-
-@dataclass(frozen=True, eq=False)
-class ResponseData:
-    """A measured response, its monitors in the ring's order.
-
-    Attributes:
-        ring: the design.
-        measured: the response.
-        at: the monitors' places among the ring's, [monitor].
-        orbits: measured orbit changes, the RF's last, m, [column, monitor, 2].
-        kicks: the steps, rad, the RF's relative, [column].
-        plane: in which each column kicks, [column].
-        noise: rms of a reading, m, [monitor, 2].
-    """
-
-    ring: Ring
-    measured: OrbitResponse
-    at: Indices
-    orbits: Array
-    kicks: Array
-    plane: Indices
-    noise: Array
-
-    @property
-    def energy_of_rf(self) -> float:
-        """Relative energy that the RF's step makes in the design."""
-        return float(self.kicks[-1] * self.design.rf_start[5])
-
-    @cached_property
-    def design(self) -> ResponseModel:
-        """Of the ring as it is given; UnstableRingError where it has no closed orbit."""
-        return ResponseModel(self.ring)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Columns, monitors."""
-        return self.orbits.shape[0], self.orbits.shape[1]
-
-    def plane_of(self, block: int) -> Indices:
-        """The plane in which each column is read, [column]."""
-        return self.plane if block == 0 else 1 - self.plane
-
-    def pick(self, values: Array, block: int = 0) -> Array:
-        """One plane of [column, monitor, 2] for each column."""
-        plane = self.plane_of(block)[:, None, None]
-        return np.asarray(np.take_along_axis(values, plane, 2)[..., 0])
-
-    def noise_of(self, block: int) -> Array:
-        """rms of each reading, m, [column, monitor]."""
-        return np.asarray(self.noise[:, self.plane_of(block)].T)
-
-
-def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
-    """What was measured, as the ring has it.
-
-    Without an RF step, or with an orbit of it that no monitor read (`response_rf`), its column is
-    empty, and only priors tell the correctors' scale from the monitors'. Noise that nobody states
-    is learnt, see `response_noise`.
-
-    Raises:
-        MeasurementError: no noise, and too few readings to learn it.
-        UnknownNameError: a monitor that the ring does not have.
-    """
-    names = [monitor.name for monitor in ring.monitors]
-    known = {ring[name].name: name for name in measured.monitors}
-    measured = measured.select(monitors=[known[name] for name in names if name in known])
-    rf = measured.rf
-    if rf is not None and not read(measured):
-        rf = replace(rf, orbit=None)
-        measured = replace(measured, rf=rf)
-    if rf is None or rf.orbit is None or rf.step == 0:
-        step, orbit = NO_RF, np.full((len(measured.monitors), 2), np.nan)
-    else:
-        step, orbit = rf.step / rf.frequency, rf.orbit
-    noise = measured.noise
-    if noise is None or np.isnan(noise).any():
-        learnt = learnt_noise(measured, np.array([ring[name].s for name in measured.monitors]))
-        noise = learnt if noise is None else np.where(np.isnan(noise), learnt, noise)
-    order = {name: i for i, name in enumerate(names)}
-    return ResponseData(
-        ring=ring,
-        measured=measured,
-        at=np.array([order[ring[name].name] for name in measured.monitors]),
-        orbits=np.concatenate([measured.response, orbit[None]]),
-        kicks=np.append(measured.kicks, step),
-        plane=np.append([int(p == "y") for p in measured.planes], 0),
-        noise=noise,
-    )
-
-
 OFF = 0.1
 """Share of what a corrector is told, below which what it kicks says nothing of its plane."""
 
@@ -161,10 +63,19 @@ class Errors:
 
     @classmethod
     def none(cls, data: ResponseData) -> "Errors":
-        """The design."""
+        """The design, with what is known of its dispersion."""
         columns, monitors = data.shape
         eye = np.tile(np.eye(2), (monitors, 1, 1))
-        return cls(eye, np.zeros(columns), np.zeros(columns))
+        none = cls(eye, np.zeros(columns), np.zeros(columns))
+        if not data.dispersion:
+            return none
+        ring, nothing = data.ring, (0.0, 0.0)
+        at_monitors, at_correctors = (
+            np.array([data.dispersion.get(ring[name].name, nothing) for name in names])
+            for names in (data.measured.monitors, data.measured.correctors)
+        )
+        own = at_correctors[np.arange(columns - 1), data.plane[:-1]]
+        return replace(none, dispersion=at_monitors * data.energy_of_rf, at_correctors=own)
 
     @property
     def turned(self) -> Flags:

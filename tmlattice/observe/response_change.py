@@ -1,7 +1,7 @@
 """What changed between two orbit responses of one ring, as a measurement of its own.
 
->>> there, change = response_change(data_before, errors, data_after)
->>> response_data(there, change).orbits            # the model before, and what changed since
+>>> change = response_change(data_before, errors, dispersion, data_after)
+>>> change.orbits                                  # the model before, and what changed since
 
 What the model of the first measurement lacks is in the second one too: it cancels in their
 difference. So the difference is put on top of what the model with the errors of the first says.
@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Errors, ResponseData
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import Beside, ResponseData
 
 Array = NDArray[np.float64]
 
@@ -62,18 +62,19 @@ def _as_the_ring_names_them(ring: Ring, measured: OrbitResponse) -> OrbitRespons
 
 
 def response_change(
-    before: ResponseData, errors: Errors, after: ResponseData
-) -> tuple[Ring, OrbitResponse]:
-    """The ring of the first measurement, and what the second would have been in it.
+    before: ResponseData, errors: Errors, dispersion: Beside, after: ResponseData
+) -> ResponseData:
+    """What the second measurement would have been in the ring of the first.
 
     Args:
         before: of the design; correctors and monitors as in `after`.
         errors: of ring, monitors and correctors, fitted to it.
+        dispersion: beside that of the ring with these, fitted to it.
         after: the second measurement.
 
     Returns:
-        The design with the ring's errors and the correctors' rolls; and a measurement by perfect
-        monitors, with steps as the correctors really made them: the ring's response, and on top of
+        In the design with the ring's errors and the correctors' rolls, a measurement by perfect
+        monitors with steps as the correctors really made them: that ring's response, and on top of
         it the difference of the two.
     """
     columns = before.measured.correctors
@@ -82,23 +83,20 @@ def response_change(
     change = np.einsum("mij,cmj->cmi", mend, after.orbits * scale - before.orbits)
     noise = np.hypot(before.noise, after.noise * np.abs(np.median(scale)))
     noise = np.sqrt(np.einsum("mij,mj->mi", mend**2, noise**2))
-    rolls = _rolls(columns, errors.angle)
-    ring = apply(before.ring, (*errors.ring, *rolls))
-    kicks = before.kicks[:-1] * errors.kick[:-1]
-    model = ResponseModel(ring)
-    response = model.response(columns)[:, before.at] * kicks[:, None, None]
+    kicks = np.append(before.kicks[:-1] * errors.kick[:-1], before.kicks[-1])
+    there = replace(
+        before,
+        ring=apply(before.ring, (*errors.ring, *_rolls(columns, errors.angle))),
+        kicks=kicks,
+        noise=noise,
+        dispersion=dispersion,
+    )
+    orbits = Predicted(there, Errors.none(there)).straight + change
     rf = before.measured.rf
     if rf is not None and rf.orbit is not None:
-        orbit = model.rf_change(before.kicks[-1])[before.at]
-        rf = replace(rf, orbit=orbit + change[-1])
-    measured = replace(
-        before.measured,
-        kicks=kicks,
-        response=response + change[:-1],
-        noise=noise,
-        rf=rf,
-    )
-    return ring, measured
+        rf = replace(rf, orbit=orbits[-1])
+    measured = replace(before.measured, kicks=kicks[:-1], response=orbits[:-1], noise=noise, rf=rf)
+    return replace(there, measured=measured, orbits=orbits)
 
 
 def _rolls(columns: Sequence[str], roll: Array) -> list[Cause]:

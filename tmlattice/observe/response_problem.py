@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, find, modelled
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.problem import Point
-from tmlattice.observe.orbit_response import Predicted, ResponseData
+from tmlattice.observe.orbit_response import Predicted
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_metric import ResponseMetric
 from tmlattice.observe.steady import NOTHING, Steady
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

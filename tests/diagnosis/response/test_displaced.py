@@ -16,7 +16,7 @@ from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause
 from tmlattice.lattice.json_file import save_ring
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 BY = 0.2

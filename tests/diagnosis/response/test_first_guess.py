@@ -14,7 +14,7 @@ from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
 from tmlattice.observe.split import split_columns
 

@@ -12,7 +12,8 @@ from tmlattice.diagnosis.response.dense import fit_steps
 from tmlattice.diagnosis.response.pulled_apart import CLEAR, pulled_apart
 from tmlattice.effects import Cause, apply
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 from tmlattice.report.response_text import pulled_apart_texts
 

@@ -21,7 +21,7 @@ from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 from tmlattice.report.response_text import instead_texts, reason_rows, reasons_sentence
 

@@ -10,14 +10,15 @@ from tmlattice.diagnosis.families.dispersion import USUAL, HorizontalKicks
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.dense import one_by_one
 from tmlattice.diagnosis.response.judges import inner, score
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others, rf_known_to
-from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted, response_data
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
 

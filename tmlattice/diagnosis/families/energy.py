@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.effects import Cause, expected_spread, find
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted, ResponseData
+from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 

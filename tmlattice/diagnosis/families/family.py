@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 Told = tuple[Cause, float]

@@ -17,7 +17,8 @@ from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 

@@ -28,9 +28,10 @@ from tmlattice.diagnosis.families.fields import (
     VerticalFocusing,
 )
 from tmlattice.diagnosis.families.magnets import families
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, Monitors
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 
@@ -68,9 +69,9 @@ class MonitorGain(_Monitors):
 
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
         """All of x, then all of y."""
-        names = data.measured.monitors
+        names, gain = data.measured.monitors, Monitors.of(errors.monitors).gain
         return [
-            (Cause(f"monitor_gain_{p}", name, float(values[2 * i + j])), float(sigma[2 * i + j]))
+            (Cause(f"monitor_gain_{p}", name, float(gain[i, j])), float(sigma[2 * i + j]))
             for j, p in enumerate("xy")
             for i, name in enumerate(names)
         ]
@@ -97,14 +98,13 @@ class MonitorRoll(_Monitors):
         return replace(errors, monitors=monitors)
 
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
-        """x reads (coupling + roll) y, y reads (coupling - roll) x."""
-        gain = np.diagonal(errors.monitors, axis1=1, axis2=2)
-        x, y = (values.reshape(-1, 2) / gain).T
+        """Of small ones x reads (coupling + roll) y, y reads (coupling - roll) x."""
+        monitors = Monitors.of(errors.monitors)
         spread = np.hypot(*sigma.reshape(-1, 2).T) / 2
         return [
             (Cause(effect, name, float(amount[i])), float(spread[i]))
             for i, name in enumerate(data.measured.monitors)
-            for effect, amount in zip(self.effects, ((x - y) / 2, (x + y) / 2), strict=True)
+            for effect, amount in zip(self.effects, (monitors.roll, monitors.coupling), strict=True)
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
@@ -226,6 +226,12 @@ WITHOUT_KICKS = (
 )
 """What a lattice with its monitors and correctors can have wrong. Skew gradients move the tunes to
 second order, which the gradients then take back."""
+
+REFERENCE = (
+    *WITHOUT_KICKS,
+    Trial((HorizontalKicks(),), 2, 0),
+    Trial((VerticalKicks(),), 0, 2),
+)
 
 STEPS = (
     *WITHOUT_KICKS,

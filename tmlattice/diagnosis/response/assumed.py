@@ -7,7 +7,7 @@ import numpy as np
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_noise import learnt_noise
 
 UNDERSTATED = 2.0

@@ -21,22 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.families.dispersion import dispersion_beside
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
+from tmlattice.diagnosis.families.steps import CHANGES, REFERENCE, Trial
 from tmlattice.diagnosis.findings import (
     least_certain,
     strongest_first,
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.dense import DenseFit, Step, one_by_one
+from tmlattice.diagnosis.response.dense import DenseFit, Step, fit_steps, one_by_one
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
 from tmlattice.diagnosis.response.exchanged_since import all_right, since
 from tmlattice.diagnosis.response.few import Few, few_causes
-from tmlattice.diagnosis.response.first_guess import begun
 from tmlattice.diagnosis.response.judges import score
-from tmlattice.diagnosis.response.left_open import LeftOpen, left_open
+from tmlattice.diagnosis.response.left_open import LeftOpen, and_orbits, left_open
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
@@ -49,8 +49,9 @@ from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Predicted, ResponseData, response_data
+from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_change import alike, response_change
+from tmlattice.observe.response_data import ResponseData, response_data
 from tmlattice.observe.split import Split, split_columns
 
 Array = NDArray[np.float64]
@@ -115,9 +116,12 @@ def diagnose_change(
     before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    fitted = _reference(first, split_columns(first, holdout, rng), WITHOUT_KICKS if trials else ())
+    fitted = _reference(
+        first, split_columns(first, holdout, rng), REFERENCE if trials else (), progress
+    )
     bad = ~fitted.good
     errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
+    dispersion = dispersion_beside(fitted.values, fitted.data)
     if bad.any():
         names = np.array(first.measured.monitors)
         said.append(f"monitors left out, bad in the reference: {', '.join(names[bad])}")
@@ -125,7 +129,7 @@ def diagnose_change(
         first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
 
     def change(measured: OrbitResponse) -> ResponseData:
-        return response_data(*response_change(first, errors, response_data(ring, measured)))
+        return response_change(first, errors, dispersion, response_data(ring, measured))
 
     _, data, exchanged_after = all_right(change, second.measured, holdout)
     there = data.ring
@@ -137,9 +141,8 @@ def diagnose_change(
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    fit = _few_or_all(
-        data, split, trials, effects, max_effects, judgement, seed, progress, left_open(fitted)
-    )
+    open_ = left_open(fitted)
+    fit = _few_or_all(data, split, trials, effects, max_effects, judgement, seed, progress, open_)
     if isinstance(fit, Few):
         causes = tuple(cause for cause, _ in fit.told)
         found = strongest_first([*fit.findings, *pairs])
@@ -153,7 +156,7 @@ def diagnose_change(
         )  # fmt: skip
     progress("what changed")
     whole = _all_columns(fit.state)
-    changed, scatter = what_changed(whole, judgement)
+    changed, scatter = what_changed(whole, judgement, open_)
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
@@ -207,17 +210,19 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
     )
 
 
-def _reference(data: ResponseData, split: Split, steps: Sequence[Trial]) -> State:
-    """Everything that a lattice holds, fitted to all of the first measurement: a ring whose
-    dispersion is the measured one, for that is what a changed gradient acts on; kicks would stay
-    behind. The design where that goes astray."""
-    state = replace(begin(data, _judged_by_nobody(split)), exploring=False)
+def _reference(
+    data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
+) -> State:
+    """Everything that is wrong with the ring, fitted to all of the first measurement. The design
+    where that goes astray."""
+    nothing = replace(begin(data, _judged_by_nobody(split)), exploring=False)
+    if not steps:
+        return nothing
     try:
-        for _, settled in one_by_one(begun(state, steps), steps):
-            state = settled
-        return settle(bend(jump(state)))
+        fit = fit_steps(data, split, steps, len(steps), progress)
+        return settle(bend(jump(replace(fit.state, split=_judged_by_nobody(split)), beyond=1.0)))
     except (TmlatticeError, np.linalg.LinAlgError):
-        return state
+        return nothing
 
 
 def _fit_change(
@@ -281,7 +286,9 @@ def _few_or_all(
 ) -> Few | DenseFit:
     """The few causes that explain a change, or the fit of everything that may have changed."""
     asked = changes() if effects is None else effects
-    few = few_causes(data, split, asked, most, judgement, seed, progress, open_)
+    few = few_causes(
+        data, split, asked, most, judgement, seed, progress, and_orbits(data.ring, open_)
+    )
     if few is not None and any(is_drift(cause) for cause, _ in few.told):
         few = None
     if few is not None and few.noise:

@@ -26,17 +26,11 @@ from tmlattice.diagnosis.response.judges import (
     lost,
     score,
 )
+from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.odd_readings import robust
 from tmlattice.diagnosis.response.odd_steps import beside, odd_steps
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
-from tmlattice.diagnosis.response.rounds import (
-    Evidence,
-    Linear,
-    evidence_of,
-    linear,
-    linear_evidence,
-    settle,
-)
+from tmlattice.diagnosis.response.rounds import Evidence, evidence_of, linear_evidence, settle
 from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.state import (
     State,
@@ -48,7 +42,7 @@ from tmlattice.diagnosis.response.state import (
 )
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import Posterior
-from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.steps import CHANGES
 from tmlattice.diagnosis.findings import finding_of
-from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause

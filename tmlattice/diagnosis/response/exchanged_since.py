@@ -14,7 +14,7 @@ from tmlattice.diagnosis.response.exchanged import PutRight, righted, told
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.strangers import strangers
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import split_columns
 
 

@@ -12,7 +12,8 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
-from tmlattice.observe.orbit_response import Errors, ResponseData
+from tmlattice.observe.orbit_response import Errors
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,8 @@ from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.rivals import Detection, leading
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Named, Search, explain
-from tmlattice.observe.orbit_response import Hypothesis, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Hypothesis, Predicted
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.split import Split
 

@@ -20,7 +20,7 @@ from tmlattice.diagnosis.families.magnets import magnets
 from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
 from tmlattice.errors import UnstableRingError
-from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]

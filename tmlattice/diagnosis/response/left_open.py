@@ -12,13 +12,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, background_rms, find
 from tmlattice.inference.among import Blurred
 from tmlattice.inference.normal import solve
 from tmlattice.inference.problem import Hypothesis
+from tmlattice.lattice import Ring
 from tmlattice.observe.response_problem import Response
 
 Array = NDArray[np.float64]
@@ -50,7 +52,7 @@ a change of sextupoles does."""
 
 
 def left_open(state: State) -> LeftOpen:
-    """By a fit that has settled, with its priors; and orbits as large as usual errors make them."""
+    """By a fit that has settled, with its priors."""
     blocks: list[dict[Hypothesis, Array]] = []
     for block in (block for block in (0, 1) if state.of_block(block)):
         there = linear(state, block)
@@ -66,9 +68,6 @@ def left_open(state: State) -> LeftOpen:
                     amounts[hypothesis] = share * number + amounts.get(hypothesis, 0.0)
         if amounts:
             blocks.append(amounts)
-    usual = background_rms(dict.fromkeys(ORBITS))
-    unseen = [(name, place) for name in ORBITS for place in find(name).places(state.data.ring)]
-    blocks += [{h: np.eye(len(unseen))[i] * usual[h[0]] for i, h in enumerate(unseen)}]
     hypotheses = tuple(dict.fromkeys(h for own in blocks for h in own))
     where = {h: i for i, h in enumerate(hypotheses)}
     roots = []
@@ -77,7 +76,41 @@ def left_open(state: State) -> LeftOpen:
         for hypothesis, number in own.items():
             root[where[hypothesis]] = number
         roots.append(root)
-    return LeftOpen(hypotheses, np.hstack(roots))
+    return LeftOpen(hypotheses, np.hstack([np.zeros((len(hypotheses), 0)), *roots]))
+
+
+def and_orbits(ring: Ring, open_: LeftOpen) -> LeftOpen:
+    """With orbits as large as usual errors make them."""
+    usual = background_rms(dict.fromkeys(ORBITS))
+    unseen = [(name, place) for name in ORBITS for place in find(name).places(ring)]
+    alone = np.diag([usual[name] for name, _ in unseen])
+    return LeftOpen((*open_.hypotheses, *unseen), block_diag(open_.root, alone))
+
+
+STRONGEST, HARDLY = 200, 0.1
+"""Errors that are kept where all are too many, and what one has to make of the readings, in units
+of their noise."""
+
+
+def strongest(problem: Response, open_: LeftOpen, causes: Sequence[Cause]) -> LeftOpen:
+    """Of the errors those, with what is known of them together, that move most what causes make of
+    the readings.
+
+    Raises:
+        UnstableRingError: no closed orbit with the causes.
+    """
+    views = problem.view(()), problem.view(causes)
+    slopes = (view.signatures(open_.hypotheses) for view in views)
+    noise = np.broadcast_to(problem.base.data.noise, problem.used.shape)[problem.used]
+    moved = np.array([
+        np.linalg.norm((with_them - without)[problem.used] / noise)
+        for without, with_them in zip(*slopes, strict=True)
+    ])  # fmt: skip
+    moved *= np.sqrt(np.sum(open_.root**2, axis=1))
+    order = np.argsort(-moved, kind="stable")[:STRONGEST]
+    kept = np.sort(order[moved[order] > HARDLY])
+    root = np.linalg.qr(open_.root[kept].T)[1].T
+    return LeftOpen(tuple(open_.hypotheses[i] for i in kept), root)
 
 
 class Blur:

@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
-from tmlattice.diagnosis.response.rounds import linear
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State, rms_of
 from tmlattice.diagnosis.response.weights import weight
 

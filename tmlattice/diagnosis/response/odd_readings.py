@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.state import State
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

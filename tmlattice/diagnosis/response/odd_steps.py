@@ -16,7 +16,7 @@ from tmlattice.diagnosis.response.odd_readings import gross, told_gross
 from tmlattice.diagnosis.response.other_kicks import OtherKick, left_in_plane, other_kicks
 from tmlattice.diagnosis.response.state import State, bend, jump
 from tmlattice.diagnosis.response.torn_steps import torn
-from tmlattice.observe.orbit_response import ResponseData
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

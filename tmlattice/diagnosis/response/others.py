@@ -14,7 +14,8 @@ from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 

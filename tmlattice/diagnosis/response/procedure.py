@@ -58,7 +58,7 @@ from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import response_data
+from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.rf_by_others import rf_fitted
-from tmlattice.diagnosis.response.rounds import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import magnets
-from tmlattice.diagnosis.response.rounds import linear, marginal
+from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from tmlattice.diagnosis.response.rounds import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference.normal import Posterior, solve

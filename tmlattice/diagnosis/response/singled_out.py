@@ -23,8 +23,9 @@ from tmlattice.diagnosis.remedies import remedy_of
 from tmlattice.diagnosis.response.dense import ROUGH, DenseFit, Step, fit_chi2
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.judges import Chi2, score
+from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.others import KINDS, with_number
-from tmlattice.diagnosis.response.rounds import Linear, linear, log_evidence, settle
+from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
 from tmlattice.diagnosis.response.state import Apart, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
@@ -37,7 +38,8 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.inference.rivals import linear_evidence
 from tmlattice.inference.scan import Scan
-from tmlattice.observe.orbit_response import Hypothesis, ResponseData
+from tmlattice.observe.orbit_response import Hypothesis
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import Split
 

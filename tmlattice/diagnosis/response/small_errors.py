@@ -27,13 +27,15 @@ from tmlattice.diagnosis.families.steps import (
     MonitorRoll,
 )
 from tmlattice.diagnosis.response.dense import ROUGH, fit_chi2
-from tmlattice.diagnosis.response.rounds import Linear, log_evidence, settle
+from tmlattice.diagnosis.response.linear import Linear
+from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
 from tmlattice.effects import find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import SMALLEST, Group
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]

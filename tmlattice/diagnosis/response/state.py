@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.priors import GUESSED, Group
-from tmlattice.observe.orbit_response import Errors, Predicted, ResponseData
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
 Array = NDArray[np.float64]

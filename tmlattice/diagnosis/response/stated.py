@@ -8,7 +8,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.rounds import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Apart, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import unknown_sizes

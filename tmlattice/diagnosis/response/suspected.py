@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
-from tmlattice.diagnosis.response.rounds import Linear, gathered, linear
+from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.small_errors import sizes_in
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import weighed, weight

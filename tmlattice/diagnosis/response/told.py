@@ -3,7 +3,7 @@
 import numpy as np
 
 from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.response.rounds import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import stated
 from tmlattice.errors import first_of

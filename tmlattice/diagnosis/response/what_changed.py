@@ -18,15 +18,19 @@ from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.findings import finding_of
-from tmlattice.diagnosis.response.rounds import Linear, linear, marginal
+from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, strongest
+from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.levels import Levels, Reason
 from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_problem import Response
 
 Array = NDArray[np.float64]
 
@@ -40,6 +44,8 @@ USUAL = 1e-2
 """Prior rms of a change: relative, or of integrated gradients in 1/m."""
 ALONE = 2.0
 """Log odds of a supply that changed against one of its magnets alone, or a field elsewhere."""
+AGAIN = 3
+"""How often it is asked anew what changed, beside what the ring's errors make of what was found."""
 FINER = 0.5
 """Steps in which less scatter is tried."""
 
@@ -63,24 +69,62 @@ class _Weighed:
     evidence: float
 
 
-def what_changed(state: State, judgement: Judgement) -> tuple[list[Finding], float | None]:
+def what_changed(
+    state: State, judgement: Judgement, open_: LeftOpen | None = None
+) -> tuple[list[Finding], float | None]:
     """Supplies, magnets and devices that changed: all of them, for what is left out is scatter.
 
     Args:
         state: of a fit of the change.
         judgement: of the sets of rivals.
+        open_: what is not known of the ring that changed; None: it is known.
 
     Returns:
         The findings; and by how much magnets of a supply scatter in their change, rms, relative;
         None where no quadrupoles were fitted.
     """
+    found, between = _found(state, judgement, {})
+    for _ in range(AGAIN):
+        if open_ is None or not found:
+            break
+        before = [(own.effect, own.element) for own in found]
+        try:
+            blurred = _blurred(state, open_, found)
+        except UnstableRingError:  # what was found is too much for the ring
+            break
+        found, between = _found(state, judgement, blurred)
+        if [(own.effect, own.element) for own in found] == before:
+            break
+    return found, between
+
+
+def _blurred(state: State, open_: LeftOpen, found: Sequence[Finding]) -> dict[int, Array]:
+    """What errors of the ring that are not known make of what changed, m, of each block [error,
+    column, monitor]."""
+    data = state.data
+    base = Predicted(data, Errors.none(data)).bend()
+    problem = Response(base=base, used=np.isfinite(data.orbits), places={})
+    causes = [Cause(own.effect or "", own.element, own.amount or 0.0) for own in found]
+    spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
+    return {
+        block: np.array([data.pick(own, block) for own in spread]).reshape(-1, *data.shape)
+        for block in (0, 1)
+    }
+
+
+def _found(
+    state: State, judgement: Judgement, blurred: Mapping[int, Array]
+) -> tuple[list[Finding], float | None]:
     found: list[Finding] = []
     between = None
     for block in (0, 1):
         fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}
         if not fitted:
             continue
-        scatter, own = _by_evidence(state, block, fitted)
+        there = linear(state, block)
+        if block in blurred:
+            there = with_numbers(there, state, block, "left open", blurred[block])
+        scatter, own = _by_evidence(state, block, there, fitted)
         between = scatter.get(QuadrupoleGradient.name, between)
         found += [
             _finding(state.data.ring, own.among.causes, reason, judgement)
@@ -90,10 +134,9 @@ def what_changed(state: State, judgement: Judgement) -> tuple[list[Finding], flo
 
 
 def _by_evidence(
-    state: State, block: int, fitted: Mapping[str, Family]
+    state: State, block: int, there: Linear, fitted: Mapping[str, Family]
 ) -> tuple[dict[str, float], _Weighed]:
     """The scatter of each family, at most what a fit of all has learnt, and what is there."""
-    there = linear(state, block)
     information, pull = marginal(there, list(fitted))
     wider = _widened(state, block, there)
 

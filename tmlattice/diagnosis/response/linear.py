@@ -1,0 +1,218 @@
+"""The readings of a dense fit where it stands: slopes, normal equations, priors.
+
+>>> there = linear(state, 0)
+>>> information, score = marginal(there, ["gradient"])
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.family import Family
+from tmlattice.diagnosis.response.state import Kept, State
+from tmlattice.diagnosis.response.weights import taken, weighed, weight
+from tmlattice.inference.normal import Normal, normal_equations
+from tmlattice.inference.priors import Group
+from tmlattice.inference.slopes import Slopes, whole
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+STILL = 0.05
+"""Share of what is trusted by which the ring moves, in the mean, before rows are taken anew."""
+
+
+def _ring(state: State) -> dict[str, Array]:
+    """The ring's numbers, in units of what a round may move them by."""
+    return {f.variable: state.values[f.variable] / f.trust
+            for f in state.families if f.per == "ring"}  # fmt: skip
+
+
+def _rows(state: State, family: Family) -> Kept:
+    """Of a variable of the ring: those that stand, or new ones."""
+    ring, gain = _ring(state), state.at.gain(family.block)
+    scale = 1 + state.at.errors.calibration
+    kept = state.kept.get(family.variable)
+    if kept is not None and len(kept.rows) == len(ring[family.variable]):
+        moved = np.concatenate([_change(kept.at, ring, name) for name in {**kept.at, **ring}])
+        if np.sqrt(np.mean(moved**2)) < STILL and (kept.scale != 0).all():
+            return kept
+    return Kept(family.rows(state.at, state.values[family.variable]), gain, scale, ring)
+
+
+def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) -> Array:
+    """Of one variable's numbers, of which either may have more: what is not there is zero."""
+    old, new = (one.get(name, np.zeros(0)) for one in (before, now))
+    change = np.zeros(max(len(old), len(new)))
+    change[: len(new)] += new
+    change[: len(old)] -= old
+    return change
+
+
+def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
+    """By what rows that stand are to be multiplied: monitors and correctors have moved."""
+    if (gain == kept.gain).all() and (scale == kept.scale).all():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = gain / kept.gain * (scale / kept.scale)[:, None]
+    return np.where(np.isfinite(share), share, 1.0)
+
+
+class Linear(NamedTuple):
+    """The readings of one block where the fit stands.
+
+    Parameters are those of the monitors, x and y of each; of the columns; and of the ring. One that
+    is as low as it can be, and that the readings would have lower, stays: no prior moves it.
+    """
+
+    normal: Normal
+    start: Array
+    trust: Array
+    by_monitor: Array
+    by_column: Array
+    ring: tuple[Slopes, ...]
+    where: Mapping[str, slice]
+    groups: tuple[Group, ...]
+    kept: Mapping[str, Kept]
+    lowest: Array
+
+    @property
+    def by_ring(self) -> Array:
+        """The ring's rows in one array, [error, column, monitor]: a copy of them."""
+        return whole(self.ring, self.by_monitor.shape)
+
+    def of_column(self, column: int, read: Indices, plane: int) -> Array:
+        """Slopes of some readings of a column that is read in a plane, [reading, parameter]."""
+        columns, monitors = self.by_monitor.shape
+        out = np.zeros((len(read), len(self.start)))
+        out[np.arange(len(read)), 2 * read + plane] = self.by_monitor[column, read]
+        out[:, 2 * monitors + column] = self.by_column[column, read]
+        out[:, 2 * monitors + columns :] = np.concatenate(
+            [np.zeros((0, len(read))), *(own.of(column, read) for own in self.ring)]
+        ).T
+        return out
+
+
+def linear(state: State, block: int) -> Linear:
+    """Normal equations where the fit stands, the parameters there, priors, trusted changes."""
+    data, at = state.data, state.at
+    columns, monitors = data.shape
+    families = state.of_block(block)
+    where: dict[str, slice] = {}
+    rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
+    ring: list[Slopes] = []
+    kept: dict[str, Kept] = {}
+    end = 2 * monitors + columns
+    start, trust = [np.zeros(end)], [np.ones(end)]
+    for family in {f.variable: f for f in families}.values():
+        values = state.values[family.variable]
+        if family.per == "ring":
+            stands = kept[family.variable] = _rows(state, family)
+            share = _now(stands, at.gain(block), 1 + at.errors.calibration)
+            where[family.variable] = slice(end, end + len(values))
+            end += len(values)
+            start.append(values)
+            trust.append(np.full(len(values), family.trust))
+            ring.append(Slopes(stands.rows, share))
+        else:
+            slopes = family.rows(at, values)
+            low = 0 if family.per == "monitor" else 2 * monitors
+            mine = where[family.variable] = slice(low, low + len(values))
+            start[0][mine], trust[0][mine] = values, family.trust
+            rows[family.per] = slopes
+    normal = normal_equations(
+        data.pick(at.left, block), weight(state, block), data.plane_of(block), rows["monitor"],
+        rows["column"], ring, taken(state, block),
+    )  # fmt: skip
+    groups = []
+    lowest = np.full(end, -np.inf)
+    for family in families:
+        lowest[where[family.variable]] = family.lowest(data)
+    begin = np.concatenate(start)
+    free = (begin > lowest) | (normal.vector > 0)
+    for family in families:
+        for own in family.groups(data):
+            basis = np.zeros((end, own.basis.shape[1]))
+            basis[where[family.variable]] = own.basis
+            basis[~free] = 0.0
+            known = state.groups.get(own.name, own)
+            groups.append(
+                replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms,
+                        guessed=state.guessed)
+            )  # fmt: skip
+    for one in (one for one in state.apart if one.block == block and one.variable in where):
+        basis = np.zeros((end, 1))
+        basis[where[one.variable], 0] = one.members
+        groups.append(Group(one.name, basis, one.wide, fixed=True))
+    return Linear(
+        normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], tuple(ring),
+        where, tuple(groups), kept, lowest,
+    )  # fmt: skip
+
+
+def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array) -> Linear:
+    """With more numbers of the ring, each of size 1 by its prior.
+
+    Args:
+        there: `linear` of a block of the state.
+        state, block: as there.
+        name: of their variable.
+        rows: what they do for the readings, m, [number, column, monitor].
+    """
+    before, end = len(there.start), len(there.start) + len(rows)
+    weighted = np.array([weighed(state, block, own) for own in rows]).reshape(rows.shape)
+    plane = state.data.plane_of(block)
+    across = np.array([gathered(there, plane, own) for own in weighted]).reshape(-1, before)
+    more, read = Slopes(rows), Slopes(weighted)
+    own = np.array([read.times(one) for one in rows]).reshape(len(rows), len(rows))
+    matrix = np.block([[there.normal.matrix, across.T], [across, own]])
+    left = np.nan_to_num(state.data.pick(state.at.left, block))
+    groups = [
+        replace(group, basis=np.pad(group.basis, ((0, len(rows)), (0, 0))))
+        for group in there.groups
+    ]
+    basis = np.eye(end)[:, before:]
+    return there._replace(
+        normal=Normal(matrix, np.append(there.normal.vector, read.times(left))),
+        start=np.pad(there.start, (0, len(rows))),
+        trust=np.pad(there.trust, (0, len(rows)), constant_values=1.0),
+        ring=(*there.ring, more),
+        where={**there.where, name: slice(before, end)},
+        groups=(*groups, Group(name, basis, 1.0, fixed=True)),
+        lowest=np.pad(there.lowest, (0, len(rows)), constant_values=-np.inf),
+    )
+
+
+def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
+    """What the readings say of some variables of the ring, all others with their priors taken out.
+
+    Args:
+        there: where the fit stands.
+        names: of variables.
+
+    Returns:
+        Information, and score with all these numbers at zero: their likelihood is
+        exp(score x - x information x / 2).
+    """
+    A = there.normal.matrix
+    said = there.normal.vector + A @ there.start
+    own = np.concatenate([np.arange(len(A))[there.where[name]] for name in names])
+    spread = np.concatenate([group.basis * group.scale for group in there.groups], axis=1)
+    spread = spread[:, ~spread[own].any(axis=0)]
+    inside = spread.T @ A @ spread + np.eye(spread.shape[1])
+    across = A[own] @ spread
+    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ said]))
+    information = A[np.ix_(own, own)] - across @ taken[:, :-1]
+    return (information + information.T) / 2, said[own] - across @ taken[:, -1]
+
+
+def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
+    """J^T of weighted readings [column, monitor] with the slopes of the start, [parameter], each
+    column read in a plane."""
+    by_monitor = there.by_monitor * weighted
+    alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
+    by_column = (there.by_column * weighted).sum(axis=1)
+    return np.concatenate([alone.ravel(), by_column, *(r.times(weighted) for r in there.ring)])

@@ -1,0 +1,124 @@
+"""A measured orbit response as a ring has it.
+
+>>> data = response_data(ring, measured)
+>>> data.orbits                                    # [column, monitor, 2]
+
+A column is a corrector, in the order of the measurement, or the RF, which is the last. Block 0 is
+the plane in which a column kicks, block 1 the other one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.lattice import Ring
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.response_noise import learnt_noise
+from tmlattice.observe.response_rf import read
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Beside = Mapping[str, tuple[float, float]]
+"""Dispersion beside that of a lattice, m per relative energy in x and y, of names."""
+
+NO_RF = 1e-6
+"""Relative step of an RF that was not stepped: its orbit is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseData:
+    """A measured response, its monitors in the ring's order.
+
+    Attributes:
+        ring: the design.
+        measured: the response.
+        at: the monitors' places among the ring's, [monitor].
+        orbits: measured orbit changes, the RF's last, m, [column, monitor, 2].
+        kicks: the steps, rad, the RF's relative, [column].
+        plane: in which each column kicks, [column].
+        noise: rms of a reading, m, [monitor, 2].
+        dispersion: what is known of it that the design does not have, at its monitors and
+            correctors, x and y, m.
+    """
+
+    ring: Ring
+    measured: OrbitResponse
+    at: Indices
+    orbits: Array
+    kicks: Array
+    plane: Indices
+    noise: Array
+    dispersion: Beside = field(default_factory=dict)
+
+    @property
+    def energy_of_rf(self) -> float:
+        """Relative energy that the RF's step makes in the design."""
+        return float(self.kicks[-1] * self.design.rf_start[5])
+
+    @cached_property
+    def design(self) -> ResponseModel:
+        """Of the ring as it is given; UnstableRingError where it has no closed orbit."""
+        return ResponseModel(self.ring)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Columns, monitors."""
+        return self.orbits.shape[0], self.orbits.shape[1]
+
+    def plane_of(self, block: int) -> Indices:
+        """The plane in which each column is read, [column]."""
+        return self.plane if block == 0 else 1 - self.plane
+
+    def pick(self, values: Array, block: int = 0) -> Array:
+        """One plane of [column, monitor, 2] for each column."""
+        plane = self.plane_of(block)[:, None, None]
+        return np.asarray(np.take_along_axis(values, plane, 2)[..., 0])
+
+    def noise_of(self, block: int) -> Array:
+        """rms of each reading, m, [column, monitor]."""
+        return np.asarray(self.noise[:, self.plane_of(block)].T)
+
+
+def response_data(
+    ring: Ring, measured: OrbitResponse, dispersion: Beside | None = None
+) -> ResponseData:
+    """What was measured, as the ring has it.
+
+    Without an RF step, or with an orbit of it that no monitor read (`response_rf`), its column is
+    empty, and only priors tell the correctors' scale from the monitors'. Noise that nobody states
+    is learnt, see `response_noise`.
+
+    Raises:
+        MeasurementError: no noise, and too few readings to learn it.
+        UnknownNameError: a monitor that the ring does not have.
+    """
+    names = [monitor.name for monitor in ring.monitors]
+    known = {ring[name].name: name for name in measured.monitors}
+    measured = measured.select(monitors=[known[name] for name in names if name in known])
+    rf = measured.rf
+    if rf is not None and not read(measured):
+        rf = replace(rf, orbit=None)
+        measured = replace(measured, rf=rf)
+    if rf is None or rf.orbit is None or rf.step == 0:
+        step, orbit = NO_RF, np.full((len(measured.monitors), 2), np.nan)
+    else:
+        step, orbit = rf.step / rf.frequency, rf.orbit
+    noise = measured.noise
+    if noise is None or np.isnan(noise).any():
+        learnt = learnt_noise(measured, np.array([ring[name].s for name in measured.monitors]))
+        noise = learnt if noise is None else np.where(np.isnan(noise), learnt, noise)
+    order = {name: i for i, name in enumerate(names)}
+    return ResponseData(
+        ring=ring,
+        measured=measured,
+        at=np.array([order[ring[name].name] for name in measured.monitors]),
+        orbits=np.concatenate([measured.response, orbit[None]]),
+        kicks=np.append(measured.kicks, step),
+        plane=np.append([int(p == "y") for p in measured.planes], 0),
+        noise=noise,
+        dispersion=dispersion or {},
+    )
