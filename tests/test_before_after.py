@@ -297,6 +297,6 @@ def test_correctors_of_the_machine_before_kick_as_they_were_fitted(small_ring, b
     calibration, roll = np.zeros((2, len(data.kicks)))
     calibration[[4, 5, 6]], roll[[4, 5, 6]] = (0.01, -2.0, -1.0), (0.05, 0.05, 0.9)
     errors = replace(Errors.none(data), calibration=calibration, roll=roll)
-    change = response_change(data, errors, {}, data).measured
+    change = response_change(data, errors, data).measured
     fitted = Predicted(data, errors).kicked[:-1]
     assert np.abs(change.response - fitted).max() < 1e-5 * np.abs(fitted).max()

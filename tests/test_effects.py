@@ -301,6 +301,18 @@ def test_monitor_model_in_the_order_of_the_design_page():
     assert monitors.read(np.array([[x, y]]))[0] == pytest.approx(by_hand[::-1])
 
 
+def test_monitors_are_known_by_what_they_make_of_the_beam(rng):
+    """The inverse of their matrices: reversed ones, and much mixing, too."""
+    given = Monitors.perfect(50)
+    given.gain = rng.choice([1.0, -1.0], (50, 2)) * rng.uniform(0.5, 1.5, (50, 2)) - 1
+    given.roll, given.coupling = rng.uniform(-0.2, 0.2, 50), rng.uniform(-0.5, 0.5, 50)
+    found = Monitors.of(given.matrix())
+    for name in ("gain", "roll", "coupling"):
+        np.testing.assert_allclose(getattr(found, name), getattr(given, name), atol=1e-12)
+    swapped = Monitors.of(np.array([[[0.0, 1.0], [1.0, 0.0]], [[0.9, 1.1], [0.0, 1.0]]]))
+    assert np.isfinite([*swapped.gain.ravel(), *swapped.roll, *swapped.coupling]).all()
+
+
 def test_radiation_vs_published_loss(petra3):
     loss = dict.fromkeys(("bend", "wiggler"), 0.0)
     for element in petra3.elements:

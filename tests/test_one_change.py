@@ -1,22 +1,33 @@
 """One change of a machine that is known with errors: each weighed with what they make of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.families.steps import CHANGES, STEPS
+from tmlattice.diagnosis.response.before_after import ANY
 from tmlattice.diagnosis.response.dense import one_by_one
-from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, and_orbits, left_open
+from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, and_orbits, left_open, strongest
+from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.one_change import OneChange, _Line
+from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.effects import Cause
+from tmlattice.diagnosis.response.weights import weight
+from tmlattice.diagnosis.response.what_changed import what_changed
+from tmlattice.effects import Cause, find
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_change import response_change
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import split_columns
+
+CROWDED = {"QF::2": 0.04, "QF::9": -0.04, "QD::5": -0.04, "QD::12": 0.04}
 
 
 def machine(ring, changes=(), seed=1):
@@ -46,6 +57,20 @@ def problem(small_ring, before):
     data = response_data(small_ring, before)
     used = np.isfinite(data.orbits)
     return Response(base=Predicted(data, Errors.none(data)), used=used, places={"any": 1})
+
+
+@pytest.fixture(scope="module")
+def crowded_change(small_ring, before, fitted):
+    """A fit of a change of four magnets, by 4 %."""
+    changes = [Cause("quadrupole_gradient", name, amount) for name, amount in CROWDED.items()]
+    first, second = (response_data(small_ring, one)
+                     for one in (before, machine(small_ring, changes, seed=2)))  # fmt: skip
+    data = response_change(first, fitted.at.errors, second)
+    split = split_columns(data, 0.2, np.random.default_rng(0))
+    state = begin(data, split)
+    for _, settled in one_by_one(replace(state, exploring=False, guessed=ANY), CHANGES):
+        state = settled
+    return settle(state)
 
 
 def chi2_per_reading(state):
@@ -102,6 +127,58 @@ def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
         slope = (read[True, 1] - read[True, -1] - read[False, 1] + read[False, -1]) / (2 * h)
         size = np.nanmax(np.abs(slope))
         assert np.nanmax(np.abs(of[error] - slope)) < 0.02 * size + 1e-9
+
+
+def test_the_strongest_errors_are_nearly_all_that_a_blur_is(fitted, problem):
+    whole, changes = left_open(fitted), [Cause("quadrupole_gradient", "QF::3", 0.01)]
+    few = strongest(problem, whole, changes)
+    assert len(few.hypotheses) < len(whole.hypotheses) / 2
+    of_all, of_few = (
+        np.sum(np.where(problem.used, Blur(problem, one).of(changes), 0.0) ** 2)
+        for one in (whole, few)
+    )
+    assert of_few == pytest.approx(of_all, rel=0.02)
+
+
+def test_numbers_that_nobody_asks_for_are_a_covariance_of_the_readings(fitted, rng):
+    """Against the inverse of the whole covariance."""
+    there, weights = linear(fitted, 0), weight(fitted, 0)
+    rows = 3e-6 * rng.standard_normal((4, *weights.shape))
+    read = weights > 0
+    plane = fitted.data.plane_of(0)
+    slopes = np.concatenate([
+        there.of_column(c, np.flatnonzero(read[c]), plane[c]) for c in np.flatnonzero(read.any(1))
+    ])  # fmt: skip
+    spread = np.concatenate([rows[:, c, read[c]] for c in np.flatnonzero(read.any(1))], axis=1)
+    inverse = np.linalg.inv(np.diag(1 / weights[read]) + spread.T @ spread)
+    wider = with_numbers(there, fitted, 0, "more", rows).normal
+    n = len(there.start)
+    across, own = wider.matrix[:n, n:], wider.matrix[n:, n:] + np.eye(4)
+    taken = np.linalg.solve(own, np.column_stack([across.T, wider.vector[n:]]))
+    left = fitted.data.pick(fitted.at.left)[read]
+    np.testing.assert_allclose(
+        wider.matrix[:n, :n] - across @ taken[:, :n], slopes.T @ inverse @ slopes,
+        atol=1e-6 * np.abs(wider.matrix).max(),
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        wider.vector[:n] - across @ taken[:, n], slopes.T @ inverse @ left,
+        atol=1e-6 * np.abs(wider.vector[:n]).max(),
+    )  # fmt: skip
+
+
+def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
+    """Amounts were off by three of their errors, of a ring that is known to a per cent."""
+    places = find("quadrupole_gradient").places(small_ring)
+    errors = tuple(("quadrupole_gradient", place) for place in places)
+    of_one, of_twenty = (
+        what_changed(crowded_change, DEFAULT, LeftOpen(errors, size * np.eye(len(places))))[0]
+        for size in (0.01, 0.2)
+    )
+    assert {own.element for own in of_one} == set(CROWDED)
+    pulls = [(own.amount - CROWDED[own.element]) / own.amount_sigma for own in of_one]
+    assert np.abs(pulls).max() < 2.5
+    sure = sum(own.detection.statistic for own in of_one)
+    assert sum(own.detection.statistic for own in of_twenty) < sure / 2
 
 
 def test_the_density_of_a_change_is_a_gaussian_of_its_own_covariance():

@@ -129,3 +129,21 @@ def test_where_nothing_is_there_the_empty_set_is_told():
     sets = likely_sets(own, 7)
     assert sets[0].chosen == ()
     assert over_sets(own, sets) == []
+
+
+def test_amounts_are_told_over_whether_a_neighbour_is_there():
+    """Two numbers that are hardly told apart, one of which is clear: by enumeration."""
+    information = np.array([[4.0, 3.9], [3.9, 4.0]]) * 1e2
+    own = Levels(
+        information, information @ [0.8, 0.5], np.eye(2), np.full(2, 1e-12), np.full(2, 3.0)
+    )
+    alone, both = own.fitted([0]), own.fitted([0, 1])
+    odds = np.exp(own.log_evidence([0, 1]) - own.log_evidence([0]))
+    share = odds / (1 + odds)
+    assert 0.1 < share < 0.9
+    mean = (1 - share) * alone[0][0] + share * both[0][0]
+    beside = share * (1 - share) * (both[0][0] - alone[0][0]) ** 2
+    (amount,), (variance,) = own.averaged([0])
+    assert amount == pytest.approx(mean)
+    assert variance == pytest.approx(alone[1][0, 0] + beside)
+    assert own.reasons([0], alone=False)[0].sigma == pytest.approx(np.sqrt(variance))

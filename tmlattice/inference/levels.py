@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
-from scipy.special import expit
+from scipy.special import logsumexp
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,8 @@ CLEAR = 25.0
 """Chi-square that a reason has to have: five standard deviations."""
 SWEEPS = 5
 """Times that every reason is exchanged against its rivals."""
+SEEN = 1e-6
+"""Share of what is known of a candidate that others have to leave of it."""
 RIVAL = 3.0
 """Log evidence by which a rival may be behind to be told beside a reason: a twentieth."""
 
@@ -117,7 +119,7 @@ class Levels:
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
         square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
-        seen = own > 1e-6 * np.diag(self.information)  # else the chosen ones make it up
+        seen = own > SEEN * np.diag(self.information)  # else the chosen ones make it up
         gain = np.where(seen, gain, 0.0) - self.cost
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
@@ -163,25 +165,32 @@ class Levels:
         return chosen
 
     def averaged(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Amounts of some candidates and their variances, over whether each other one is there
-        beside them: one that is not clear may be, and take its share of them."""
+        """Amounts of some candidates and their variances, over whether they are all, or one more is
+        there that is not clear, and takes its share of them."""
         amounts, covariance = self.fitted(chosen)
         gain = self.gains(chosen)[0]
-        there = expit(gain)
         across = covariance @ self.information[list(chosen)]
         own = np.diag(self.information) - np.sum(self.information[list(chosen)] * across, axis=0)
         score = self.score - amounts @ self.information[list(chosen)]
         moved = -across * (score / (np.maximum(own, 0.0) + self.slab**-2.0))
-        return (
-            amounts + moved @ there,
-            np.diag(covariance) + moved**2 @ (there * (1 - there)),
-        )
+        gain[own <= SEEN * np.diag(self.information)] = -np.inf  # the chosen ones make it up
+        there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
+        more = moved @ there
+        return amounts + more, np.diag(covariance) + moved**2 @ there - more**2
 
-    def reasons(self, chosen: Sequence[int]) -> list[Reason]:
-        """With amounts, errors and rivals, by falling chi-square."""
+    def reasons(self, chosen: Sequence[int], alone: bool = True) -> list[Reason]:
+        """With amounts, errors and rivals, by falling chi-square.
+
+        Args:
+            chosen: all that are there.
+            alone: whether nothing else is there; else one that is not clear may be, see `averaged`.
+        """
         if not chosen:
             return []
-        amounts, variance = self.averaged(chosen)
+        amounts, covariance = self.fitted(chosen)
+        variance = np.diag(covariance)
+        if not alone:
+            amounts, variance = self.averaged(chosen)
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])

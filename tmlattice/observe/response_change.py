@@ -1,6 +1,6 @@
 """What changed between two orbit responses of one ring, as a measurement of its own.
 
->>> change = response_change(data_before, errors, dispersion, data_after)
+>>> change = response_change(data_before, errors, data_after)
 >>> change.orbits                                  # the model before, and what changed since
 
 What the model of the first measurement lacks is in the second one too: it cancels in their
@@ -18,7 +18,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import Beside, ResponseData
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 
@@ -61,15 +61,12 @@ def _as_the_ring_names_them(ring: Ring, measured: OrbitResponse) -> OrbitRespons
     return replace(measured, monitors=monitors, correctors=correctors)
 
 
-def response_change(
-    before: ResponseData, errors: Errors, dispersion: Beside, after: ResponseData
-) -> ResponseData:
+def response_change(before: ResponseData, errors: Errors, after: ResponseData) -> ResponseData:
     """What the second measurement would have been in the ring of the first.
 
     Args:
         before: of the design; correctors and monitors as in `after`.
         errors: of ring, monitors and correctors, fitted to it.
-        dispersion: beside that of the ring with these, fitted to it.
         after: the second measurement.
 
     Returns:
@@ -89,7 +86,6 @@ def response_change(
         ring=apply(before.ring, (*errors.ring, *_rolls(columns, errors.angle))),
         kicks=kicks,
         noise=noise,
-        dispersion=dispersion,
     )
     orbits = Predicted(there, Errors.none(there)).straight + change
     rf = before.measured.rf

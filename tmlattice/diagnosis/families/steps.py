@@ -227,12 +227,6 @@ WITHOUT_KICKS = (
 """What a lattice with its monitors and correctors can have wrong. Skew gradients move the tunes to
 second order, which the gradients then take back."""
 
-REFERENCE = (
-    *WITHOUT_KICKS,
-    Trial((HorizontalKicks(),), 2, 0),
-    Trial((VerticalKicks(),), 0, 2),
-)
-
 STEPS = (
     *WITHOUT_KICKS,
     Trial((HorizontalKicks(),), 2, 0),

@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families.dispersion import dispersion_beside
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, REFERENCE, Trial
+from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import (
     least_certain,
     strongest_first,
@@ -116,12 +115,10 @@ def diagnose_change(
     before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    fitted = _reference(
-        first, split_columns(first, holdout, rng), REFERENCE if trials else (), progress
-    )
+    steps = WITHOUT_KICKS if trials else ()
+    fitted = _reference(first, split_columns(first, holdout, rng), steps, progress)
     bad = ~fitted.good
     errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
-    dispersion = dispersion_beside(fitted.values, fitted.data)
     if bad.any():
         names = np.array(first.measured.monitors)
         said.append(f"monitors left out, bad in the reference: {', '.join(names[bad])}")
@@ -129,7 +126,7 @@ def diagnose_change(
         first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
 
     def change(measured: OrbitResponse) -> ResponseData:
-        return response_change(first, errors, dispersion, response_data(ring, measured))
+        return response_change(first, errors, response_data(ring, measured))
 
     _, data, exchanged_after = all_right(change, second.measured, holdout)
     there = data.ring
@@ -213,8 +210,9 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 def _reference(
     data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
 ) -> State:
-    """Everything that is wrong with the ring, fitted to all of the first measurement. The design
-    where that goes astray."""
+    """What a lattice can have wrong, as one measurement has it, then fitted to all of the first: a
+    ring whose dispersion is the measured one, for that is what a changed gradient acts on; kicks
+    would stay behind. The design where that goes astray."""
     nothing = replace(begin(data, _judged_by_nobody(split)), exploring=False)
     if not steps:
         return nothing

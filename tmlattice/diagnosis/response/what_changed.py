@@ -128,7 +128,7 @@ def _found(
         between = scatter.get(QuadrupoleGradient.name, between)
         found += [
             _finding(state.data.ring, own.among.causes, reason, judgement)
-            for reason in own.levels.reasons(own.chosen)
+            for reason in own.levels.reasons(own.chosen, alone=False)
         ]
     return found, between
 
