@@ -178,7 +178,7 @@ def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
     pulls = [(own.amount - CROWDED[own.element]) / own.amount_sigma for own in of_one]
     assert np.abs(pulls).max() < 2.5
     sure = sum(own.detection.statistic for own in of_one)
-    assert sum(own.detection.statistic for own in of_twenty) < sure / 2
+    assert sum(own.detection.statistic for own in of_twenty) < 0.75 * sure
 
 
 def test_the_density_of_a_change_is_a_gaussian_of_its_own_covariance():
