@@ -145,5 +145,6 @@ def test_amounts_are_told_over_whether_a_neighbour_is_there():
     beside = share * (1 - share) * (both[0][0] - alone[0][0]) ** 2
     (amount,), (variance,) = own.averaged([0])
     assert amount == pytest.approx(mean)
-    assert variance == pytest.approx(alone[1][0, 0] + beside)
+    within = (1 - share) * alone[1][0, 0] + share * both[1][0, 0]
+    assert variance == pytest.approx(within + beside)
     assert own.reasons([0], alone=False)[0].sigma == pytest.approx(np.sqrt(variance))

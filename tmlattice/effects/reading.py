@@ -43,17 +43,15 @@ class Monitors:
     @classmethod
     def of(cls, matrix: Array) -> "Monitors":
         """Monitors with d reading / d beam [monitor, 2, 2], none of them swapped: the inverse of
-        `matrix`, to first order for one that reads more of the other plane than of its own."""
+        `matrix`. One that reads nothing of a plane in that plane has a gain of -1 there."""
         found = cls.perfect(len(matrix))
         own, other = matrix[:, [0, 1], [0, 1]], matrix[:, [0, 1], [1, 0]]
-        exact = np.all(np.abs(other) < np.abs(own), axis=1, keepdims=True)
-        share = np.divide(other, own, out=np.zeros_like(own), where=own != 0)
-        angle = np.where(exact, np.arctan(share), share)
-        found.roll, mixed = (angle[:, 0] - angle[:, 1]) / 2, (angle[:, 0] + angle[:, 1]) / 2
-        found.coupling = np.where(exact[:, 0], np.tan(mixed), mixed)
+        angle = np.arctan(np.divide(other, own, out=np.zeros_like(own), where=own != 0))
+        found.roll = (angle[:, 0] - angle[:, 1]) / 2
+        found.coupling = np.tan((angle[:, 0] + angle[:, 1]) / 2)
         # a row of C Rot(roll) is as long as one of C
-        length = np.sign(own) * np.hypot(own, other) / np.hypot(1, found.coupling)[:, None]
-        found.gain = np.where(exact, length, own) - 1
+        longer = np.hypot(1, found.coupling)[:, None]
+        found.gain = np.sign(own) * np.hypot(own, other) / longer - 1
         return found
 
     def copy(self) -> "Monitors":

@@ -172,11 +172,13 @@ class Levels:
         across = covariance @ self.information[list(chosen)]
         own = np.diag(self.information) - np.sum(self.information[list(chosen)] * across, axis=0)
         score = self.score - amounts @ self.information[list(chosen)]
-        moved = -across * (score / (np.maximum(own, 0.0) + self.slab**-2.0))
+        spread = np.maximum(own, 0.0) + self.slab**-2.0
+        moved = -across * (score / spread)
         gain[own <= SEEN * np.diag(self.information)] = -np.inf  # the chosen ones make it up
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
-        return amounts + more, np.diag(covariance) + moved**2 @ there - more**2
+        wider = np.diag(covariance) + (moved**2 + across**2 / spread) @ there
+        return amounts + more, wider - more**2
 
     def reasons(self, chosen: Sequence[int], alone: bool = True) -> list[Reason]:
         """With amounts, errors and rivals, by falling chi-square.

@@ -31,9 +31,12 @@ class Slopes(NamedTuple):
     now: Array | None = None
 
     def times(self, readings: Array) -> Array:
-        """Readings [column, monitor] times what each error does for them, summed, [error]."""
+        """Readings [..., column, monitor] times what each error does for them, summed, [error,
+        ...]."""
         own = readings if self.now is None else self.now * readings
-        return np.asarray(self.rows.reshape(len(self.rows), own.size) @ own.ravel())
+        flat = self.rows.reshape(len(self.rows), -1)
+        summed = flat @ own.reshape(-1, flat.shape[1]).T
+        return np.asarray(summed.reshape(len(self.rows), *readings.shape[:-2]))
 
     def of(self, column: int, monitor: Indices) -> Array:
         """Of some readings of a column, [error, reading]."""

@@ -71,7 +71,9 @@ class Errors:
             return none
         ring, nothing = data.ring, (0.0, 0.0)
         at_monitors, at_correctors = (
-            np.array([data.dispersion.get(ring[name].name, nothing) for name in names])
+            np.array([data.dispersion.get(ring[name].name, nothing) for name in names]).reshape(
+                -1, 2
+            )
             for names in (data.measured.monitors, data.measured.correctors)
         )
         own = at_correctors[np.arange(columns - 1), data.plane[:-1]]

@@ -81,6 +81,10 @@ class MonitorGain(_Monitors):
         return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
 
 
+LEAST_GAIN = 1e-3
+"""Of a monitor that has an angle."""
+
+
 class MonitorRoll(_Monitors):
     """What each plane of a monitor reads of the other: roll and coupling."""
 
@@ -100,7 +104,8 @@ class MonitorRoll(_Monitors):
     def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
         """Of small ones x reads (coupling + roll) y, y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
-        spread = np.hypot(*sigma.reshape(-1, 2).T) / 2
+        own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
+        spread = np.hypot(*(sigma.reshape(-1, 2) / own).T) / 2
         return [
             (Cause(effect, name, float(amount[i])), float(spread[i]))
             for i, name in enumerate(data.measured.monitors)

@@ -48,7 +48,7 @@ from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Predicted
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_change import alike, response_change
 from tmlattice.observe.response_data import ResponseData, response_data
 from tmlattice.observe.split import Split, split_columns
@@ -116,14 +116,9 @@ def diagnose_change(
     progress("the reference")
     rng = np.random.default_rng(seed)
     steps = WITHOUT_KICKS if trials else ()
-    fitted = _reference(first, split_columns(first, holdout, rng), steps, progress)
-    bad = ~fitted.good
-    errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
-    if bad.any():
-        names = np.array(first.measured.monitors)
-        said.append(f"monitors left out, bad in the reference: {', '.join(names[bad])}")
-        kept = names[fitted.good].tolist()
-        first, second = (response_data(ring, one.select(monitors=kept)) for one in (before, after))
+    fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
+    said += more
+    first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
 
     def change(measured: OrbitResponse) -> ResponseData:
         return response_change(first, errors, response_data(ring, measured))
@@ -209,18 +204,36 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 
 def _reference(
     data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
-) -> State:
+) -> tuple[State, list[str]]:
     """What a lattice can have wrong, as one measurement has it, then fitted to all of the first: a
     ring whose dispersion is the measured one, for that is what a changed gradient acts on; kicks
-    would stay behind. The design where that goes astray."""
+    would stay behind. The design where that goes astray. And what is to be said of it."""
     nothing = replace(begin(data, _judged_by_nobody(split)), exploring=False)
     if not steps:
-        return nothing
+        return nothing, []
     try:
         fit = fit_steps(data, split, steps, len(steps), progress)
-        return settle(bend(jump(replace(fit.state, split=_judged_by_nobody(split)), beyond=1.0)))
+        whole = replace(fit.state, split=_judged_by_nobody(split))
+        return settle(bend(jump(whole, beyond=1.0))), [
+            f"of the reference: {own}" for own in fit.said
+        ]
     except (TmlatticeError, np.linalg.LinAlgError):
-        return nothing
+        return nothing, ["the reference could not be fitted: the change is one of the design"]
+
+
+def _by_good_monitors(
+    ring: Ring, fitted: State, before: OrbitResponse, after: OrbitResponse, said: list[str]
+) -> tuple[ResponseData, ResponseData, Errors]:
+    """Both measurements, and what is wrong with the first, without monitors that are bad in it, and
+    without its odd readings; which ones goes to what is `said`."""
+    errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
+    if not fitted.good.all():
+        names = np.array(fitted.data.measured.monitors)
+        said.append(f"monitors left out, bad in the reference: {', '.join(names[~fitted.good])}")
+        kept = names[fitted.good].tolist()
+        before, after = (one.select(monitors=kept) for one in (before, after))
+    first, second = (response_data(ring, one) for one in (before, after))
+    return replace(first, orbits=fitted.data.orbits[:, fitted.good]), second, errors
 
 
 def _fit_change(

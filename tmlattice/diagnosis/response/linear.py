@@ -164,10 +164,13 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
     """
     before, end = len(there.start), len(there.start) + len(rows)
     weighted = np.array([weighed(state, block, own) for own in rows]).reshape(rows.shape)
-    plane = state.data.plane_of(block)
-    across = np.array([gathered(there, plane, own) for own in weighted]).reshape(-1, before)
+    plane, no_ring = state.data.plane_of(block), there._replace(ring=())
+    beside = [gathered(no_ring, plane, own) for own in weighted]
+    across = np.concatenate([
+        np.array(beside).reshape(len(rows), -1), *(own.times(weighted).T for own in there.ring)
+    ], axis=1)  # fmt: skip
     more, read = Slopes(rows), Slopes(weighted)
-    own = np.array([read.times(one) for one in rows]).reshape(len(rows), len(rows))
+    own = read.times(rows)
     matrix = np.block([[there.normal.matrix, across.T], [across, own]])
     left = np.nan_to_num(state.data.pick(state.at.left, block))
     groups = [

@@ -1,6 +1,6 @@
 """Which supplies, magnets and devices changed: candidates weighed by evidence.
 
->>> findings, scatter = what_changed(state, judgement)
+>>> findings, scatter = what_changed(state, judgement, left_open(reference))
 
 Magnets of a supply scatter in their change, and by how much says how well a change of a supply is
 known. What a fit of every magnet learns of it has the changes of single magnets in it; so the
@@ -87,13 +87,13 @@ def what_changed(
     for _ in range(AGAIN):
         if open_ is None or not found:
             break
-        before = [(own.effect, own.element) for own in found]
+        before = {(own.effect, own.element) for own in found}
         try:
             blurred = _blurred(state, open_, found)
         except UnstableRingError:  # what was found is too much for the ring
             break
         found, between = _found(state, judgement, blurred)
-        if [(own.effect, own.element) for own in found] == before:
+        if {(own.effect, own.element) for own in found} == before:
             break
     return found, between
 
