@@ -3,7 +3,8 @@
 A change between two measurements is seen in the machine that was fitted to the first one, whose
 numbers are known with errors. What is not known of them moves no reading by itself, for it was
 there before; but it moves what the change makes of the readings, by as much as the change is large.
-So far the readings are blurred (`inference.among.Blurred`): amounts, rivals and statistics know it.
+So far the readings are blurred: amounts, rivals and statistics know it, of one change
+(`inference.among.Blurred`) and of many (`linear.with_numbers`).
 """
 
 from collections.abc import Sequence
