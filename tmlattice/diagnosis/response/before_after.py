@@ -6,10 +6,10 @@
 The ring, its monitors and its correctors are fitted to the first measurement; what that leaves is
 in both and cancels in their difference (`observe.response_change`), which is fitted in turn. Drifts
 of monitors and correctors, whose sizes are learnt, are nuisances. Magnets scatter, too: how far
-those of one supply differ in their change is learnt, and is in the error of every amount, as is what
-the fit of the first leaves open (`left_open`). Findings are supplies (magnets whose names begin alike), single
-magnets, gradients in sextupoles and wigglers (of the orbit there), and insertion devices: by
-evidence, see `inference.levels`.
+those of one supply differ in their change is learnt, and is in the error of every amount, as is
+what the fit of the first leaves open (`left_open`). Findings are supplies (magnets whose names
+begin alike), single magnets, gradients in sextupoles and wigglers (of the orbit there), and
+insertion devices: by evidence, see `inference.levels`.
 """
 
 import time
