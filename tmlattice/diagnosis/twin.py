@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.families.dispersion import errors_beside
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
@@ -25,7 +26,7 @@ from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.posterior import posterior
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
-from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 
@@ -89,7 +90,7 @@ def _together(
 ) -> Known:
     """All small errors that the readings of a response allow, about its dense fit."""
     ring = diagnosis.ring
-    data = response_data(ring, view.measured, diagnosis.dispersion)
+    data = response_data(ring, view.measured)
     # what the model lacks is no noise, but without it all would be known better than it is
     lacks = np.sqrt(max(diagnosis.fit_after.chi2_per_dof, 1.0))
     data = replace(data, noise=data.noise * lacks)
@@ -104,7 +105,7 @@ def _together(
                for name, _ in more}  # fmt: skip
     usual, everywhere = {**usual, **scatter}, [*everywhere, *more]
     problem = Response(
-        base=Predicted(data, Errors.none(data)).bend(),
+        base=Predicted(data, errors_beside(data, diagnosis.dispersion)).bend(),
         used=np.isfinite(data.orbits) & view.good[:, None],
         places={},
         fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),

@@ -107,15 +107,18 @@ class Levels:
         known = np.maximum(known, 0)
         return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
 
+    def _beside(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+        """What is left of each candidate's score and information beside some, and by what a unit of
+        it lessens the amounts of these, [chosen, candidate]."""
+        amounts, covariance = self.fitted(chosen)
+        across = self.information[:, list(chosen)]
+        lessened = covariance @ across.T
+        own = np.diag(self.information) - np.einsum("ij,ji->i", across, lessened)
+        return self.score - across @ amounts, np.maximum(own, 0.0), lessened
+
     def gains(self, chosen: Sequence[int]) -> tuple[Array, Array]:
         """Log evidence of one more of each candidate beside some, and its chi-square."""
-        score, own = self.score, np.diag(self.information)
-        if len(chosen):
-            amounts, covariance = self.fitted(chosen)
-            across = self.information[:, list(chosen)]
-            score = score - across @ amounts
-            own = own - np.einsum("ij,ij->i", across @ covariance, across)
-        own = np.maximum(own, 0.0)
+        score, own, _ = self._beside(chosen)
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
         square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
@@ -168,16 +171,14 @@ class Levels:
         """Amounts of some candidates and their variances, over whether they are all, or one more is
         there that is not clear, and takes its share of them."""
         amounts, covariance = self.fitted(chosen)
+        score, own, lessened = self._beside(chosen)
+        spread = own + self.slab**-2.0
+        moved = -lessened * (score / spread)
         gain = self.gains(chosen)[0]
-        across = covariance @ self.information[list(chosen)]
-        own = np.diag(self.information) - np.sum(self.information[list(chosen)] * across, axis=0)
-        score = self.score - amounts @ self.information[list(chosen)]
-        spread = np.maximum(own, 0.0) + self.slab**-2.0
-        moved = -across * (score / spread)
         gain[own <= SEEN * np.diag(self.information)] = -np.inf  # the chosen ones make it up
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
-        wider = np.diag(covariance) + (moved**2 + across**2 / spread) @ there
+        wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
         return amounts + more, wider - more**2
 
     def reasons(self, chosen: Sequence[int], alone: bool = True) -> list[Reason]:

@@ -63,21 +63,10 @@ class Errors:
 
     @classmethod
     def none(cls, data: ResponseData) -> "Errors":
-        """The design, with what is known of its dispersion."""
+        """The design."""
         columns, monitors = data.shape
         eye = np.tile(np.eye(2), (monitors, 1, 1))
-        none = cls(eye, np.zeros(columns), np.zeros(columns))
-        if not data.dispersion:
-            return none
-        ring, nothing = data.ring, (0.0, 0.0)
-        at_monitors, at_correctors = (
-            np.array([data.dispersion.get(ring[name].name, nothing) for name in names]).reshape(
-                -1, 2
-            )
-            for names in (data.measured.monitors, data.measured.correctors)
-        )
-        own = at_correctors[np.arange(columns - 1), data.plane[:-1]]
-        return replace(none, dispersion=at_monitors * data.energy_of_rf, at_correctors=own)
+        return cls(eye, np.zeros(columns), np.zeros(columns))
 
     @property
     def turned(self) -> Flags:

@@ -7,8 +7,7 @@ A column is a corrector, in the order of the measurement, or the RF, which is th
 the plane in which a column kicks, block 1 the other one.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,8 +21,6 @@ from tmlattice.observe.response_rf import read
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Beside = Mapping[str, tuple[float, float]]
-"""Dispersion beside that of a lattice, m per relative energy in x and y, of names."""
 
 NO_RF = 1e-6
 """Relative step of an RF that was not stepped: its orbit is missing."""
@@ -41,8 +38,6 @@ class ResponseData:
         kicks: the steps, rad, the RF's relative, [column].
         plane: in which each column kicks, [column].
         noise: rms of a reading, m, [monitor, 2].
-        dispersion: what is known of it that the design does not have, at its monitors and
-            correctors, x and y, m.
     """
 
     ring: Ring
@@ -52,7 +47,6 @@ class ResponseData:
     kicks: Array
     plane: Indices
     noise: Array
-    dispersion: Beside = field(default_factory=dict)
 
     @property
     def energy_of_rf(self) -> float:
@@ -83,9 +77,7 @@ class ResponseData:
         return np.asarray(self.noise[:, self.plane_of(block)].T)
 
 
-def response_data(
-    ring: Ring, measured: OrbitResponse, dispersion: Beside | None = None
-) -> ResponseData:
+def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
     """What was measured, as the ring has it.
 
     Without an RF step, or with an orbit of it that no monitor read (`response_rf`), its column is
@@ -120,5 +112,4 @@ def response_data(
         kicks=np.append(measured.kicks, step),
         plane=np.append([int(p == "y") for p in measured.planes], 0),
         noise=noise,
-        dispersion=dispersion or {},
     )

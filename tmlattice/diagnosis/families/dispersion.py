@@ -17,7 +17,7 @@ from tmlattice.beam.kicks import dispersion_behind, dispersion_of_kicks, energy_
 from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
-from tmlattice.observe.response_data import Beside, ResponseData
+from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 
@@ -154,9 +154,11 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
             )
 
 
-def dispersion_beside(values: Mapping[str, Array], data: ResponseData) -> Beside:
-    """What was found beside the lattice's dispersion, at all monitors and correctors of the ring,
-    with what was known before; empty where nothing was.
+def dispersion_beside(
+    values: Mapping[str, Array], data: ResponseData
+) -> dict[str, tuple[float, float]]:
+    """What was found beside the lattice's dispersion, at all monitors and correctors of the ring, m
+    per relative energy in x and y; empty where nothing was.
 
     Args:
         values: that were found, by variable.
@@ -168,15 +170,29 @@ def dispersion_beside(values: Mapping[str, Array], data: ResponseData) -> Beside
         if values.get(family.variable, np.zeros(0)).any()
     ]
     if not found:
-        return data.dispersion
+        return {}
     model = data.design
     columns = model.columns()
     names = [*model.monitors, *columns.names]
-    dispersion = np.array([data.dispersion.get(name, (0.0, 0.0)) for name in names])
+    dispersion = np.zeros((len(names), 2))
     for family, own in found:
         kicks = own @ family.patterns(data).kicks
-        dispersion[:, family.plane] += np.concatenate([
+        dispersion[:, family.plane] = np.concatenate([
             dispersion_of_kicks(model, data.kicks[-1], family.plane) / data.energy_of_rf,
             dispersion_behind(model, columns.layer, family.plane),
         ]) @ kicks  # fmt: skip
     return {name: (float(x), float(y)) for name, (x, y) in zip(names, dispersion, strict=True)}
+
+
+def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
+    """The design with what `dispersion_beside` says, as other correctors and monitors have it."""
+    none = Errors.none(data)
+    if not dispersion:
+        return none
+    ring, nothing = data.ring, (0.0, 0.0)
+    monitors, correctors = (
+        np.array([dispersion.get(ring[name].name, nothing) for name in names])
+        for names in (data.measured.monitors, data.measured.correctors)
+    )
+    own = correctors[np.arange(len(correctors)), data.plane[:-1]]
+    return replace(none, dispersion=monitors * data.energy_of_rf, at_correctors=own)

@@ -148,7 +148,7 @@ def diagnose_change(
             provenance=provenance(ring, options, seed, started),
         )  # fmt: skip
     progress("what changed")
-    whole = _all_columns(fit.state)
+    whole = settle(_all_columns(fit.state))
     changed, scatter = what_changed(whole, judgement, open_)
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
@@ -214,10 +214,8 @@ def _reference(
         return nothing, []
     try:
         fit = fit_steps(data, split, steps, len(steps), progress)
-        whole = replace(fit.state, split=_judged_by_nobody(split))
-        return settle(bend(jump(whole, beyond=1.0))), [
-            f"of the reference: {own}" for own in fit.said
-        ]
+        said = [f"of the reference: {own}" for own in fit.said]
+        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), said
     except (TmlatticeError, np.linalg.LinAlgError):
         return nothing, ["the reference could not be fitted: the change is one of the design"]
 
@@ -280,8 +278,8 @@ def _with_noise(state: State, noise: Array) -> State:
 
 
 def _all_columns(state: State) -> State:
-    """Fitted to the held-out correctors too."""
-    return settle(replace(state, split=_judged_by_nobody(state.split)))
+    """To be fitted to the held-out correctors too."""
+    return replace(state, split=_judged_by_nobody(state.split))
 
 
 # --- what is told ---------------------------------------------------------------------------------

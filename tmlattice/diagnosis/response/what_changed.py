@@ -84,26 +84,27 @@ def what_changed(
         None where no quadrupoles were fitted.
     """
     found, between = _found(state, judgement, {})
+    if open_ is None or not found:
+        return found, between
+    data = state.data
+    base = Predicted(data, Errors.none(data)).bend()
+    problem = Response(base=base, used=np.isfinite(data.orbits), places={})
     for _ in range(AGAIN):
-        if open_ is None or not found:
-            break
         before = {(own.effect, own.element) for own in found}
         try:
-            blurred = _blurred(state, open_, found)
+            blurred = _blurred(problem, open_, found)
         except UnstableRingError:  # what was found is too much for the ring
             break
         found, between = _found(state, judgement, blurred)
-        if {(own.effect, own.element) for own in found} == before:
+        if not found or {(own.effect, own.element) for own in found} == before:
             break
     return found, between
 
 
-def _blurred(state: State, open_: LeftOpen, found: Sequence[Finding]) -> dict[int, Array]:
+def _blurred(problem: Response, open_: LeftOpen, found: Sequence[Finding]) -> dict[int, Array]:
     """What errors of the ring that are not known make of what changed, m, of each block [error,
     column, monitor]."""
-    data = state.data
-    base = Predicted(data, Errors.none(data)).bend()
-    problem = Response(base=base, used=np.isfinite(data.orbits), places={})
+    data = problem.base.data
     causes = [Cause(own.effect or "", own.element, own.amount or 0.0) for own in found]
     spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
     return {
