@@ -86,6 +86,15 @@ class Few:
     noise: bool
 
 
+@dataclass(frozen=True)
+class _Few(Search):
+    """Attributes:
+    stated: chi-square that the stated noise leaves at most.
+    """
+
+    stated: float = -np.inf
+
+
 def few_causes(
     data: ResponseData,
     split: Split,
@@ -126,11 +135,12 @@ def few_causes(
     count = int(problem.used.sum())
     number = min(most, MOST)
     gap = max(before.chi2 - count, 1.0)
-    enough = float(chi2.isf(judgement.noise[1], count))
-    enough = max(enough, min(NOISE * count, count + REST * gap))
-    search = Search(
-        problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
-    )
+    stated = float(chi2.isf(judgement.noise[1], count))
+    enough = max(stated, min(NOISE * count, count + REST * gap))
+    search = _Few(
+        problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress,
+        stated=stated,
+    )  # fmt: skip
     try:
         found = _explained(search, problem, before, number, gap)
     except UnstableRingError:  # a few causes lead to where no beam is stored
@@ -143,7 +153,7 @@ def few_causes(
 
 
 def _explained(
-    search: Search, problem: Response, before: Fit, number: int, gap: float
+    search: "_Few", problem: Response, before: Fit, number: int, gap: float
 ) -> Explanation | None:
     """Few causes in the ring as it is known; None where so few do not explain it."""
     if _hopeless(problem, search.hypotheses, before, number, search.enough):
@@ -155,14 +165,22 @@ def _explained(
         if _hopeless(problem, search.hypotheses, found.fit, number - 1, search.enough):
             return None
         found = explain(replace(search, most=number), before, found)
-    return None if found.fit.chi2 > search.enough else found
+    return None if found.fit.chi2 > search.enough else _and_more(search, number, before, found)
+
+
+def _and_more(search: "_Few", number: int, before: Fit, found: Explanation) -> Explanation:
+    """With causes that are seen beside what explains the readings: where what is left is noise as
+    it is stated, what stands out of it is one."""
+    if found.fit.chi2 > search.stated:
+        return found
+    return explain(replace(search, most=number, enough=-np.inf), before, found)
 
 
 def _among_open(
-    search: Search, plain: Response, before: Fit, found: Explanation | None, open_: LeftOpen
+    search: "_Few", plain: Response, before: Fit, found: Explanation | None, open_: LeftOpen
 ) -> Explanation | None:
-    """The same where what causes do is known no better than the ring is: one cause where one is
-    likelier than what was found, else what was found."""
+    """The same where what causes do is known no better than the ring is: one cause, and what is
+    seen beside it, where that is likelier than what was found, else what was found."""
     seen = found.first if found else scan(
         plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
     )  # fmt: skip
@@ -196,20 +214,23 @@ def _among_open(
     if not tried:
         return found
     nothing = np.zeros(plain.valid.shape, dtype=bool)
-    return Explanation(
+    one = Explanation(
         plain, tried[0].fit, nothing, (Named(detection, tried),),
         before=before, first=seen, scan=seen,
     )  # fmt: skip
+    more, evidence = _unsure(search, blur, one)
+    several = len(more.fit.causes) > 1 and evidence > one.fit.log_evidence
+    return more if several else one
 
 
-def _unsure(search: Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
+def _unsure(search: "_Few", blur: Blur, found: Explanation) -> tuple[Explanation, float]:
     """The search repeated among what is open of what was found; and its log evidence."""
     evidence = -np.inf
     for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))
-        again = explain(
-            replace(search, problem=problem, most=MOST), fit(problem, (), problem.first)
-        )
+        there = replace(search, problem=problem, most=MOST)
+        again = explain(there, fit(problem, (), problem.first))
+        again = _and_more(there, MOST, again.before, again)
         if not again.fit.causes or again.fit.chi2 > search.enough:
             break
         same, found = again.names == found.names, again
