@@ -13,7 +13,7 @@ from tmlattice.diagnosis.response import dense, rounds
 from tmlattice.diagnosis.response.dense import one_by_one
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.rounds import one_round
-from tmlattice.diagnosis.response.state import allow, begin
+from tmlattice.diagnosis.response.state import State, allow, begin
 from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
@@ -282,6 +282,46 @@ def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
     monkeypatch.setattr(dense, "_title", str)
     state = SimpleNamespace(good=None, independent=None)
     assert dense._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})
+
+
+@pytest.mark.parametrize(
+    ("quickly", "judges", "worth"),
+    [
+        (50.0, (0.14, 0.01), 50.0),  # the beam's energy at PETRA III
+        (-1.0, (0.14, 0.01), -25.0),
+        (50.0, (0.005, 0.01), -25.0),
+        (50.0, (-0.14, 0.01), -25.0),
+    ],
+)
+def test_judges_and_linear_evidence_outweigh_that_of_two_fits(monkeypatch, quickly, judges, worth):
+    """Fits that settle each by itself are twenty apart for nothing."""
+    logs = {"with": 0.0, "without": 25.0 - dense.LEAST}
+    there, without = (
+        SimpleNamespace(name=name, good=np.ones(1, dtype=bool), independent=None) for name in logs
+    )
+    monkeypatch.setattr(dense, "_quickly", lambda *_: ({"energy": quickly}, {"energy": False}))
+    monkeypatch.setattr(dense, "_without", lambda *_: without)
+    monkeypatch.setattr(
+        dense, "evidence_of", lambda state, *_: SimpleNamespace(log=logs[state.name])
+    )
+    monkeypatch.setattr(dense, "_of_rf", lambda *_: None)
+    monkeypatch.setattr(dense, "inner", lambda *_: None)
+    monkeypatch.setattr(dense, "lost", lambda *_: judges)
+    monkeypatch.setattr(dense, "_title", str)
+    monkeypatch.setattr(dense, "_asked", lambda _: True)
+    assert dense._worth(there, ["energy"], lambda stage: None)[0] == {"energy": worth}
+
+
+def test_a_jitter_is_looked_for_again_beside_itself(monkeypatch):
+    """The ring's errors had taken some of the first."""
+    found = [SimpleNamespace(orbits=orbits, sentence="") for orbits in (1, 2)]
+    monkeypatch.setattr(dense, "sought", lambda _: found.pop(0))
+    monkeypatch.setattr(dense, "settle", lambda state: state)
+    monkeypatch.setattr(dense, "inner", lambda _: None)
+    monkeypatch.setattr(dense, "lost", lambda *_: (0.1, 0.01))
+    state, moving = dense._beside_jitter(State(*[None] * 5), lambda stage: None)
+    assert moving is not None
+    assert moving.orbits == state.jitter == 2
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from tmlattice.diagnosis.response.judges import (
     Chi2,
     Score,
     against,
+    in_favour,
     inner,
     lost,
     score,
@@ -273,8 +274,10 @@ def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State,
     if moving is None:
         return state, None
     progress("jitter of the beam")
+    with_it = settle(replace(state, jitter=moving.orbits))
+    moving = sought(with_it) or moving  # the ring's errors had taken some of it
     beside_it = replace(state, jitter=moving.orbits)
-    with_it = settle(beside_it)
+    with_it = settle(replace(with_it, jitter=moving.orbits))
     said = lost(inner(beside_it), inner(with_it))
     log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
     return (state, None) if against(said, WORTH) else (with_it, moving)
@@ -311,7 +314,8 @@ def _worth(
     states without them.
 
     Correctors that were not fitted have the veto: evidence takes readings for independent, which
-    what the model lacks is not.
+    what the model lacks is not. Where they want what the evidence linear about the fit wants too,
+    it is needed: two fits that settled each by itself compare to a share of their cost alone.
     """
     worth, judged = _quickly(state, trials, progress)
     doubtful = [
@@ -336,7 +340,10 @@ def _worth(
         gained = with_it.log - other.log - LEAST
         said = lost(inner(without, _of_rf(other)), inner(state, _of_rf(with_it)))
         log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
-        worth[trial] = min(gained, said[0]) if _asked(trial) and against(said) else gained
+        if _asked(trial) and against(said):
+            worth[trial] = min(gained, said[0])
+        elif not (_asked(trial) and in_favour(said) and worth[trial] > 0):
+            worth[trial] = gained
     return worth, states
 
 

@@ -229,3 +229,8 @@ def lost(without: Judged, within: Judged) -> tuple[float, float]:
 def against(said: tuple[float, float], least: float = VETO) -> bool:
     """Whether the judges would rather be without, by what `lost` says, and by so much at least."""
     return said[0] < -max(least, SURELY * said[1])
+
+
+def in_favour(said: tuple[float, float]) -> bool:
+    """Whether they would rather be with, likewise."""
+    return against((-said[0], said[1]))
