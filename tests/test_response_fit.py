@@ -280,29 +280,33 @@ def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
     monkeypatch.setattr(dense, "_without", lost)
     monkeypatch.setattr(dense, "evidence_of", lambda *_: None)
     monkeypatch.setattr(dense, "_title", str)
-    state = SimpleNamespace(good=None, independent=None)
+    data = SimpleNamespace(orbits=np.zeros((2, 2)))
+    state = SimpleNamespace(data=data, fitted=slice(None), good=None, independent=None)
     assert dense._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})
 
 
 @pytest.mark.parametrize(
-    ("quickly", "judges", "worth"),
+    ("quickly", "settled", "judges", "worth"),
     [
-        (50.0, (0.14, 0.01), 50.0),  # the beam's energy at PETRA III
-        (-1.0, (0.14, 0.01), -25.0),
-        (50.0, (0.005, 0.01), -25.0),
-        (50.0, (-0.14, 0.01), -25.0),
+        (50.0, -25.0, (0.14, 0.01), 50.0),  # the beam's energy at PETRA III
+        (5.0, 85.0, (0.14, 0.01), 85.0),
+        (50.0, -5000.0, (0.14, 0.01), -5000.0),
+        (50.0, -25.0, (0.005, 0.01), -25.0),
+        (50.0, 10.0, (-0.14, 0.01), -0.14),
     ],
 )
-def test_judges_and_linear_evidence_outweigh_that_of_two_fits(monkeypatch, quickly, judges, worth):
+def test_judges_and_linear_evidence_outweigh_that_of_two_fits(
+    monkeypatch, quickly, settled, judges, worth
+):
     """Fits that settle each by itself are twenty apart for nothing."""
-    logs = {"with": 0.0, "without": 25.0 - dense.LEAST}
-    there, without = (
-        SimpleNamespace(name=name, good=np.ones(1, dtype=bool), independent=None) for name in logs
-    )
+    logs = {"with": settled + dense.LEAST, "without": 0.0}
+    data, none = SimpleNamespace(orbits=np.zeros((100, 35))), np.zeros(100, dtype=bool)
+    split = SimpleNamespace(held=none, inner=none)
+    there, without = (State(data, split, None, name, np.ones(1, dtype=bool)) for name in logs)
     monkeypatch.setattr(dense, "_quickly", lambda *_: ({"energy": quickly}, {"energy": False}))
     monkeypatch.setattr(dense, "_without", lambda *_: without)
     monkeypatch.setattr(
-        dense, "evidence_of", lambda state, *_: SimpleNamespace(log=logs[state.name])
+        dense, "evidence_of", lambda own, *_: SimpleNamespace(log=logs[own.lacking])
     )
     monkeypatch.setattr(dense, "_of_rf", lambda *_: None)
     monkeypatch.setattr(dense, "inner", lambda *_: None)
@@ -315,7 +319,7 @@ def test_judges_and_linear_evidence_outweigh_that_of_two_fits(monkeypatch, quick
 def test_a_jitter_is_looked_for_again_beside_itself(monkeypatch):
     """The ring's errors had taken some of the first."""
     found = [SimpleNamespace(orbits=orbits, sentence="") for orbits in (1, 2)]
-    monkeypatch.setattr(dense, "sought", lambda _: found.pop(0))
+    monkeypatch.setattr(dense, "sought", lambda state: found[0 if state.jitter is None else 1])
     monkeypatch.setattr(dense, "settle", lambda state: state)
     monkeypatch.setattr(dense, "inner", lambda _: None)
     monkeypatch.setattr(dense, "lost", lambda *_: (0.1, 0.01))

@@ -42,7 +42,7 @@ from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.response.what_changed import MOST, REPRODUCED, what_changed
-from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
@@ -135,10 +135,11 @@ def diagnose_change(
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
     open_ = left_open(fitted)
-    fit = _few_or_all(data, split, trials, effects, max_effects, judgement, seed, progress, open_)
+    fit = _few_or_all(data, split, trials, effects, judgement, seed, progress, open_)
     if isinstance(fit, Few):
         causes = tuple(cause for cause, _ in fit.told)
-        found = strongest_first([*fit.findings, *pairs])
+        sought = [own for own in fit.findings if not is_drift(_cause_of(own))]
+        found = strongest_first([*sought[:max_effects], *pairs])
         return as_diagnosis(
             there, fit.fit, fit.fit.state.at.errors.ring, fit.told,
             verdict=least_certain(found, fit.verdict),
@@ -153,7 +154,7 @@ def diagnose_change(
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
-    causes = tuple(Cause(own.effect or "", own.element, own.amount or 0.0) for own in named)
+    causes = tuple(_cause_of(own) for own in named)
     known = [own.amount_sigma or 0.0 for own in named]
     told: list[Told] = list(zip(causes, known, strict=True))
     found = strongest_first([*named, *pairs])
@@ -282,13 +283,16 @@ def _all_columns(state: State) -> State:
     return replace(state, split=_judged_by_nobody(state.split))
 
 
+def _cause_of(own: Finding) -> Cause:
+    return Cause(own.effect or "", own.element, own.amount or 0.0)
+
+
 # --- what is told ---------------------------------------------------------------------------------
 def _few_or_all(
     data: ResponseData,
     split: Split,
     trials: Sequence[Trial],
     effects: Sequence[str] | None,
-    most: int,
     judgement: Judgement,
     seed: int,
     progress: Callable[[str], Any],
@@ -297,9 +301,9 @@ def _few_or_all(
     """The few causes that explain a change, or the fit of everything that may have changed."""
     asked = changes() if effects is None else effects
     few = few_causes(
-        data, split, asked, most, judgement, seed, progress, and_orbits(data.ring, open_)
+        data, split, asked, MOST, judgement, seed, progress, and_orbits(data.ring, open_)
     )
-    if few is not None and any(is_drift(cause) for cause, _ in few.told):
+    if few is not None and all(is_drift(cause) for cause, _ in few.told):
         few = None
     if few is not None and few.noise:
         return few

@@ -269,15 +269,17 @@ def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
-    """With a jitter of the beam, where one stands out and those who choose do not object."""
+    """With a jitter of the beam, where one stands out and those who choose do not object. It is
+    looked for again beside the first, of which the ring's errors had taken some."""
     moving = sought(state)
     if moving is None:
         return state, None
     progress("jitter of the beam")
     with_it = settle(replace(state, jitter=moving.orbits))
-    moving = sought(with_it) or moving  # the ring's errors had taken some of it
+    again = sought(with_it)
+    if again is not None:
+        moving, with_it = again, settle(replace(with_it, jitter=again.orbits))
     beside_it = replace(state, jitter=moving.orbits)
-    with_it = settle(replace(with_it, jitter=moving.orbits))
     said = lost(inner(beside_it), inner(with_it))
     log.info("%s: judges %+.3f +- %.3f", moving.sentence, *said)
     return (state, None) if against(said, WORTH) else (with_it, moving)
@@ -315,7 +317,7 @@ def _worth(
 
     Correctors that were not fitted have the veto: evidence takes readings for independent, which
     what the model lacks is not. Where they want what the evidence linear about the fit wants too,
-    it is needed: two fits that settled each by itself compare to a share of their cost alone.
+    that stands, for two fits that settled each by itself compare to a share of their cost alone.
     """
     worth, judged = _quickly(state, trials, progress)
     doubtful = [
@@ -327,6 +329,7 @@ def _worth(
         return worth, states
     shares = state.independent
     whole = evidence_of(state, state.good, shares)
+    unsure = ROUGH * np.count_nonzero(np.isfinite(state.data.orbits[state.fitted])) / 2
     for trial in doubtful:
         progress(f"without {_title(trial)}")
         try:
@@ -338,11 +341,16 @@ def _worth(
         with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
         other = evidence_of(without, good, shares)
         gained = with_it.log - other.log - LEAST
-        said = lost(inner(without, _of_rf(other)), inner(state, _of_rf(with_it)))
+        said = lost(
+            inner(replace(without, good=good), _of_rf(other)),
+            inner(replace(state, good=good), _of_rf(with_it)),
+        )
         log.info("without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *said)
-        if _asked(trial) and against(said):
+        if not _asked(trial):
+            worth[trial] = gained
+        elif against(said):
             worth[trial] = min(gained, said[0])
-        elif not (_asked(trial) and in_favour(said) and worth[trial] > 0):
+        elif not (in_favour(said) and worth[trial] > gained > -unsure):
             worth[trial] = gained
     return worth, states
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.findings import findings_of, verdict_of
+from tmlattice.diagnosis.findings import findings_of, strongest_first, verdict_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen
@@ -38,6 +38,10 @@ Flags = NDArray[np.bool_]
 
 MOST = 3
 """More causes are not few: each costs a search of its own."""
+
+RARER = 100.0
+"""Each cause beyond the first is so many times less likely than the one before: what another one of
+them makes is known in part, and what is left of it looks like one more."""
 
 NOISE, REST = 1.5, 0.01
 """Where what is left is more than noise, a few causes explain a response if they leave less than
@@ -87,9 +91,11 @@ class Few:
 
 
 @dataclass(frozen=True)
-class _Few(Search):
-    """Attributes:
-    stated: chi-square that the stated noise leaves at most.
+class _Search(Search):
+    """A search for one cause first, and for some more where one is not all.
+
+    Attributes:
+        stated: chi-square that the stated noise leaves at most.
     """
 
     stated: float = -np.inf
@@ -129,55 +135,54 @@ def few_causes(
         used=_used(data, split),
         places=places,
         rare=rare(data.ring, list(places)),
-        judgement=judgement,
+        judgement=replace(judgement, rarer=RARER),
     )
     before = fit(problem, (), problem.first)
     count = int(problem.used.sum())
-    number = min(most, MOST)
     gap = max(before.chi2 - count, 1.0)
     stated = float(chi2.isf(judgement.noise[1], count))
     enough = max(stated, min(NOISE * count, count + REST * gap))
-    search = _Few(
+    search = _Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress,
         stated=stated,
     )  # fmt: skip
     try:
-        found = _explained(search, problem, before, number, gap)
+        found = _explained(search, problem, before, gap)
     except UnstableRingError:  # a few causes lead to where no beam is stored
         found = None
     if open_ is not None and open_.root.size and open_.size(problem) <= BLURRED:
         found = _among_open(search, problem, before, found, open_)
     if found is None:
         return None
-    return _told(data, split, problem.base, found, count, judgement)
+    return _told(data, split, problem.base, found, count, most, judgement)
 
 
-def _explained(
-    search: "_Few", problem: Response, before: Fit, number: int, gap: float
-) -> Explanation | None:
+def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> Explanation | None:
     """Few causes in the ring as it is known; None where so few do not explain it."""
-    if _hopeless(problem, search.hypotheses, before, number, search.enough):
+    if _hopeless(problem, search.hypotheses, before, MOST, search.enough):
         return None
     found = explain(search, before)
-    if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * number):
+    if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * MOST):
         return None  # the strongest of a few would explain its share
-    if found.fit.chi2 > search.enough and number > 1:
-        if _hopeless(problem, search.hypotheses, found.fit, number - 1, search.enough):
+    if found.fit.chi2 > search.enough:
+        if _hopeless(problem, search.hypotheses, found.fit, MOST - 1, search.enough):
             return None
-        found = explain(replace(search, most=number), before, found)
-    return None if found.fit.chi2 > search.enough else _and_more(search, number, before, found)
+        found = explain(replace(search, most=MOST), before, found)
+    return None if found.fit.chi2 > search.enough else _and_more(search, before, found)
 
 
-def _and_more(search: "_Few", number: int, before: Fit, found: Explanation) -> Explanation:
-    """With causes that are seen beside what explains the readings: where what is left is noise as
-    it is stated, what stands out of it is one."""
-    if found.fit.chi2 > search.stated:
+def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
+    """With causes that are seen beside what explains the readings, if what they leave together is
+    noise as it is stated: what stands out of more than that may be anything."""
+    try:
+        more = explain(replace(search, most=MOST, enough=-np.inf), before, found)
+    except UnstableRingError:  # one of them stores no beam
         return found
-    return explain(replace(search, most=number, enough=-np.inf), before, found)
+    return more if more.fit.chi2 <= search.stated else found
 
 
 def _among_open(
-    search: "_Few", plain: Response, before: Fit, found: Explanation | None, open_: LeftOpen
+    search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: LeftOpen
 ) -> Explanation | None:
     """The same where what causes do is known no better than the ring is: one cause, and what is
     seen beside it, where that is likelier than what was found, else what was found."""
@@ -223,16 +228,17 @@ def _among_open(
     return more if several else one
 
 
-def _unsure(search: "_Few", blur: Blur, found: Explanation) -> tuple[Explanation, float]:
-    """The search repeated among what is open of what was found; and its log evidence."""
+def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
+    """The search repeated among what is open of what was found; and its log evidence, if it still
+    explains the readings there."""
     evidence = -np.inf
     for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))
         there = replace(search, problem=problem, most=MOST)
         again = explain(there, fit(problem, (), problem.first))
-        again = _and_more(there, MOST, again.before, again)
         if not again.fit.causes or again.fit.chi2 > search.enough:
-            break
+            return found, -np.inf
+        again = _and_more(there, again.before, again)
         same, found = again.names == found.names, again
         evidence = problem.log_scale + found.fit.log_evidence
         if same:
@@ -285,6 +291,7 @@ def _told(
     base: Predicted,
     found: Explanation,
     count: int,
+    most: int,
     judgement: Judgement,
 ) -> Few:
     causes = found.fit.causes
@@ -306,4 +313,4 @@ def _told(
     told = list(zip(causes, errors, strict=True))
     less = p_value > 1 - judgement.noise[1]
     noise = p_value >= judgement.noise[1] and not less
-    return Few(dense, findings, verdict, told, said, noise)
+    return Few(dense, tuple(strongest_first(findings)[:most]), verdict, told, said, noise)

@@ -162,6 +162,8 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
         name: of their variable.
         rows: what they do for the readings, m, [number, column, monitor].
     """
+    if not len(rows):
+        return there
     before, end = len(there.start), len(there.start) + len(rows)
     weighted = np.array([weighed(state, block, own) for own in rows]).reshape(rows.shape)
     plane, no_ring = state.data.plane_of(block), there._replace(ring=())
