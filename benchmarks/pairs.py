@@ -79,6 +79,16 @@ def drawn(ring, rng, null):
     return changes
 
 
+def causes_of(changes):
+    """What `drawn` says, piece by piece."""
+    return [
+        Cause("quadrupole_gradient", piece.name, amount)
+        for _, amount, _, own, of in changes
+        for m in of
+        for piece in own[m]
+    ]
+
+
 def first_day(ring, measured):
     """What was measured by what resembles its model, what the model has, and the orbits of that."""
     found = tmlattice.diagnose(ring, measured)
@@ -125,13 +135,7 @@ def simulated(ring, causes, measured):
 
 def second_day(measured, ring, known, before, changes, rng):
     """What would have been measured then, of a ring with some causes on the first day."""
-    causes = [
-        Cause("quadrupole_gradient", piece.name, amount)
-        for _, amount, _, own, of in changes
-        for m in of
-        for piece in own[m]
-    ]
-    after = simulated(ring, [*known, *causes], measured)
+    after = simulated(ring, [*known, *causes_of(changes)], measured)
     kicks = as_kicked(measured, before)[2]
     noise = np.zeros(2) if measured.noise is None else measured.noise
     gain = 1 + DRIFT * rng.standard_normal((len(measured.monitors), 2))
@@ -176,6 +180,23 @@ def judged(ring, result, changes):
     return found, missed, wrong, pulls
 
 
+def weighed(name, case, ring, result, changes, seconds):
+    """How many were found, were there, and are none; and pulls. It is told, too."""
+    found, missed, wrong, pulls = judged(ring, result, changes)
+    told = ", ".join(f"{what} {100 * amount:+.2f} %" for what, amount in missed)
+    others = ", ".join(f"{effect} {where} {amount:+.2g} ± {error:.1g}"
+                       for effect, where, amount, error in wrong)  # fmt: skip
+    print(f"{name}, case {case}: {result.verdict}, {len(found)} of {len(changes)}; missed: "
+          f"{told or 'none'}; others: {others or 'none'}; pulls "
+          f"{' '.join(f'{pull:+.1f}' for pull in pulls)}; {seconds:.0f} s", flush=True)  # fmt: skip
+    return [len(found), len(changes), len(wrong)], pulls
+
+
+def rms(pulls):
+    """NaN of none."""
+    return np.sqrt(np.mean(np.square(pulls))) if pulls else np.nan
+
+
 def cases(name, files, data, place, options):
     """Each as it comes; and the counts."""
     lattice, folder, _ = imported(name, files, data, place, "last")
@@ -195,18 +216,11 @@ def cases(name, files, data, place, options):
             print(f"{name}, case {case}: {error}", flush=True)
             total += [0, len(changes), 0, 1]
             continue
-        found, missed, wrong, pulls = judged(ring, result, changes)
+        spent = time.process_time() - begun
+        counts, pulls = weighed(name, case, ring, result, changes, spent)
         every += pulls
-        total += [len(found), len(changes), len(wrong), 0]
-        told = ", ".join(f"{what} {100 * amount:+.2f} %" for what, amount in missed)
-        others = ", ".join(f"{effect} {where} {amount:+.2g} ± {error:.1g}"
-                           for effect, where, amount, error in wrong)  # fmt: skip
-        print(f"{name}, case {case}: {result.verdict}, {len(found)} of {len(changes)}; missed: "
-              f"{told or 'none'}; others: {others or 'none'}; pulls "
-              f"{' '.join(f'{pull:+.1f}' for pull in pulls)}; "
-              f"{time.process_time() - begun:.0f} s", flush=True)  # fmt: skip
-    rms = np.sqrt(np.mean(np.square(every))) if every else np.nan
-    return f"| {name} | {total[0]} of {total[1]} | {total[2]} | {rms:.2f} | {total[3]} |"
+        total += [*counts, 0]
+    return f"| {name} | {total[0]} of {total[1]} | {total[2]} | {rms(every):.2f} | {total[3]} |"
 
 
 def main():

@@ -16,7 +16,6 @@ import numpy as np
 import pairs
 
 import tmlattice
-from tmlattice import Cause
 from tmlattice.machine.response import simulate_response
 
 BACKGROUND = {
@@ -47,13 +46,8 @@ def day(ring, causes, machine, seed):
 def case(ring, number, null):
     """Changes of one number, and the diagnosis."""
     changes = pairs.drawn(ring, np.random.default_rng(number), null)
-    causes = [
-        Cause("quadrupole_gradient", piece.name, amount)
-        for _, amount, _, own, of in changes
-        for magnet in of
-        for piece in own[magnet]
-    ]
-    before, after = day(ring, [], number, 1), day(ring, causes, number, 2)
+    before = day(ring, [], number, 1)
+    after = day(ring, pairs.causes_of(changes), number, 2)
     return changes, tmlattice.diagnose(ring, after, reference=before)
 
 
@@ -72,18 +66,11 @@ def main():
         for number in range(options.cases):
             begun = time.process_time()
             changes, result = case(ring, number, options.null)
-            found, missed, wrong, pulls = pairs.judged(ring, result, changes)
+            spent = time.process_time() - begun
+            counts, pulls = pairs.weighed(name, number, ring, result, changes, spent)
             every += pulls
-            count += [len(found), len(changes), len(wrong)]
-            told = [f"{what} {100 * amount:+.2f} %" for what, amount in missed]
-            others = [f"{effect} {where} {amount:+.2g} ± {error:.1g}"
-                      for effect, where, amount, error in wrong]  # fmt: skip
-            print(f"{name}, case {number}: {result.verdict}, {len(found)} of {len(changes)}; "
-                  f"missed: {', '.join(told) or 'none'}; others: {', '.join(others) or 'none'}; "
-                  f"pulls {' '.join(f'{pull:+.1f}' for pull in pulls)}; "
-                  f"{time.process_time() - begun:.0f} s", flush=True)  # fmt: skip
-        rms = np.sqrt(np.mean(np.square(every))) if every else np.nan
-        print(f"| {name} | {count[0]} of {count[1]} | {count[2]} | {rms:.2f} |", flush=True)
+            count += counts
+        print(f"| {name} | {count[0]} of {count[1]} | {count[2]} | {pairs.rms(every):.2f} |")
 
 
 if __name__ == "__main__":

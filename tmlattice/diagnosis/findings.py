@@ -49,6 +49,11 @@ def findings_of(
     return strongest_first(found)
 
 
+def cause_of(found: Finding) -> Cause:
+    """What is found, as a cause of its amount."""
+    return Cause(found.effect or "", found.element, found.amount or 0.0)
+
+
 def strongest_first(found: Iterable[Finding]) -> tuple[Finding, ...]:
     """By falling statistic."""
     return tuple(sorted(found, key=lambda own: -own.detection.statistic))

@@ -26,6 +26,7 @@ from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
 from tmlattice.diagnosis.findings import (
+    cause_of,
     least_certain,
     strongest_first,
     with_consequences,
@@ -42,8 +43,8 @@ from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.response.what_changed import MOST, REPRODUCED, what_changed
-from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import DEFAULT, Judgement
@@ -138,7 +139,7 @@ def diagnose_change(
     fit = _few_or_all(data, split, trials, effects, judgement, seed, progress, open_)
     if isinstance(fit, Few):
         causes = tuple(cause for cause, _ in fit.told)
-        sought = [own for own in fit.findings if not is_drift(_cause_of(own))]
+        sought = [own for own in fit.findings if not is_drift(cause_of(own))]
         found = strongest_first([*sought[:max_effects], *pairs])
         return as_diagnosis(
             there, fit.fit, fit.fit.state.at.errors.ring, fit.told,
@@ -154,7 +155,7 @@ def diagnose_change(
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
-    causes = tuple(_cause_of(own) for own in named)
+    causes = tuple(cause_of(own) for own in named)
     known = [own.amount_sigma or 0.0 for own in named]
     told: list[Told] = list(zip(causes, known, strict=True))
     found = strongest_first([*named, *pairs])
@@ -281,10 +282,6 @@ def _with_noise(state: State, noise: Array) -> State:
 def _all_columns(state: State) -> State:
     """To be fitted to the held-out correctors too."""
     return replace(state, split=_judged_by_nobody(state.split))
-
-
-def _cause_of(own: Finding) -> Cause:
-    return Cause(own.effect or "", own.element, own.amount or 0.0)
 
 
 # --- what is told ---------------------------------------------------------------------------------

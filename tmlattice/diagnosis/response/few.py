@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.findings import findings_of, strongest_first, verdict_of
+from tmlattice.diagnosis.findings import findings_of, verdict_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen
@@ -313,4 +313,4 @@ def _told(
     told = list(zip(causes, errors, strict=True))
     less = p_value > 1 - judgement.noise[1]
     noise = p_value >= judgement.noise[1] and not less
-    return Few(dense, tuple(strongest_first(findings)[:most]), verdict, told, said, noise)
+    return Few(dense, findings[:most], verdict, told, said, noise)

@@ -27,6 +27,7 @@ from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersio
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import (
+    cause_of,
     least_certain,
     strongest_first,
     swap_of,
@@ -139,9 +140,7 @@ def diagnose_response(
         "max_effects": max_effects, "false_alarm": false_alarm, "missing": missing,
         **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    causes = tuple(
-        Cause(own.effect, own.element, own.amount or 0.0) for own in findings if own.effect
-    )
+    causes = tuple(cause_of(own) for own in findings if own.effect)
     return as_diagnosis(
         ring, fit, fit.state.at.errors.ring, found,
         noise_estimated=measured.noise is None,

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.magnets import families
-from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.findings import cause_of, finding_of
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, strongest
 from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
 from tmlattice.diagnosis.response.state import State
@@ -105,7 +105,7 @@ def _blurred(problem: Response, open_: LeftOpen, found: Sequence[Finding]) -> di
     """What errors of the ring that are not known make of what changed, m, of each block [error,
     column, monitor]."""
     data = problem.base.data
-    causes = [Cause(own.effect or "", own.element, own.amount or 0.0) for own in found]
+    causes = [cause_of(own) for own in found]
     spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
     return {
         block: np.array([data.pick(own, block) for own in spread]).reshape(-1, *data.shape)
