@@ -262,7 +262,9 @@ def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
     jsonschema.validate(document, json.loads(schema.read_text()))
     assert document["provenance"]["options"]["reference"] is True
     assert {own["element"] for own in document["findings"]} == {"qf", "QD::5"}
-    assert "Since the reference" in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Since the reference" in page
+    assert "what the reference leaves of it" in page
     wrong = CliRunner().invoke(tmlattice, [*words, "--lattice-out", str(tmp_path / "r.json")])
     assert wrong.exit_code == 2
     assert "no meaning for a change since a reference" in wrong.output

@@ -235,6 +235,11 @@ class Diagnosis(ShownDiagnosis):
         return isinstance(self.view, ResponseView)
 
     @property
+    def since_reference(self) -> bool:
+        """Whether what is told is a change from an earlier measurement (but of trajectories)."""
+        return self.kind != "trajectory" and bool(self.provenance["options"].get("reference"))
+
+    @property
     def parts(self) -> tuple[PartView, ...]:
         """The measurements, where there are several or a stored beam's."""
         return self.view.parts if isinstance(self.view, JointView) else ()

@@ -95,15 +95,9 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 # --- the sentences --------------------------------------------------------------------------------
-def since_reference(diagnosis: Diagnosis) -> bool:
-    """Whether the findings are what changed between two orbit responses."""
-    options = diagnosis.provenance["options"]
-    return diagnosis.kind != "trajectory" and bool(options.get("reference"))
-
-
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
-    if not since_reference(diagnosis):
+    if not diagnosis.since_reference:
         return _verdict_sentence(diagnosis)
     if diagnosis.verdict == "nothing":
         return (
@@ -150,7 +144,7 @@ def _located_sentence(diagnosis: Diagnosis) -> str:
 
 def _errors_in_steps(diagnosis: Diagnosis) -> bool:
     """Whether steps were kept that are errors of the ring, and no drifts since a reference."""
-    return len(diagnosis.steps) > 1 and not since_reference(diagnosis)
+    return len(diagnosis.steps) > 1 and not diagnosis.since_reference
 
 
 def steps_sentence(diagnosis: Diagnosis) -> str:
@@ -237,7 +231,7 @@ def headline(diagnosis: Diagnosis) -> str:
         return verdict_sentence(diagnosis)
     several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "equivalent"]
     unnamed = [str(n) for n, f in enumerate(found, 1) if f.verdict == "located" and not f.words]
-    since = "Since the reference: " if since_reference(diagnosis) else ""
+    since = "Since the reference: " if diagnosis.since_reference else ""
     text = f"{since}{len(found)} findings."
     if several:
         text += f" More than one explanation fits: {', '.join(several)}."
