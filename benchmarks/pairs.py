@@ -3,7 +3,8 @@
 The response that was measured is the first day. The second is the same, with what changes of some
 supplies and of some single magnets do to the readings of all that was fitted to the first (AT's
 closed orbits, with less without), drifts of monitors and correctors, and noise of its own.
-What the model of the ring lacks is in both days, as it is in two real ones.
+What the model of the ring lacks is in both days, as it is in two real ones; so is the first one's
+noise, and the second's is drawn larger by that: two days differ by the noise of both.
 
 Each case is drawn by its number: three supplies by 0.1 to 0.6 %, less where that moves a tune by
 more than 0.03, and three single quadrupoles by 0.3 to 1 %, of either sign; or nothing (`--null`).
@@ -137,7 +138,7 @@ def second_day(measured, ring, known, before, changes, rng):
     """What would have been measured then, of a ring with some causes on the first day."""
     after = simulated(ring, [*known, *causes_of(changes)], measured)
     kicks = as_kicked(measured, before)[2]
-    noise = np.zeros(2) if measured.noise is None else measured.noise
+    noise = np.zeros(2) if measured.noise is None else np.sqrt(2) * np.nan_to_num(measured.noise)
     gain = 1 + DRIFT * rng.standard_normal((len(measured.monitors), 2))
     scale = 1 + DRIFT * rng.standard_normal((len(kicks), 1, 1))
     response = measured.response + (after.response - before.response) * kicks[:, None, None]

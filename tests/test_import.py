@@ -411,7 +411,6 @@ def test_fields_that_are_not_needed_may_be_anything(simulated, brought, change):
         ({"CMData_HCMIndex": np.zeros((2, 8))}, "several elements a row"),
         ({"CMData_HCMIndex": np.ones(16)}, "different places"),
         ({"CMData_HCMKicks": np.ones(3)}, "HCMKicks has 3 steps"),
-        ({"RINGData_Energy": "none"}, "energy"),
         ({"RINGData_Lattice": 3.0}, "no list of elements"),
         ({"LocoMeasData_M": "no numbers"}, "holds no numbers"),
         ({"RINGData_Lattice": element(2, Length=1e300)}, "has the length 1e+300"),
@@ -421,9 +420,6 @@ def test_fields_that_are_not_needed_may_be_anything(simulated, brought, change):
 )
 def test_damaged_loco_files_are_a_sentence(simulated, brought, change, told):
     variables = changed(simulated, **change)
-    if "RINGData_Energy" in change:
-        bare = [{k: v for k, v in e.items() if k != "Energy"} for e in elements()]
-        variables["RINGData"]["Lattice"] = np.array(bare, dtype=object)
     with pytest.raises(TmlatticeError, match=re.escape(told)):
         brought(variables)
 
@@ -729,7 +725,8 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
 
 # --- the files of real rings ----------------------------------------------------------------------
 # file: monitors x, y; correctors H, V; noise of an orbit; measured in-plane rms; what the lattice
-# in the file leaves, all in micrometres: the table of the folder's README
+# in the file leaves, all in micrometres: the table of the folder's README (but for LNLS, 11 July,
+# 20.8 there: with the field of devices that AT passes as drifts; LOCO's own model is below)
 README = {
     "als_2005-06-13": (121, 121, 97, 73, 0.49, 238, 23.5),
     "als_2008-01-05": (122, 122, 95, 73, 0.57, 220, 26.2),
@@ -737,7 +734,7 @@ README = {
     "soleil_2012-01-20": (122, 122, 57, 57, 0.13, 76, 9.3),
     "pls_2009-03-01_0713": (102, 102, 68, 70, 0.36, 136, 42.5),
     "siam_2007-09-25": (20, 20, 16, 12, 16, 284, 106),
-    "lnls_2014-07-11_a": (25, 25, 18, 24, 0.32, 159, 20.8),
+    "lnls_2014-07-11_a": (25, 25, 18, 24, 0.32, 159, 24.4),
     "lnls_2014-07-17_before": (24, 24, 18, 24, 0.33, 154, 23),
 }
 
@@ -769,7 +766,7 @@ def test_figures_of_a_real_ring_are_those_of_its_readme(name):
 
 
 @real
-@pytest.mark.parametrize("name", [n for n in README if n[:3] in ("als", "spe", "sol")])
+@pytest.mark.parametrize("name", [n for n in README if n[:3] in ("als", "spe", "sol", "lnl")])
 def test_model_of_a_real_ring_is_locos_own(name):
     """LOCO's model before its first iteration, made by MATLAB's AT with its own integrators of
     sextupoles and bends: a thousandth, or what a tune difference of 1e-4 makes."""
@@ -777,6 +774,8 @@ def test_model_of_a_real_ring_is_locos_own(name):
     found = bring_in([path], Options(iteration="first"))
     own = read_mat(path, ["LocoModel"])["LocoModel"][0]
     columns, rf = design(found)
+    good = np.isfinite(found.measurement.response).any(axis=(0, 2))
+    columns, rf = columns[:, good], rf[good]
     M = 1e-3 * own["M"].T.reshape(len(columns), 2, -1).swapaxes(1, 2)
     planes = found.measurement.planes
     assert rms(in_plane(M - columns, planes)) < 1e-3 * rms(in_plane(M, planes))

@@ -7,7 +7,6 @@ import pytest
 import scipy.io
 from test_import import simulated  # noqa: F401  (a fixture)
 
-from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
 from tmlattice.lattice import mat_file
 
@@ -70,6 +69,19 @@ def energy_of_globval(v):
     v["GLOBVAL"] = {"E0": 1.5e9}
 
 
+def empty_cavity(v):
+    for element in v["RINGData"]["Lattice"]:
+        if element["FamName"] == "CAV":
+            element.update(Frequency=np.zeros(0), HarmNumber=np.nan, Voltage=np.zeros((0, 0)))
+
+
+def monitors_of_each_plane(v):
+    index = v["BPMData"]["BPMIndex"]
+    v["BPMData"].update(
+        BPMIndex=np.concatenate([index, index]), VBPMIndex=v["BPMData"]["VBPMIndex"] + len(index)
+    )
+
+
 def several_elements(v):
     index = v["CMData"]["HCMIndex"]
     v["CMData"]["HCMIndex"] = np.stack([index, index, np.full(len(index), np.nan)], axis=1)
@@ -103,6 +115,11 @@ FORMS = {
         "CMData", VCMIndex=lambda i: i[:14], VCMKicks=lambda k: k[:14], VCMGoodDataIndex=None)),
         "M stands as [correctors, monitors]"),
     "several elements a corrector": (several_elements, "the middle is taken"),
+    "an RF of no number": (together(put("LocoMeasData", RF=lambda f: np.nan), put(
+        "RINGData", CavityHarmNumber=lambda h: np.zeros((0, 0)))), ""),
+    "an RF of 0": (put("LocoMeasData", RF=lambda f: 0.0), ""),
+    "a cavity of empty fields": (empty_cavity, ""),
+    "monitors for x and for y": (monitors_of_each_plane, "each is one monitor"),
     "flags that say nothing": (put("LocoFlags", ResponseMatrixMeasurement=lambda f: np.zeros(0)),
                                "no LocoFlags say so"),
 }  # fmt: skip
@@ -148,10 +165,11 @@ def test_what_is_not_measured_is_left_out_and_said(simulated, bring):  # noqa: F
         assert any(said in sentence for sentence in found.assumed), found.assumed
 
 
-def test_an_energy_that_no_file_states_can_be_named(simulated, bring):  # noqa: F811
+def test_an_energy_that_no_file_states_is_assumed_and_can_be_named(simulated, bring):  # noqa: F811
     variables = copy.deepcopy(simulated)
     energy_of_globval(variables)
     del variables["GLOBVAL"]
-    with pytest.raises(MeasurementError, match="--energy"):
-        bring(variables)
+    found = bring(variables)
+    assert found.ring.energy == pytest.approx(3.0)
+    assert any("no energy is stated" in sentence for sentence in found.assumed)
     assert bring(variables, energy=1.5).ring.energy == pytest.approx(1.5)

@@ -150,8 +150,9 @@ def _bring(
         if len(responses) == 1:
             beside = [content for _, content in rest if is_beside(content)]
             return bring_middle_layer(
-                responses[0], beside, content, path, options.iteration, options.keep_bad
-            )
+                responses[0], beside, content, path, options.iteration, options.keep_bad,
+                options.energy,
+            )  # fmt: skip
     shown = ", ".join(f"'{path}'" for path in files)
     raise MeasurementError(
         f"{shown}: no measurement that is known; give a MATLAB LOCO file (with LocoMeasData), or "

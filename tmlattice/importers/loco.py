@@ -148,8 +148,9 @@ def _index(structure: Fields, name: str) -> Indices:
 
 def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
     """GeV; LOCO has it in GeV, AT's elements in eV."""
-    stated = [s["Energy"] for s in (lattice, *elements) if is_number(s.get("Energy"))]
-    if not stated or not stated[0] > 0:
+    given = (own.get("Energy") for own in (lattice, *elements))
+    stated = [value for value in given if is_number(value) and value > 0]
+    if not stated:
         raise MeasurementError(
             "neither RINGData nor its elements state an energy: name it (--energy, GeV)"
         )

@@ -20,6 +20,8 @@ SAME_RF = 0.02
 """Share by which a frequency may differ from the one that the ring's length and harmonic make."""
 TINY_STEP = 1e-9
 """Relative step of the RF that no beam would show: it is written in MHz."""
+USUAL_ENERGY = 3.0
+"""GeV, where no file states it."""
 
 
 def usual_form(content: Fields, energy: float | None = None) -> tuple[dict[str, Any], list[str]]:
@@ -48,6 +50,7 @@ def usual_form(content: Fields, energy: float | None = None) -> tuple[dict[str, 
         new["LocoFlags"] = {k: v for k, v in new["LocoFlags"].items() if np.size(v)}
     _energy(new, energy, said)
     _rf(new, said)
+    _monitors(monitors, said)
     _places(correctors, said)
     _good_lists(monitors, correctors, said)
     _shapes(data, monitors, correctors, said)
@@ -71,13 +74,19 @@ def _energy(new: dict[str, Any], energy: float | None, said: list[str]) -> None:
     if energy is not None:
         ring["Energy"] = energy
         return
-    if any(is_number(own.get("Energy")) for own in (ring, *_elements(ring))):
+    if any(_positive(own.get("Energy")) for own in (ring, *_elements(ring))):
         return
     others = [own.get("E0") for own in (_first(new.get("GLOBVAL")), *_elements(ring))]
-    found = next((own for own in others if is_number(own)), None)
+    found = next((own for own in others if _positive(own)), None)
     if found is not None:
         ring["Energy"] = found
         said.append("the energy is E0, of GLOBVAL or of the lattice's elements")
+        return
+    ring["Energy"] = USUAL_ENERGY
+    said.append(
+        f"no energy is stated: {USUAL_ENERGY:g} GeV is assumed, for the closed orbits of electrons "
+        "hardly depend on it (--energy names it)"
+    )
 
 
 # --- the RF ---------------------------------------------------------------------------------------
@@ -90,14 +99,17 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         return
     turn = LIGHT / sum(lengths)
     cavities = [e for e in elements if _is_cavity(e)]
-    frequencies = [
-        data.get("RF"),
-        ring.get("CavityFrequency"),
-        *(e.get("Frequency") for e in cavities),
-    ]
-    frequencies = [own for own in frequencies if is_number(own) and own > 0]
-    harmonics = [ring.get("CavityHarmNumber"), *(e.get("HarmNumber") for e in cavities)]
-    harmonics = [own for own in harmonics if is_number(own) and own > 0]
+    for own, names in (
+        (data, ("RF",)), (ring, ("CavityFrequency", "CavityHarmNumber")),
+        *((cavity, ("Frequency", "HarmNumber")) for cavity in cavities),
+    ):  # fmt: skip
+        for name in names:  # an empty one, NaN or 0 states nothing
+            if not _positive(own.get(name)):
+                own.pop(name, None)
+    stated = (data.get("RF"), ring.get("CavityFrequency"), *(e.get("Frequency") for e in cavities))
+    frequencies = [own for own in stated if own is not None]
+    stated = (ring.get("CavityHarmNumber"), *(e.get("HarmNumber") for e in cavities))
+    harmonics = [own for own in stated if own is not None]
     if not harmonics and frequencies and frequencies[0] > turn / 2:
         harmonics = [round(frequencies[0] / turn)]
         said.append(f"no harmonic is given: {harmonics[0]}, by the frequency and the length")
@@ -111,7 +123,8 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         if harmonics and frequencies:
             cavity.setdefault("Frequency", frequencies[0])
             cavity.setdefault("HarmNumber", harmonics[0])
-            cavity.setdefault("Voltage", 0.0)
+            if not is_number(cavity.get("Voltage")):
+                cavity["Voltage"] = 0.0
         else:  # no cavity can be made of it, and an orbit at a fixed frequency needs none
             cavity["PassMethod"] = "DriftPass" if cavity.get("Length") else "IdentityPass"
             for name in ("Class", "Frequency", "HarmNumber", "Voltage"):
@@ -123,6 +136,10 @@ def _is_cavity(element: Fields) -> bool:
     known = any(is_number(element.get(name)) for name in ("Frequency", "HarmNumber", "Voltage"))
     by_method = "Cavity" in str(element.get("PassMethod"))
     return known or by_method or element.get("Class") == "RFCavity"
+
+
+def _positive(value: Any) -> bool:
+    return is_number(value) and value > 0
 
 
 def _frequency(
@@ -150,6 +167,25 @@ def _step(new: Fields, data: dict[str, Any], said: list[str]) -> None:
 
 
 # --- places and good lists ------------------------------------------------------------------------
+def _monitors(monitors: dict[str, Any], said: list[str]) -> None:
+    """`BPMIndex` with each place once, and `HBPMIndex` and `VBPMIndex` that count in it."""
+    index = _array(monitors.get("BPMIndex"))
+    if index is None or index.ndim != 1:
+        return
+    places, first, number = np.unique(index, return_index=True, return_inverse=True)
+    if len(places) == len(index):
+        return
+    order = np.argsort(first)  # as in the list
+    number = np.argsort(order)[number]
+    for name in ("HBPMIndex", "VBPMIndex"):
+        own = _array(monitors.get(name))
+        if own is None or own.ndim != 1 or not np.isin(own, np.arange(len(index)) + 1).all():
+            return  # for the reader to refuse
+        monitors[name] = number[own.astype(np.int64) - 1] + 1.0
+    monitors["BPMIndex"] = places[order]
+    said.append("BPMIndex names places twice, for x and for y: each is one monitor")
+
+
 def _places(correctors: dict[str, Any], said: list[str]) -> None:
     """`HCMIndex`, `VCMIndex`: of a corrector of several elements the middle one; steps that are no
     numbers are none."""

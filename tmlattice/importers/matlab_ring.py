@@ -7,10 +7,11 @@ corrector whatever its class says, and keeps its name:
 - a corrector of one plane stays one element;
 - where one place kicks in both planes, all of its family become two thin correctors in the middle
   of it, `name_h` and `name_v`: to first order a thick corrector is no other;
+- a corrector that the measurement does not use is of the planes of its family;
 - a magnet that kicks (a corrector inside a sextupole) becomes two halves, `name` and `name_2`, with
-  the thin correctors in its middle.
-
-A pass method of the file chooses nothing that is loaded: one that AT does not ship is a drift.
+  the thin correctors in its middle;
+- where a monitor's place is a magnet or a corrector, the orbit at its entrance is meant: a monitor,
+  `name_bpm`, stands before it.
 """
 
 import warnings
@@ -22,17 +23,11 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError
-from tmlattice.importers.imported import is_number
+from tmlattice.importers.at_element import at_element
 from tmlattice.lattice import Ring
-from tmlattice.lattice.at_child import shipped_methods
 from tmlattice.lattice.at_file import ring_from_at
-from tmlattice.lattice.expressions import check_order
 
-PLANES = "xy"
-LONGEST = 1e5
-"""m; no element of a ring is longer."""
 _LETTER = {"x": "h", "y": "v"}
-_APERTURES = ("AperturePass", "EAperturePass", "LongtAperturePass")
 _MAD = {"x": "HKICKER", "y": "VKICKER"}
 
 
@@ -96,28 +91,16 @@ def ring_of_elements(
     said: Counter[str] = Counter()
     with warnings.catch_warnings():  # AT's own, of what it finds in old files
         warnings.simplefilter("ignore")
-        made = [_element(fields, i, energy, said) for i, fields in enumerate(elements)]
-    both = {
-        _family(made[i])
-        for i, planes in roles.kicks.items()
-        if len(planes) > 1 and isinstance(made[i], at.Corrector)
-    }
+        made = [at_element(fields, i, energy, said) for i, fields in enumerate(elements)]
+    of_family = _planes_of_families(made, roles.kicks)
     sequence: list[Any] = []
     where: dict[tuple[int, str], int] = {}  # (place, "" or plane) -> in the sequence
     for i, element in enumerate(made):
         planes = roles.kicks.get(i, frozenset())
+        parts = _parts(element, planes, of_family, said)
         if i in roles.monitors:
-            parts = _monitor(element, planes)
+            parts = _read(element, parts)
             where[i, ""] = len(sequence)
-        elif isinstance(element, at.Corrector):
-            if np.any(np.asarray(element.KickAngle, dtype=float)):
-                said["kicks of correctors in the lattice are taken as 0"] += 1
-            parts = _corrector(element, frozenset(PLANES) if _family(element) in both else planes)
-        elif planes:
-            parts = _magnet(element, planes)
-            said["magnets that kick stand as two halves with thin correctors between"] += 1
-        else:
-            parts = [element]
         for k, part in enumerate(parts):
             if plane := getattr(part, "Plane", ""):
                 where[i, plane] = len(sequence) + k
@@ -173,54 +156,6 @@ def _family(element: Any) -> str:
     return str(element.FamName).strip().lower()
 
 
-def _element(fields: Mapping[str, Any], place: int, energy: float, said: Counter[str]) -> Any:
-    from at.load.utils import element_from_dict
-
-    if not isinstance(fields, Mapping):
-        raise LatticeError(f"element {place + 1} of the lattice is no structure; save it again")
-    kept = {key: value for key, value in fields.items() if _is_data(value)}
-    length = kept.get("Length", 0.0)
-    if not is_number(length) or abs(length) > LONGEST:
-        raise LatticeError(f"element {place + 1} of the lattice has the length {length!r:.40}")
-    name, method = kept.get("FamName"), kept.get("PassMethod")
-    kept["FamName"] = name if isinstance(name, str) and name else f"element_{place + 1}"
-    if not isinstance(method, str) or method not in shipped_methods():
-        said[f"'{str(method)[:40]}' is no pass method of AT: a drift"] += 1
-        kept = {"FamName": kept["FamName"], "Length": length}
-        kept["PassMethod"] = "DriftPass" if length else "IdentityPass"
-    if str(kept["PassMethod"]) in _APERTURES:
-        kept = {"FamName": kept["FamName"], "Class": "Marker", "PassMethod": "IdentityPass"}
-    check_order(kept)
-    _one_gradient(kept)
-    if "Frequency" in kept:  # a cavity cannot be made without
-        kept.setdefault("Energy", energy * 1e9)
-    try:
-        return element_from_dict(kept, index=place, check=False, quiet=True)
-    except Exception as error:  # AT's constructors fail in their own ways
-        said_so = " ".join(str(error).split()) or type(error).__name__
-        raise LatticeError(
-            f"element {place + 1} of the lattice, '{kept['FamName']}', cannot be made ({said_so})"
-        ) from error
-
-
-def _one_gradient(fields: dict[str, Any]) -> None:
-    """`K` and `PolynomB` both say the gradient; a linear pass method follows `K`."""
-    if "PolynomB" in fields and "K" in fields:
-        gradient = fields.pop("K")
-        if "Linear" in str(fields.get("PassMethod")):
-            orders = np.zeros(max(2, np.size(fields["PolynomB"])))
-            orders[: np.size(fields["PolynomB"])] = fields["PolynomB"]
-            orders[1] = float(np.ravel(gradient)[0])
-            fields["PolynomB"] = orders
-            fields["MaxOrder"] = max(1, int(fields.get("MaxOrder", 1)))
-
-
-def _is_data(value: Any) -> bool:
-    if isinstance(value, np.ndarray):
-        return value.dtype.kind in "fiub" and value.size > 0
-    return isinstance(value, int | float | str)
-
-
 def _kicker(family: str, length: float, plane: str) -> Any:
     import at
 
@@ -231,12 +166,47 @@ def _thin(element: Any, planes: Iterable[str]) -> list[Any]:
     return [_kicker(f"{_family(element)}_{_LETTER[plane]}", 0.0, plane) for plane in sorted(planes)]
 
 
-def _monitor(element: Any, planes: frozenset[str]) -> list[Any]:
+def _planes_of_families(
+    made: Sequence[Any], kicks: Mapping[int, frozenset[str]]
+) -> dict[str, frozenset[str]]:
+    """Planes in which some corrector of a family kicks."""
     import at
 
+    planes: dict[str, frozenset[str]] = {}
+    for i, own in kicks.items():
+        if isinstance(made[i], at.Corrector):
+            family = _family(made[i])
+            planes[family] = planes.get(family, frozenset()) | own
+    return planes
+
+
+def _parts(
+    element: Any,
+    planes: frozenset[str],
+    of_family: Mapping[str, frozenset[str]],
+    said: Counter[str],
+) -> list[Any]:
+    """An element as it kicks."""
+    import at
+
+    if isinstance(element, at.Corrector):
+        if np.any(np.asarray(element.KickAngle, dtype=float)):
+            said["kicks of correctors in the lattice are taken as 0"] += 1
+        return _corrector(element, of_family.get(_family(element), frozenset()))
     if planes:
-        raise LatticeError(f"'{element.FamName}' is a monitor and a corrector; name one of them")
-    return [at.Monitor(_family(element), Length=float(getattr(element, "Length", 0.0)))]
+        said["magnets that kick stand as two halves with thin correctors between"] += 1
+        return _magnet(element, planes)
+    return [element]
+
+
+def _read(element: Any, parts: list[Any]) -> list[Any]:
+    """With a monitor: what only fills the place becomes one, others have it before them."""
+    import at
+
+    fills = isinstance(element, at.Monitor | at.Marker | at.Drift)
+    if fills and parts == [element]:
+        return [at.Monitor(_family(element), Length=float(getattr(element, "Length", 0.0)))]
+    return [at.Monitor(f"{_family(element)}_bpm"), *parts]
 
 
 def _corrector(element: Any, planes: frozenset[str]) -> list[Any]:
@@ -257,6 +227,9 @@ def _magnet(element: Any, planes: frozenset[str]) -> list[Any]:
     thin = _thin(element, planes)
     if not float(getattr(element, "Length", 0.0)):
         return [element, *thin]
-    first, second = element.divide([0.5, 0.5])
+    halves = element.divide([0.5, 0.5])
+    if len(halves) == 1:  # AT cannot divide it
+        return [element, *thin]
+    first, second = halves
     second.FamName = f"{_family(element)}_2"
     return [first, *thin, second]

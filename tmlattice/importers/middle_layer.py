@@ -47,6 +47,7 @@ def bring_middle_layer(
     path: Path,
     iteration: Iteration = "last",
     keep_bad: bool = False,
+    energy: float | None = None,
 ) -> Imported:
     """The measurement of the Middle Layer's files; the model is that of the LOCO file.
 
@@ -55,14 +56,14 @@ def bring_middle_layer(
         beside: variables with the dispersion or the noise.
         loco: variables of the machine's LOCO file, the dictionary.
         path: of the LOCO file.
-        iteration, keep_bad: see `bring_loco`.
+        iteration, keep_bad, energy: see `bring_loco`.
 
     Raises:
         MeasurementError: a field is missing, a device that LOCO's file does not have, or a unit
             that is not known.
     """
-    known = bring_loco(loco, path, iteration, keep_bad)
-    model, good = bring_loco(loco, path, iteration, True).measurement, known.measurement
+    known = bring_loco(loco, path, iteration, keep_bad, energy)
+    model, good = bring_loco(loco, path, iteration, True, energy).measurement, known.measurement
     assert isinstance(model, OrbitResponse)
     assert isinstance(good, OrbitResponse)
     data = loco["LocoMeasData"]

@@ -192,6 +192,12 @@ def _convert(
         return "monitor", ocelot.Monitor(l=length, eid=family)
     if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
         return "monitor", ocelot.Monitor(l=length, eid=family)  # lattices from before the class
+    if isinstance(element, at.Drift | at.Marker | at.Aperture) or _passive(element, left_out):
+        if mad in ACTS:
+            left_out[f"what {mad.lower()} does"] += 1
+        if length:
+            return "drift", ocelot.Drift(l=length, eid=family)
+        return "marker", ocelot.Marker(eid=family)
     if isinstance(element, at.M66):
         matrix = np.asarray(element.M66, dtype=float)
         if roll:
@@ -205,12 +211,6 @@ def _convert(
         return bend(element, family, length, roll, left_out)
     if isinstance(element, at.Multipole):
         return straight(element, family, length, mad, roll, left_out)
-    if isinstance(element, at.Drift | at.Marker | at.Aperture) or "Identity" in element.PassMethod:
-        if mad in ACTS:
-            left_out[f"what {mad.lower()} does"] += 1
-        if length:
-            return "drift", ocelot.Drift(l=length, eid=family)
-        return "marker", ocelot.Marker(eid=family)
     kind, source = _matrix(tracker.matrix(element), family, length, energy)
     name = type(element).__name__
     name = element.PassMethod.removesuffix("Pass") if name == "Element" else name
@@ -218,6 +218,16 @@ def _convert(
     if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"
     return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source
+
+
+def _passive(element: Any, left_out: Counter[str]) -> bool:
+    """Whether AT passes it as if nothing were there, whatever its fields say: a magnet that was
+    switched off by its pass method; and noise of the radiation, which moves no orbit."""
+    method = element.PassMethod
+    fields = ("PolynomA", "PolynomB", "BendingAngle")
+    if method == "DriftPass" and any(np.any(getattr(element, name, 0.0)) for name in fields):
+        left_out["fields of magnets whose pass method is DriftPass"] += 1
+    return method == "DriftPass" or "Identity" in method or "QuantDiff" in method
 
 
 def _correctors(element: Any, family: str, mad: str) -> list[Place]:

@@ -76,7 +76,21 @@ def read_in_a_child(path: Path, what: str, code: str, error: type[TmlatticeError
         raise error(f"'{path}' cannot be read as {what} ({why}); save it again")
 
 
-_CHILD = """
+_READ_ALL = """
+def read_all(path):
+    import h5py
+
+    def read(name, item):
+        if isinstance(item, h5py.Dataset):
+            item[()]  # anything returned would end the visit
+
+    with h5py.File(path) as file:
+        file.visititems(read)
+"""
+
+_CHILD = (
+    _READ_ALL
+    + """
 import sys, warnings
 warnings.simplefilter("ignore")
 import scipy.io
@@ -85,22 +99,22 @@ try:
     if scipy.io.matlab.matfile_version(path)[0] < 2:
         scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
     else:
-        import h5py
-        with h5py.File(path) as file:
-            file.visititems(lambda name, item: item[()] if isinstance(item, h5py.Dataset) else None)
+        read_all(path)
 except Exception as error:
     sys.exit(" ".join(f"{type(error).__name__}: {error}".split()) or "error")
 """
+)
 
-_HDF5 = """
+_HDF5 = (
+    _READ_ALL
+    + """
 import sys
-import h5py
 try:
-    with h5py.File(sys.argv[1]) as file:
-        file.visititems(lambda name, item: item[()] if isinstance(item, h5py.Dataset) else None)
+    read_all(sys.argv[1])
 except Exception as error:
     sys.exit(" ".join(f"{type(error).__name__}: {error}".split()) or "error")
 """
+)
 
 
 def read_mat(path: Path, variables: Sequence[str] | None = None) -> dict[str, Any]:
