@@ -10,7 +10,7 @@ from at.load.utils import element_from_dict
 from numpy.testing import assert_allclose
 from test_import import ENERGY, design, elements, simulated  # noqa: F401  (a fixture)
 
-from tmlattice.importers import Options, bring_in
+from tmlattice.importers import Options, bring_in, matlab_ring
 from tmlattice.lattice import mat_file
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
@@ -158,3 +158,19 @@ def test_a_magnet_that_at_passes_as_a_drift_is_one(fields):
         ring = ring_from_at(there, "ring", ENERGY)
     assert [e.kind for e in ring.elements if e.family == "off"] == ["drift", "drift"]
     assert_allclose(np.array(ring_tunes(ring)) % 1, at.get_tune(there), atol=1e-3)
+
+
+def test_tunes_that_are_not_ats_are_a_doubt(bring, monkeypatch):
+    """Whatever is lost of a lattice moves the tunes."""
+    assert not bring(lambda v: None).doubts
+    usual = matlab_ring.ring_from_at
+
+    def lossy(lattice, name, energy):
+        weaker = lattice.deepcopy()
+        for element in weaker:
+            if element.FamName == "QF":
+                element.PolynomB[1] *= 1.02
+        return usual(weaker, name, energy)
+
+    monkeypatch.setattr(matlab_ring, "ring_from_at", lossy)
+    assert any("AT's of the same elements" in said for said in bring(lambda v: None).doubts)

@@ -139,7 +139,7 @@ def bring_hdf5(
         of_rf,
         *placed.said,
     )
-    return Imported(measured, placed.ring, said)
+    return Imported(measured, placed.ring, said, placed.doubts)
 
 
 def _with(parts: Sequence[tuple[Path, Mapping[str, Any]]], name: str) -> Mapping[str, Any] | None:

@@ -109,7 +109,11 @@ def bring_loco(
         measured,
         placed.ring,
         assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.said),
-        doubts=(*_computed(data, content.get("LocoModel"), good), *_unkicked(correctors, kickers)),
+        doubts=(
+            *placed.doubts,
+            *_computed(data, content.get("LocoModel"), good),
+            *_unkicked(correctors, kickers),
+        ),
     )
 
 
