@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -15,8 +16,9 @@ from click.testing import CliRunner
 from tmlattice import diagnose, load_ring
 from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.response import before_after
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
+from tmlattice.lattice import write_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -71,6 +73,44 @@ def after(small_ring):
 @pytest.fixture(scope="module")
 def change(small_ring, before, after):
     return diagnose(small_ring, after, reference=before)
+
+
+def with_names_of_their_own(ring, folder):
+    """QF_a0 for QF::0: what MAD-X and many a laboratory call magnets."""
+    write_ring(ring, folder / "ring.json")
+    document = json.loads((folder / "ring.json").read_text())
+    known = document["definitions"]
+    count = Counter()
+    for i, name in enumerate(document["sequence"]):
+        if known[name]["kind"] == "quadrupole":
+            own = f"{name}_a{count[name]}"
+            count[name] += 1
+            known[own] = known[name]
+            document["sequence"][i] = own
+    for name in count:
+        del known[name]
+    (folder / "ring.json").write_text(json.dumps(document))
+    return load_ring(folder / "ring.json")
+
+
+def test_a_supply_of_magnets_with_names_of_their_own(small_ring, before, after, change, tmp_path):
+    """What their names begin with stands for it; all else is as with a family's name."""
+    ring = with_names_of_their_own(small_ring, tmp_path)
+    result = diagnose(ring, after, reference=before)
+    found, same = (
+        {
+            (own.effect, own.element.casefold().replace("_a", "::")): own.amount
+            for own in of.findings
+        }
+        for of in (result, change)
+    )
+    assert found == pytest.approx({(e, name.casefold()): a for (e, name), a in same.items()})
+    assert ("family_gradient", "qf") in found
+    assert [e.name for e in result.as_found.elements] == [e.name for e in ring.elements]
+    supply = Cause("family_gradient", "qf", 0.01)
+    weaker = apply(ring, [supply])
+    assert weaker["QF_a3"].k1 == pytest.approx(1.01 * ring["QF_a3"].k1)
+    assert weaker["QD_a3"].k1 == ring["QD_a3"].k1
 
 
 SINGLE = {"QF::3": 8e-3, "QF::9": -7e-3, "QF::12": 6e-3, "QD::1": 1e-2, "QD::5": -8e-3,

@@ -289,9 +289,16 @@ class FamilyEffect(StrengthEffect):
     """The same error of all magnets of a family: their supply's."""
 
     def places(self, ring: Ring) -> list[str | None]:
-        """Families in the order of their first members."""
-        count = Counter(e.family for e in ring.elements if self.sits_on(e))
-        return [family for family, members in count.items() if members > 1]
+        """Families in the order of their first members; where every magnet is a family of its own,
+        what several of their names begin with."""
+        powered = [e for e in ring.elements if self.sits_on(e)]
+        named = _several(e.family for e in powered)
+        return [*(named or _several(stem(e.name) for e in powered))]
+
+    def _allowed(self, ring: Ring) -> frozenset[str | None]:
+        """And what the names of several families begin with."""
+        begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
+        return super()._allowed(ring) | set(begin)
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
         """All magnets of the family; or, where none is called so, those whose names begin so, up
@@ -300,6 +307,11 @@ class FamilyEffect(StrengthEffect):
         powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
         family = [i for i in powered if ring.elements[i].family.casefold() == name]
         return family or [i for i in powered if stem(ring.elements[i].name) == name]
+
+
+def _several(names: Iterable[str]) -> list[str]:
+    """Those that stand more than once, in their order."""
+    return [name for name, count in Counter(names).items() if count > 1]
 
 
 LEAST_FIELD = 0.1
