@@ -151,7 +151,7 @@ class Predicted:
         """
         data = self.data
         steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
-        whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
+        whole = np.concatenate([steps, model.rf_orbit(data.kicks[-1])[None]])[:, data.at]
         if np.any(self.errors.dispersion):
             at_monitors = np.asarray(self.errors.dispersion) / data.energy_of_rf
             names = data.measured.correctors
@@ -187,9 +187,13 @@ class Predicted:
         """What a mean square energy deviation of `DELTA` squared adds to that.
 
         A monitor reads the centroid of particles whose orbits answer each as its energy has it:
-        half the second derivative by the energy, times the mean square.
+        half the second derivative by the energy, times the mean square. 0 where a ring stores no
+        beam so far off.
         """
-        up, down = self._off_energy
+        try:
+            up, down = self._off_energy
+        except UnstableRingError:
+            return np.zeros_like(self.straight)
         return np.asarray((up + down) / 2 - self.straight)
 
     @cached_property

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.errors import UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.response_noise import learnt_noise
-from tmlattice.observe.response_rf import read
+from tmlattice.observe.response_noise import completed
+from tmlattice.observe.response_rf import of_design, read
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -99,17 +100,38 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
         step, orbit = NO_RF, np.full((len(measured.monitors), 2), np.nan)
     else:
         step, orbit = rf.step / rf.frequency, rf.orbit
-    noise = measured.noise
-    if noise is None or np.isnan(noise).any():
-        learnt = learnt_noise(measured, np.array([ring[name].s for name in measured.monitors]))
-        noise = learnt if noise is None else np.where(np.isnan(noise), learnt, noise)
+    measured = _without_blanks(measured)
     order = {name: i for i, name in enumerate(names)}
-    return ResponseData(
+    data = ResponseData(
         ring=ring,
         measured=measured,
         at=np.array([order[ring[name].name] for name in measured.monitors]),
         orbits=np.concatenate([measured.response, orbit[None]]),
         kicks=np.append(measured.kicks, step),
         plane=np.append([int(p == "y") for p in measured.planes], 0),
-        noise=noise,
+        noise=completed(ring, measured),
     )
+    if rf is not None and np.isfinite(orbit[:, 0]).any() and _computed(data):
+        return response_data(ring, replace(measured, rf=replace(rf, orbit=None)))
+    return data
+
+
+def _without_blanks(measured: OrbitResponse) -> OrbitResponse:
+    """Without the other plane's readings where all of them are 0: they were not taken."""
+    response = measured.response
+    for p, plane in enumerate("xy"):
+        rows = np.array([own == plane for own in measured.planes])
+        across = response[rows, :, 1 - p]
+        if across.size and not np.nan_to_num(across).any():
+            response = response.copy()
+            response[rows, :, 1 - p] = np.nan
+    return measured if response is measured.response else replace(measured, response=response)
+
+
+def _computed(data: ResponseData) -> bool:
+    """Whether the RF's orbit is the design's own."""
+    try:
+        design = data.design.rf_orbit(data.kicks[-1])[data.at]
+    except UnstableRingError:
+        return False
+    return of_design(data.orbits[-1], design, data.noise)

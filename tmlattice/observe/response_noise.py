@@ -5,10 +5,13 @@ the same way for every corrector that does not stand among them (and the energy'
 one neighbour more). What is left of the best such rule has the noise of all its readings.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.noise import SAME_PLACE
 
@@ -16,19 +19,39 @@ Array = NDArray[np.float64]
 
 NEIGHBOURS = 4
 """Readings that a monitor's follows from: two for the orbit, one for the energy, one to spare."""
-SPARE = 3
+SPARE = 2
 """Times as many columns as neighbours at least, for a rule to be fitted."""
-AMONG = 0.2
-"""Share of the columns that may stand among the neighbours: the furthest off are left out."""
+WRONG = 0.1
+"""Share of the columns that need not follow it: readings that went wrong."""
+OVERSTATED = 3.0
+"""So many times what the readings leave is too large a noise."""
 _MAD = 1.4826  # of a Gaussian
 
 
-def learnt_noise(measured: OrbitResponse, s: Array) -> Array:
+class Places(NamedTuple):
+    """Where monitors and correctors stand, m, and the length of the ring."""
+
+    monitors: Array
+    correctors: Array
+    length: float
+
+
+def places(ring: Ring, measured: OrbitResponse) -> Places:
+    """Of a measurement's monitors and correctors."""
+    s = [
+        np.array([ring[name].s for name in names])
+        for names in (measured.monitors, measured.correctors)
+    ]
+    return Places(s[0], s[1], ring.length)
+
+
+def learnt_noise(measured: OrbitResponse, where: Places) -> Array:
     """rms of one orbit change, m, [monitor, 2], the same for all monitors of a plane.
 
     Args:
         measured: in beam order.
-        s: where its monitors stand, m; one signal under two names counts once (see `noise`).
+        where: its monitors and correctors stand; one signal under two names counts once (see
+            `noise`).
 
     Raises:
         MeasurementError: too few monitors or columns.
@@ -38,11 +61,11 @@ def learnt_noise(measured: OrbitResponse, s: Array) -> Array:
     for p in (0, 1):
         own = measured.response[planes == p, :, p]
         seen = np.isfinite(own).mean(axis=0) > 0.5 if len(own) else np.zeros(0, dtype=bool)
-        read, places = own[:, seen], s[seen]
-        copied = (np.diff(read, axis=1) == 0).all(axis=0) & (np.diff(places) < SAME_PLACE)
-        read = read[:, ~np.append(False, copied)[: len(places)]]
-        read = read[np.isfinite(read).all(axis=1)]
-        found.append(_left(read))
+        read, s = own[:, seen], where.monitors[seen]
+        copied = (np.diff(read, axis=1) == 0).all(axis=0) & (np.diff(s) < SAME_PLACE)
+        alone = ~np.append(False, copied)[: len(s)]
+        kicked = where.correctors[planes == p]
+        found.append(_left(read[:, alone], s[alone], kicked, where.length))
     sizes = np.array(found)
     if not np.isfinite(sizes).any():
         raise MeasurementError(
@@ -53,21 +76,63 @@ def learnt_noise(measured: OrbitResponse, s: Array) -> Array:
     return np.tile(sizes, (len(measured.monitors), 1))
 
 
-def _left(read: Array) -> float:
-    """Of [column, monitor], in beam order."""
-    columns, monitors = read.shape if read.ndim == 2 else (0, 0)
-    if columns < SPARE * NEIGHBOURS or monitors < NEIGHBOURS + 1:
-        return float("nan")
+def completed(ring: Ring, measured: OrbitResponse) -> Array:
+    """The noise that is stated, m, [monitor, 2]; where a monitor has none, what is usual of its
+    plane, and where no monitor of a plane has, what the readings tell.
+
+    Raises:
+        MeasurementError: they do not tell it either.
+    """
+    shape = (len(measured.monitors), 2)
+    noise = np.full(shape, np.nan) if measured.noise is None else np.asarray(measured.noise)
+    for p in (0, 1):
+        there = np.isfinite(noise[:, p])
+        if there.any():
+            blank = np.isnan(noise) & (np.arange(2) == p)
+            noise = np.where(blank, np.median(noise[there, p]), noise)
+    if np.isnan(noise).any():
+        noise = np.where(np.isnan(noise), learnt_noise(measured, places(ring, measured)), noise)
+    return noise
+
+
+def no_more(ring: Ring, measured: OrbitResponse, noise: Array) -> Array:
+    """The noise, in the planes where it is stated far too large as large as the readings leave it,
+    which is more than it is.
+
+    Args:
+        ring, measured: whose it is.
+        noise: as it is stated, m, [monitor, 2].
+    """
+    try:
+        shown = learnt_noise(measured, places(ring, measured))
+    except MeasurementError:  # too few readings say nothing
+        return noise
+    over = np.median(noise, axis=0) > OVERSTATED * shown[0]
+    return np.where(over, shown, noise)
+
+
+def _left(read: Array, s: Array, kicked: Array, length: float) -> float:
+    """Of [column, monitor], in beam order; NaN where too few say it.
+
+    Args:
+        read: m, NaN where nothing was read.
+        s: where the monitors stand, m.
+        kicked: where the columns' correctors stand, m.
+        length: of the ring, m.
+    """
     left = []
-    for m in range(monitors):
-        at = (m + np.arange(-(NEIGHBOURS // 2), NEIGHBOURS // 2 + 1)) % monitors
-        others = read[:, np.delete(at, NEIGHBOURS // 2)]
-        kept = np.ones(columns, dtype=bool)
-        for _ in range(3):  # correctors that stand among them do not follow the rule
-            rule = np.linalg.lstsq(others[kept], read[kept, m], rcond=None)[0]
-            miss = np.abs(read[:, m] - others @ rule)
-            kept = miss <= np.quantile(miss, 1 - AMONG)
+    for m in range(len(s)) if len(s) > NEIGHBOURS else ():
+        at = (m + np.arange(-(NEIGHBOURS // 2), NEIGHBOURS // 2 + 1)) % len(s)
+        among = (kicked - s[at[0]]) % length <= (s[at[-1]] - s[at[0]]) % length
+        rows = ~among & np.isfinite(read[:, at]).all(axis=1)
+        if rows.sum() < SPARE * NEIGHBOURS:
+            continue
+        others, own = read[rows][:, np.delete(at, NEIGHBOURS // 2)], read[rows, m]
+        kept = np.ones(len(own), dtype=bool)
+        for _ in range(3):
+            rule = np.linalg.lstsq(others[kept], own[kept], rcond=None)[0]
+            miss = np.abs(own - others @ rule)
+            kept = miss <= np.quantile(miss, 1 - WRONG)
         freedom = (kept.sum() - NEIGHBOURS) / kept.sum()
-        rms = np.median(miss) * _MAD / np.sqrt(freedom * (1 + rule @ rule))
-        left.append(rms)
-    return float(np.median(left))
+        left.append(np.median(miss) * _MAD / np.sqrt(freedom * (1 + rule @ rule)))
+    return float(np.median(left)) if left else float("nan")

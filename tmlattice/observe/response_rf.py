@@ -16,6 +16,8 @@ SAME = 1e-9
 FEW, ENOUGH = 0.5, 0.75
 """Share of numbers that differ, at most, of what was computed; and at least of the correctors'
 orbits, which are read with the same digits."""
+NEARER = 0.05
+"""Of the noise, rms: no reading is so near to a model."""
 LEAST = 6
 """Monitors that it takes to say so."""
 
@@ -39,6 +41,19 @@ def computed(orbit: Array, response: Array) -> bool:
     if np.isfinite(orbit).sum() < LEAST or not columns:
         return False
     return _differ(orbit) <= FEW and bool(np.median(columns) >= ENOUGH)
+
+
+def of_design(orbit: Array, design: Array, noise: Array) -> bool:
+    """Whether an RF's orbit is the design's own: nearer to it than readings are to the truth.
+
+    Args:
+        orbit: m, [monitor, 2], NaN where nothing was read.
+        design: what the design makes of it, m, [monitor, 2].
+        noise: of a reading, m, [monitor, 2].
+    """
+    apart = (orbit - design)[:, 0] / noise[:, 0]
+    apart = apart[np.isfinite(apart)]
+    return len(apart) >= LEAST and bool(np.sqrt(np.mean(apart**2)) < NEARER)
 
 
 def _differ(read: Array) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.response_noise import learnt_noise
+from tmlattice.observe.response_noise import OVERSTATED, learnt_noise, places
 
 UNDERSTATED = 2.0
 """So many times the stated noise is told, where the readings show it."""
@@ -24,13 +24,13 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
             f"{x} in x and {y} in y (a jitter of the beam is not in it)"
         )
     else:
-        said += _understated(data)
+        said += _misstated(data)
     rf = data.measured.rf
     if rf is None or rf.orbit is None:
         copied = measured.rf is not None and measured.rf.orbit is not None
         why = (
-            "the RF step's orbit repeats to the last digit, is a model's and no measurement, and "
-            "is left out"
+            "the RF step's orbit repeats to the last digit, or is the design's own: it is a "
+            "model's and no measurement, and is left out"
             if copied
             else "there is no RF step"
         )
@@ -51,19 +51,24 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
     return said
 
 
-def _understated(data: ResponseData) -> list[str]:
-    """Where the readings scatter by far more than the noise that is stated."""
+def _misstated(data: ResponseData) -> list[str]:
+    """Where the readings scatter by far more, or less, than the noise that is stated."""
     measured = data.measured  # in beam order
     if measured.noise is None:
         return []
     try:
-        shown = learnt_noise(measured, np.array([data.ring[name].s for name in measured.monitors]))
+        shown = learnt_noise(measured, places(data.ring, measured))
     except MeasurementError:  # too few readings say nothing
         return []
     stated = np.nanmedian(measured.noise, axis=0)
-    return [
-        f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors leave "
-        f"{1e6 * seen:.2g} µm of each other's readings: chi-square is as much too large"
-        for plane, own, seen in zip("xy", stated, shown[0], strict=True)
-        if seen > UNDERSTATED * own
-    ]
+    said = []
+    for plane, own, seen in zip("xy", stated, shown[0], strict=True):
+        but = (
+            f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors "
+            f"leave {1e6 * seen:.2g} µm of each other's readings"
+        )
+        if seen > UNDERSTATED * own:
+            said.append(f"{but}: chi-square is as much too large")
+        elif own > OVERSTATED * seen:
+            said.append(f"{but}, which is taken")
+    return said

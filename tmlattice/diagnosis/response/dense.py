@@ -53,8 +53,9 @@ log = logging.getLogger(__name__)
 
 LEAST = 5.0
 """Log evidence that a step has to have."""
-SPOILT = 0.05
-"""By how much the judges' figures may rise with all families together."""
+SPOILT, ENOUGH = 0.05, 3
+"""By how much the judges' figures may rise with all families together, and judges that it takes to
+say so: one of them alone may be near the design by chance."""
 ASTRAY, NEAR = 1.2, 1e-3
 """So many times what the design leaves of the typical column's square no result may leave; or this
 share of it, if that is more."""
@@ -185,13 +186,15 @@ def fit_steps(
     stages.clear()
     state, gone, others = _needed(state, steps, most, progress)
     refused, doubts = [replace(steps.pop(own), kept=False) for own in gone], [*doubts, *others]
-    spoilt = -lost(inner(replace(design, jitter=state.jitter)), inner(state))[0]
+    judged = inner(state)
+    enough = int(np.sum(judged.columns[:, 0, 1] > 0)) >= ENOUGH
+    spoilt = -lost(inner(replace(design, jitter=state.jitter)), judged)[0]
     nothing = DenseFit(
         design, design, (Step.scored("design", 0, before),),
         (*refused, *(replace(step, kept=False) for step in steps.values())),
         (before, before), (*odd.said, *doubts),
     )  # fmt: skip
-    if spoilt > SPOILT:  # all together spoil what they should mend
+    if enough and spoilt > SPOILT:  # all together spoil what they should mend
         return nothing
     progress("result")
     # those that chose start at what they say: a column far off would weigh nothing, and stay there
@@ -291,7 +294,10 @@ def one_by_one(
     """The state with one trial's families after another, each fitted beside those before it;
     without those that the ring has no places of, or the measurement no readings."""
     for given in trials:
-        told = tuple(family for family in given.families if state.reads(family.block))
+        told = tuple(
+            family for family in given.families
+            if state.reads(family.block) and family.size(state.data)
+        )  # fmt: skip
         trial = replace(given, families=told)
         if not any(family.count(state.data) for family in trial.families):
             continue

@@ -80,9 +80,9 @@ def first_guess(design: State) -> Guess | None:
         design: with no families yet.
     """
     stands = strange(design)
-    if not stands > FAR:
-        return None
     family = QuadrupoleGradient()
+    if not stands > FAR or not family.size(design.data):
+        return None
     start = allow(design, [family])
     own = magnets(design.data.ring, ("quadrupole",), True)
     focusing = np.array([pieces[0].k1 > 0 for pieces in own])

@@ -20,6 +20,9 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
 reading a monitor), and by how much their sum may fall without a step that stays all the same:
 evidence takes what the model lacks for noise, and gladly fits it."""
+FLOOR = np.array([0.1, 0.1, 1.0])
+"""Of the noise, beside what is left in-plane, across and of the RF: what is left of nothing (a
+model's own orbit) is no better for being less."""
 SURELY, WORTH = 1.0, 0.05
 """Standard errors of a fall from which on it counts; and how much one is at least that refuses what
 most of the readings ask for."""
@@ -206,7 +209,11 @@ def inner(state: State, by_others: Array | None = None) -> Judged:
     if by_others is not None:
         rf = np.stack([np.nan_to_num(by_others) ** 2, np.isfinite(by_others)], axis=1)
     rf[said[0].rf_monitors] = np.stack([said[0].rf ** 2, np.ones(len(said[0].rf))], axis=1)
-    return Judged(sums[0] + sums[1], rf)
+    floor = (FLOOR * float(np.median(state.data.noise))) ** 2
+    columns = sums[0] + sums[1]
+    columns[..., 0] += floor[:2] * columns[..., 1]
+    rf[:, 0] += floor[2] * rf[:, 1]
+    return Judged(columns, rf)
 
 
 def lost(without: Judged, within: Judged) -> tuple[float, float]:

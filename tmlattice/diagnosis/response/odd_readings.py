@@ -25,8 +25,12 @@ GROSS = 20.0
 of its monitor, no error of a ring makes of one reading alone: it went wrong."""
 OUT = 5.0
 """A reading sticks out from so many times what is left of its column's typical one."""
+LEAST = 6
+"""Readings of the RF's orbit that say what is usual of them."""
 NAMED = 3
 """Monitors and correctors that are named."""
+MANY = 8
+"""Readings of the RF's orbit that are named."""
 OFTEN = 2
 """Readings of one monitor, or corrector, from which it is named."""
 _MAD = 1.4826  # of a Gaussian
@@ -106,6 +110,23 @@ def robust(state: State) -> State:
     return replace(state, share=np.ones((2, *state.data.shape)))
 
 
+def rf_shares(state: State, block: int, left: Array) -> Array:
+    """By which each reading of the RF's orbit counts, [block, monitor]: it is one orbit, and a few
+    of its readings that went wrong (0 where nothing was read, say) make kicks and energies of it.
+
+    Args:
+        state: that is fitted.
+        block: 0 in-plane, 1 coupling.
+        left: what the fit leaves of it, m, NaN where nothing is fitted, [monitor].
+    """
+    own = np.ones((2, len(left))) if state.rf_share is None else state.rf_share.copy()
+    if np.isfinite(left).sum() >= LEAST:
+        typical = _MAD * float(np.nanmedian(np.abs(left)))
+        pull = np.nan_to_num(np.abs(left) / np.maximum(state.data.noise_of(block)[-1], typical))
+        own[block] = (OUT / np.maximum(pull, OUT)) ** 4
+    return own
+
+
 def shares(state: State, block: int, left: Array) -> Array:
     """By which each reading of the correctors counts; the RF's are few, and all count alike.
 
@@ -130,9 +151,10 @@ def _pulls(state: State, block: int, left: Array) -> Array:
 
 
 def odd_readings(state: State) -> list[str]:
-    """A sentence of those that stick out of a result, where there are any."""
+    """Sentences of those that stick out of a result, where there are any."""
     if state.share is None:
         return []
+    said = _odd_rf(state)
     measured, monitors, correctors = state.data.measured, Counter[str](), Counter[str]()
     count = total = 0
     for block in (0, 1):
@@ -143,8 +165,24 @@ def odd_readings(state: State) -> list[str]:
         monitors.update(measured.monitors[i] for i in np.nonzero(out)[1])
         correctors.update(measured.correctors[i] for i in np.nonzero(out)[0])
     if not count:
-        return []
+        return said
     return [
+        *said,
         f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
-        f"corrector's typical one, and count little{_most(monitors, correctors)}."
+        f"corrector's typical one, and count little{_most(monitors, correctors)}.",
+    ]
+
+
+def _odd_rf(state: State) -> list[str]:
+    """A sentence of the RF's readings that count little."""
+    if state.rf_share is None:
+        return []
+    odd = np.flatnonzero((state.rf_share < 1).any(axis=0) & state.good)
+    if not len(odd):
+        return []
+    names = ", ".join(state.data.measured.monitors[i] for i in odd[:MANY])
+    more = f" and {len(odd) - MANY} more" if len(odd) > MANY else ""
+    return [
+        f"readings of the RF's orbit that stick out of it by more than {OUT:g} times what is usual "
+        f"of it, and count next to nothing: {names}{more}."
     ]

@@ -38,6 +38,7 @@ from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps
 from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
 from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.first_guess import FAR, strange
 from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
@@ -60,6 +61,7 @@ from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import response_data
+from tmlattice.observe.response_noise import no_more
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
@@ -114,9 +116,14 @@ def diagnose_response(
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
+    estimated = measured.noise is None
     measured = mended(ring, measured, assume)
     trials, data = trials_of(effects), response_data(ring, measured)
     said = [*consulted(ring, measured), *assumed_of(measured, data)]
+    noise = data.noise if estimated else no_more(ring, data.measured, data.noise)
+    if noise is not measured.noise:
+        measured = replace(data.measured, noise=noise)
+        data = replace(data, measured=measured, noise=noise)
     measured, gross = without_gross(measured, data)
     if gross:
         said, data = said + gross, response_data(ring, measured)
@@ -143,7 +150,7 @@ def diagnose_response(
     causes = tuple(cause_of(own) for own in findings if own.effect)
     return as_diagnosis(
         ring, fit, fit.state.at.errors.ring, found,
-        noise_estimated=measured.noise is None,
+        noise_estimated=estimated,
         verdict=verdict,
         findings=with_consequences(ring, findings, causes),
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
@@ -175,7 +182,9 @@ def _families(
         state = begin(data, split) if fit is None else fit.state
         odd = strangers(state)
         others = set() if fit is None else _anothers(state)
-        right = righted(state, measured, known, odd, others)
+        # in a design that is far off exchanged columns fit by chance: the ring is fitted first
+        far = fit is None and strange(state) > FAR
+        right = None if far else righted(state, measured, known, odd, others)
         if right is not None:
             measured, fit = right[0], None
             said.append(right[1])

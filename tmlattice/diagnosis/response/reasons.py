@@ -173,7 +173,7 @@ class Reasons:
 def explain_gradients(state: State) -> Reasons | None:
     """The few reasons behind the gradients of a dense fit; None where none were fitted."""
     family = QuadrupoleGradient()
-    if family.variable not in state.values:
+    if family.variable not in state.values or not family.size(state.data):
         return None
     there = linear(state, 0)
     information, pull = marginal(there, [family.variable])

@@ -81,6 +81,7 @@ class State:
         exploring: the inner correctors choose, and are not fitted.
         kept: rows of the ring's variables, that stand until the ring has moved.
         share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
+        rf_share: by which the RF's readings count, [block, monitor]; None: all alike.
         apart: numbers that are wrong alone.
         independent: share of the readings that tell something of their own, see `independent`,
             [block, plane that is read]; None: all are taken to.
@@ -102,6 +103,7 @@ class State:
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
     share: Array | None = None
+    rf_share: Array | None = None
     apart: tuple[Apart, ...] = ()
     independent: Array | None = None
     jitter: Array | None = None

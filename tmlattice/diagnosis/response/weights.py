@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.independent import independent
-from tmlattice.diagnosis.response.odd_readings import shares
+from tmlattice.diagnosis.response.odd_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference.common import amounts, beside, common
 
@@ -43,9 +43,11 @@ def weight(state: State, block: int) -> Array:
     if state.exploring:
         use[-1] &= ~split.inner_rf
     variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
-    count = counts(state, block)
+    count = np.array(np.broadcast_to(counts(state, block), use.shape))
     if state.share is not None:
-        count = count * state.share[block]
+        count *= state.share[block]
+    if state.rf_share is not None:
+        count[-1] *= state.rf_share[block]
     return np.where(use, count / variance, 0.0)
 
 
@@ -115,6 +117,7 @@ def look(state: State, block: int) -> State:
     squares = shared / (TYPICAL + use.sum(axis=1))
     if state.allows(DISPERSION):
         squares[-1] = typical**2  # it is one column among many, and counts like any
+        state = replace(state, rf_share=rf_shares(state, block, left[-1]))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
     good = state.good & _good_across(state) if block else good_monitors(state)
