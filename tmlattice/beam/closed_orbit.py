@@ -301,13 +301,6 @@ class ResponseModel:
         up, down = (self.at_frequency(self.frequency + side * step / 2) for side in (1, -1))
         return up.readings - down.readings
 
-    def rf_orbit(self, step: float) -> Array:
-        """The same, linear where so large a step leads to no closed orbit, m, [monitor, 2]."""
-        try:
-            return self.rf_change(step)
-        except UnstableRingError:
-            return self.rf_response() * step
-
     def _kicks(self, place: Indices, layer: Indices) -> tuple[Array, Array]:
         """Correctors' kicks at their layers' exits, [column, n], and how they depend on the state
         at the entrances, [column, n, n]; the maps are the same on every orbit."""

@@ -151,7 +151,7 @@ class Predicted:
         """
         data = self.data
         steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
-        whole = np.concatenate([steps, model.rf_orbit(data.kicks[-1])[None]])[:, data.at]
+        whole = np.concatenate([steps, model.rf_change(data.kicks[-1])[None]])[:, data.at]
         if np.any(self.errors.dispersion):
             at_monitors = np.asarray(self.errors.dispersion) / data.energy_of_rf
             names = data.measured.correctors

@@ -34,5 +34,5 @@ def predict(model: ResponseModel, measured: OrbitResponse) -> OrbitResponse:
     response = model.response(measured.correctors)[:, at]
     rf = measured.rf
     if rf is not None and model.dimension == 6:
-        rf = replace(rf, orbit=model.rf_orbit(rf.step / rf.frequency)[at])
+        rf = replace(rf, orbit=model.rf_change(rf.step / rf.frequency)[at])
     return replace(measured, response=np.asarray(measured.kicks)[:, None, None] * response, rf=rf)

@@ -131,7 +131,7 @@ def _without_blanks(measured: OrbitResponse) -> OrbitResponse:
 def _computed(data: ResponseData) -> bool:
     """Whether the RF's orbit is the design's own."""
     try:
-        design = data.design.rf_orbit(data.kicks[-1])[data.at]
+        design = data.design.rf_change(data.kicks[-1])[data.at]
     except UnstableRingError:
         return False
     return of_design(data.orbits[-1], design, data.noise)

@@ -100,9 +100,14 @@ def first_guess(design: State) -> Guess | None:
     return found
 
 
-def strange(state: State) -> float:
+def strange(state: State, least: int = 1) -> float:
     """Share of the typical column's mean square that is left with a kick of its own, in its plane,
-    of the worse plane."""
+    of the worse plane.
+
+    Args:
+        state: what the model makes of the readings.
+        least: columns of a plane that it takes to say what is typical.
+    """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]
     seen = np.isfinite(orbits) & state.fitted[:-1, None] & state.good
@@ -113,6 +118,6 @@ def strange(state: State) -> float:
     shares = [
         np.median(left[rows] / size[rows])
         for rows in ((data.plane[:-1] == p) & (size > 0) for p in (0, 1))
-        if rows.any()
+        if rows.sum() >= least
     ]
     return float(max(shares, default=0.0))

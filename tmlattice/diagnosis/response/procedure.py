@@ -48,7 +48,7 @@ from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.rf_by_others import rf_known_to
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.strangers import ODD, reversed_ones, strangers
+from tmlattice.diagnosis.response.strangers import ODD, Strangers, reversed_ones, strangers
 from tmlattice.diagnosis.response.told import told
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import Diagnosis, Finding
@@ -76,6 +76,8 @@ LARGE = 60_000
 """Readings up to which single faults among small errors are sought: every number is fitted anew
 for each of them."""
 TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
+TYPICAL = 6
+"""Columns of a plane that say what a design leaves of the typical one."""
 BLOCKS = ("in-plane", "coupling", "RF")
 AS_KNOWN = 1.5
 """So many times what a fit knows of the RF's orbit where it did not fit it is no sign of more."""
@@ -182,8 +184,7 @@ def _families(
         state = begin(data, split) if fit is None else fit.state
         odd = strangers(state)
         others = set() if fit is None else _anothers(state)
-        # in a design that is far off exchanged columns fit by chance: the ring is fitted first
-        far = fit is None and strange(state) > FAR
+        far = fit is None and _far(state, odd)
         right = None if far else righted(state, measured, known, odd, others)
         if right is not None:
             measured, fit = right[0], None
@@ -202,6 +203,14 @@ def _families(
         elif fit is not None:
             return fit, measured, [*said, *fit.said], known
         fit = fit_steps(data, split, trials, most, progress)
+
+
+def _far(state: State, odd: Strangers) -> bool:
+    """Whether the ring is to be fitted before columns are exchanged: in a design that is far off
+    they fit in each other's place by chance."""
+    gone = {name for name, _ in odd.monitors}
+    good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
+    return strange(replace(state, good=good), TYPICAL) > FAR
 
 
 def _anothers(state: State) -> set[str]:
