@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from tmlattice import diagnose, load_ring
 from tmlattice.cli.command import tmlattice
-from tmlattice.diagnosis.response import before_after
+from tmlattice.diagnosis.response import few
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import write_ring
@@ -166,9 +166,9 @@ def test_a_fit_of_everything_is_held_against_few_causes_in_the_planes_that_were_
         return SimpleNamespace(state=state, heldout=(None, said))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(before_after, "score", lambda state, held: state.said)
-        patch.setattr(before_after, "replace", lambda state, good: state)
-        knows = before_after._knows_more
+        patch.setattr(few, "score", lambda state, held: state.said)
+        patch.setattr(few, "replace", lambda state, good: state)
+        knows = few.knows_more
         assert knows(fit(1e-6, np.nan), fit(2e-6, np.nan))
         assert not knows(fit(2e-6, np.nan), fit(2e-6, np.nan))
         assert knows(fit(2e-6, 1e-6), fit(2e-6, 2e-6))

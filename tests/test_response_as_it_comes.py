@@ -75,17 +75,12 @@ def rf_zero(measured, ring):
     return replace(measured, rf=replace(measured.rf, orbit=orbit))
 
 
-def noise_of_a_default(measured, ring):
-    return replace(measured, noise=20 * measured.noise)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (zeros_across, "no corrector is read in the other plane"),
         (of_a_model, "is a model's and no measurement"),
         (rf_zero, "readings of the RF's orbit that stick out"),
-        (noise_of_a_default, "which is taken"),
     ],
 )
 def test_it_is_said_and_the_fit_is_as_good(ring, measured, change, words):
@@ -93,6 +88,15 @@ def test_it_is_said_and_the_fit_is_as_good(ring, measured, change, words):
     result = diagnose(ring, change(measured, ring))
     assert left(result) < 1.25
     assert said(result, words), result.warnings
+    assert not result.findings
+
+
+def test_a_noise_of_a_default_is_not_explained_by_a_few_causes(ring, measured):
+    """Ten times too large, it had been: three magnets, monitors and correctors, 11 of it left."""
+    wrong = replace(measured, noise=10 * measured.noise)
+    result = diagnose(ring, wrong)
+    assert left(result) < 2.5
+    assert said(result, "it is too large, or a jitter of the beam")
     assert not result.findings
 
 

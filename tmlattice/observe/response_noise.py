@@ -24,7 +24,7 @@ SPARE = 2
 WRONG = 0.1
 """Share of the columns that need not follow it: readings that went wrong."""
 OVERSTATED = 3.0
-"""So many times what the readings leave is too large a noise."""
+"""So many times what the readings leave is too large a noise, or a jitter of the beam."""
 _MAD = 1.4826  # of a Gaussian
 
 
@@ -95,20 +95,16 @@ def completed(ring: Ring, measured: OrbitResponse) -> Array:
     return noise
 
 
-def no_more(ring: Ring, measured: OrbitResponse, noise: Array) -> Array:
-    """The noise, in the planes where it is stated far too large as large as the readings leave it,
-    which is more than it is.
-
-    Args:
-        ring, measured: whose it is.
-        noise: as it is stated, m, [monitor, 2].
-    """
+def overstated(ring: Ring, measured: OrbitResponse) -> bool:
+    """Whether the noise is stated far larger, in one plane, than neighbours leave of each other's
+    readings: it has a jitter of the beam in it, which they share, or is wrong."""
+    if measured.noise is None:
+        return False
     try:
         shown = learnt_noise(measured, places(ring, measured))
     except MeasurementError:  # too few readings say nothing
-        return noise
-    over = np.median(noise, axis=0) > OVERSTATED * shown[0]
-    return np.where(over, shown, noise)
+        return False
+    return bool((np.nanmedian(measured.noise, axis=0) > OVERSTATED * shown[0]).any())
 
 
 def _left(read: Array, s: Array, kicked: Array, length: float) -> float:

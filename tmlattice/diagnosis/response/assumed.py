@@ -70,5 +70,5 @@ def _misstated(data: ResponseData) -> list[str]:
         if seen > UNDERSTATED * own:
             said.append(f"{but}: chi-square is as much too large")
         elif own > OVERSTATED * seen:
-            said.append(f"{but}, which is taken")
+            said.append(f"{but}: it is too large, or a jitter of the beam")
     return said

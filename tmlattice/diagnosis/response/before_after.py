@@ -35,7 +35,7 @@ from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step, fit_steps, one_by_one
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
 from tmlattice.diagnosis.response.exchanged_since import all_right, since
-from tmlattice.diagnosis.response.few import Few, few_causes
+from tmlattice.diagnosis.response.few import Few, few_causes, knows_more
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import LeftOpen, and_orbits, left_open
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
@@ -61,9 +61,6 @@ ANY = 6.0
 """rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets from which a change of all of them is told though none stands out."""
-LESS = 0.98
-"""Of what a few causes leave, both planes' rms multiplied: small errors everywhere have to leave
-less, or the few have it."""
 LEAST_NOISE = 0.2
 """Share of the stated noise that two measurements differ by at least."""
 
@@ -305,16 +302,7 @@ def _few_or_all(
     if few is not None and few.noise:
         return few
     fit = _fit_change(data, split, trials, progress)
-    return fit if few is None or _knows_more(fit, few.fit) else few
-
-
-def _knows_more(fit: DenseFit, few: DenseFit) -> bool:
-    """Whether correctors that were not fitted say that a fit of everything knows more than a few
-    causes do, of the monitors that it takes for good and the planes that were read."""
-    of_all = fit.heldout[1]
-    of_few = score(replace(few.state, good=fit.state.good), few.state.split.held)
-    gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
-    return bool(np.nansum(gained) < np.log(LESS))
+    return fit if few is None or knows_more(fit, few.fit) else few
 
 
 def _verdict(state: State) -> str:

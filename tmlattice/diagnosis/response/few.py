@@ -58,6 +58,10 @@ ROUNDS, SETTLED = 30, 0.99
 """Of filling in what was not read, at most, and the share of chi-square that another one leaves
 where it is worth no more: of a column that is read by half, a round finds half of the rest."""
 
+LESS = 0.98
+"""Of what a few causes leave, both planes' rms multiplied: small errors everywhere have to leave
+less, or the few have it."""
+
 LARGER = 2.0
 """Times the largest fault: a kick of more is none, and stands for what it does to the tunes by all
 sextupoles."""
@@ -155,6 +159,15 @@ def few_causes(
     if found is None:
         return None
     return _told(data, split, problem.base, found, count, most, judgement)
+
+
+def knows_more(fit: DenseFit, few: DenseFit) -> bool:
+    """Whether correctors that were not fitted say that a fit of everything knows more than a few
+    causes do, of the monitors that it takes for good and the planes that were read."""
+    of_all = fit.heldout[1]
+    of_few = score(replace(few.state, good=fit.state.good), few.state.split.held)
+    gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
+    return bool(np.nansum(gained) < np.log(LESS))
 
 
 def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> Explanation | None:

@@ -37,7 +37,7 @@ from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps
 from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
-from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.few import few_causes, knows_more
 from tmlattice.diagnosis.response.first_guess import FAR, strange
 from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
@@ -61,7 +61,7 @@ from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_noise import no_more
+from tmlattice.observe.response_noise import overstated
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
@@ -122,20 +122,18 @@ def diagnose_response(
     measured = mended(ring, measured, assume)
     trials, data = trials_of(effects), response_data(ring, measured)
     said = [*consulted(ring, measured), *assumed_of(measured, data)]
-    noise = data.noise if estimated else no_more(ring, data.measured, data.noise)
-    if noise is not measured.noise:
-        measured = replace(data.measured, noise=noise)
-        data = replace(data, measured=measured, noise=noise)
+    measured = replace(data.measured, noise=data.noise) if estimated else measured
     measured, gross = without_gross(measured, data)
     if gross:
         said, data = said + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
+    if few is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+        whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
+        few = None if few is None or knows_more(whole[0], few.fit) else few
     if few is None:
-        fit, measured, odd, exchanges = _families(
-            ring, measured, trials, holdout, max_effects, seed, progress
-        )
+        fit, measured, odd, exchanges = whole
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
         found, degenerate = told(fit.state)
