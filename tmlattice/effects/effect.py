@@ -176,11 +176,15 @@ class Effect(ABC):
                 f"it sits on: {self.sits_on_text}"
             )
 
+    def _named(self, ring: Ring) -> list[str | None]:
+        """All names by which somebody may call its places."""
+        return self.places(ring)
+
     def _allowed(self, ring: Ring) -> frozenset[str | None]:
         """Its places without regard to case: found once a ring, for thousands of small errors."""
         key = ("places", self.name)
         if key not in ring.memory:
-            ring.memory[key] = frozenset(p and p.casefold() for p in self.places(ring))
+            ring.memory[key] = frozenset(p and p.casefold() for p in self._named(ring))
         found: frozenset[str | None] = ring.memory[key]
         return found
 
@@ -295,10 +299,10 @@ class FamilyEffect(StrengthEffect):
         named = _several(e.family for e in powered)
         return [*(named or _several(stem(e.name) for e in powered))]
 
-    def _allowed(self, ring: Ring) -> frozenset[str | None]:
+    def _named(self, ring: Ring) -> list[str | None]:
         """And what the names of several families begin with."""
         begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
-        return super()._allowed(ring) | set(begin)
+        return [*self.places(ring), *begin]
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
         """All magnets of the family; or, where none is called so, those whose names begin so, up

@@ -187,29 +187,25 @@ class Predicted:
         """What a mean square energy deviation of `DELTA` squared adds to that.
 
         A monitor reads the centroid of particles whose orbits answer each as its energy has it:
-        half the second derivative by the energy, times the mean square. 0 where a ring stores no
-        beam so far off.
+        half the second derivative by the energy, times the mean square.
         """
-        try:
-            up, down = self._off_energy
-        except UnstableRingError:
-            return np.zeros_like(self.straight)
+        up, down = self._off_energy
         return np.asarray((up + down) / 2 - self.straight)
 
     @cached_property
     def chromatic(self) -> Array:
-        """d orbit changes / d relative energy of the beam, m, [column, monitor, 2]; 0 where a ring
-        stores no beam so far off, for that says nothing of it."""
-        try:
-            up, down = self._off_energy
-        except UnstableRingError:
-            return np.zeros_like(self.straight)
+        """d orbit changes / d relative energy of the beam, m, [column, monitor, 2]."""
+        up, down = self._off_energy
         return np.asarray((up - down) / (2 * DELTA))
 
     @cached_property
     def _off_energy(self) -> tuple[Array, Array]:
-        """Orbit changes of one particle `DELTA` above and below."""
-        up, down = (self.orbits(self.model.at_energy(side * DELTA)) for side in (1, -1))
+        """Orbit changes of one particle `DELTA` above and below; as they are where a ring stores no
+        beam so far off, for that says nothing of it."""
+        try:
+            up, down = (self.orbits(self.model.at_energy(side * DELTA)) for side in (1, -1))
+        except UnstableRingError:
+            return self.straight, self.straight
         return up, down
 
     @cached_property

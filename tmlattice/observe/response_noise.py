@@ -95,16 +95,23 @@ def completed(ring: Ring, measured: OrbitResponse) -> Array:
     return noise
 
 
+def stated_and_shown(ring: Ring, measured: OrbitResponse) -> Array | None:
+    """The typical noise that is stated, and the one that neighbours leave of each other's readings,
+    m, [which, plane]; None where nothing is stated, or too few readings say it."""
+    if measured.noise is None:
+        return None
+    try:
+        shown = learnt_noise(measured, places(ring, measured))
+    except MeasurementError:
+        return None
+    return np.stack([np.nanmedian(measured.noise, axis=0), shown[0]])
+
+
 def overstated(ring: Ring, measured: OrbitResponse) -> bool:
     """Whether the noise is stated far larger, in one plane, than neighbours leave of each other's
     readings: it has a jitter of the beam in it, which they share, or is wrong."""
-    if measured.noise is None:
-        return False
-    try:
-        shown = learnt_noise(measured, places(ring, measured))
-    except MeasurementError:  # too few readings say nothing
-        return False
-    return bool((np.nanmedian(measured.noise, axis=0) > OVERSTATED * shown[0]).any())
+    both = stated_and_shown(ring, measured)
+    return both is not None and bool((both[0] > OVERSTATED * both[1]).any())
 
 
 def _left(read: Array, s: Array, kicked: Array, length: float) -> float:

@@ -15,11 +15,10 @@ from tmlattice.plots.strip import lattice_strip, plain_log
 
 def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure: (name, caption, figure); close each after use."""
-    before = "reference" if result.since_reference else "design"
     yield (
         "maps",
         "Orbit change by corrector and monitor, each corrector in its own plane: measured, what "
-        f"the {before} leaves of it and what the result does. Grey: left out.",
+        f"the {_before(result)} leaves of it and what the result does. Grey: left out.",
         plot_maps(result),
     )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
@@ -38,19 +37,23 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         )
 
 
+def _before(result: Diagnosis) -> str:
+    """What the fit began at."""
+    return "reference" if result.since_reference else "design"
+
+
 def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Measured response, and what the design (or the reference) and the result leave of it; columns
     by plane and place."""
     figure = plt.figure(figsize=(11, 8), layout="constrained") if figure is None else figure
     view, ring = result.response, result.ring
-    before = "reference" if result.since_reference else "design"
     m = view.measured
     plane = np.array([int(p == "y") for p in m.planes])
     place = np.array([ring[name].s for name in m.correctors])
     order = np.lexsort((place, plane))
     rows = [
         ("measured", view.data),
-        (f"measured - {before}", view.data - view.design),
+        (f"measured - {_before(result)}", view.data - view.design),
         ("measured - result", view.data - view.model),
     ]
     axes = figure.subplots(3, 1, sharex=True)

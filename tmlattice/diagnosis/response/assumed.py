@@ -5,10 +5,9 @@
 
 import numpy as np
 
-from tmlattice.errors import MeasurementError
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.response_noise import OVERSTATED, learnt_noise, places
+from tmlattice.observe.response_noise import OVERSTATED, stated_and_shown
 
 UNDERSTATED = 2.0
 """So many times the stated noise is told, where the readings show it."""
@@ -53,16 +52,11 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
 
 def _misstated(data: ResponseData) -> list[str]:
     """Where the readings scatter by far more, or less, than the noise that is stated."""
-    measured = data.measured  # in beam order
-    if measured.noise is None:
+    both = stated_and_shown(data.ring, data.measured)
+    if both is None:
         return []
-    try:
-        shown = learnt_noise(measured, places(data.ring, measured))
-    except MeasurementError:  # too few readings say nothing
-        return []
-    stated = np.nanmedian(measured.noise, axis=0)
     said = []
-    for plane, own, seen in zip("xy", stated, shown[0], strict=True):
+    for plane, own, seen in zip("xy", *both, strict=True):
         but = (
             f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but neighbouring monitors "
             f"leave {1e6 * seen:.2g} µm of each other's readings"

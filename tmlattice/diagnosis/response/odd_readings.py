@@ -128,7 +128,7 @@ def rf_shares(state: State, block: int, left: Array) -> Array:
 
 
 def shares(state: State, block: int, left: Array) -> Array:
-    """By which each reading of the correctors counts; the RF's are few, and all count alike.
+    """By which each reading of the correctors counts; the RF's have shares of their own.
 
     Args:
         state: that is fitted.
