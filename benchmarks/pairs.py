@@ -2,7 +2,9 @@
 
 The response that was measured is the first day. The second is the same, with what changes of some
 supplies and of some single magnets do to the readings of all that was fitted to the first (AT's
-closed orbits, with less without), drifts of monitors and correctors, and noise of its own.
+closed orbits, with less without; kicks that the dispersion has and no orbit shows, which AT lacks,
+by the package's maps), drifts of monitors and correctors, magnets that come back to 1e-4, and noise
+of its own.
 What the model of the ring lacks is in both days, as it is in two real ones; so is the first one's
 noise, and the second's is drawn larger by that: two days differ by the noise of both.
 
@@ -19,17 +21,26 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from real_rings import imported, sources
 
 import tmlattice
 from tmlattice import Cause, read_measurement
+from tmlattice.diagnosis.families.dispersion import (
+    HorizontalKicks,
+    VerticalKicks,
+    errors_beside,
+    kicks_astray,
+)
 from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
 from tmlattice.diagnosis.response import procedure
 from tmlattice.effects import apply
 from tmlattice.errors import TmlatticeError
 from tmlattice.machine.response import simulate_response
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import response_data
 from tmlattice.optics import ring_tunes
 
 SUPPLIES, SINGLE = 3, 3
@@ -37,11 +48,20 @@ SHIFT = 0.03
 """Of a tune, at most: who changes a ring in use keeps its tunes."""
 DRIFT = 2e-3
 """rms, relative, of gains and kicks from one day to the other."""
+SCATTER = 1e-4
+"""rms, relative, of what every quadrupole has changed by that was not changed."""
 STRANGE = 0.05
 """Share of the square of a column, or a monitor, that a multiple of its model leaves where it takes
 no part: what is exchanged, say, would have the change of another one."""
 KICK = 2e-5
 """rad; of AT's steps, small enough for orbits in proportion to them."""
+
+
+class Known(NamedTuple):
+    """What was fitted to the first day: causes, and kicks that only the dispersion has."""
+
+    causes: list[Cause]
+    astray: np.ndarray | None
 
 
 def drawn(ring, rng, null):
@@ -94,7 +114,8 @@ def first_day(ring, measured):
     """What was measured by what resembles its model, what the model has, and the orbits of that."""
     found = tmlattice.diagnose(ring, measured)
     # a spread would take three times the orbits, and changes theirs by next to nothing
-    known = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
+    causes = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
+    known = Known(causes, kicks_of(response_data(ring, measured), found.dispersion))
     model = simulated(ring, known, measured)
     read, told, kicks = as_kicked(measured, model)
     good = stranger(read, told, 1) < STRANGE
@@ -104,6 +125,20 @@ def first_day(ring, measured):
     monitors = [name for name, own in zip(measured.monitors, left, strict=True) if own < STRANGE]
     measured, model = (own.select(correctors, monitors) for own in (measured, model))
     return known, measured, model
+
+
+def kicks_of(data, dispersion):
+    """Kicks behind each magnet that make a dispersion, rad, as in `kicks_astray`."""
+    made = errors_beside(data, dispersion).dispersion
+    if not np.any(made):
+        return None
+    values = {
+        family.variable: np.linalg.lstsq(
+            family.patterns(data).rf.T, made[:, family.plane], rcond=None
+        )[0]
+        for family in (HorizontalKicks(), VerticalKicks())
+    }
+    return kicks_astray(values, data)
 
 
 def as_kicked(measured, model):
@@ -124,19 +159,39 @@ def stranger(read, told, axis):
     return 1 - both**2 / np.maximum(size * whole, 1e-300)
 
 
-def simulated(ring, causes, measured):
-    """AT's response with the monitors, the correctors and the RF step of a measurement."""
-    rf = measured.rf
+def simulated(ring, known, measured, changes=()):
+    """AT's response with the monitors, the correctors and the RF step of a measurement, and what
+    kicks astray add to it."""
+    rf, causes = measured.rf, [*known.causes, *changes]
     made = simulate_response(
         ring, causes, correctors=list(measured.correctors), kick=KICK, noise=0.0, progress=False,
         rf_step=0.0 if rf is None or rf.orbit is None else rf.step,
-    ).measured  # fmt: skip
+    ).measured.select(monitors=measured.monitors)  # fmt: skip
+    if known.astray is None:
+        return made
+    data = response_data(ring, made)
+    errors = Errors.none(data).with_causes(data, causes)
+    with_kicks, without = (
+        Predicted(replace(data, astray=astray), errors).read for astray in (known.astray, None)
+    )
+    more = with_kicks - without
+    made = data.measured  # its monitors in the ring's order
+    rf = made.rf
+    if rf is not None and rf.orbit is not None:
+        rf = replace(rf, orbit=rf.orbit + more[-1])
+    made = replace(made, response=made.response + more[:-1], rf=rf)
     return made.select(monitors=measured.monitors)
 
 
 def second_day(measured, ring, known, before, changes, rng):
     """What would have been measured then, of a ring with some causes on the first day."""
-    after = simulated(ring, [*known, *causes_of(changes)], measured)
+    scatter = [
+        Cause("quadrupole_gradient", piece.name, amount)
+        for magnet in magnets(ring, ("quadrupole",), powered=True)
+        for amount in [SCATTER * rng.standard_normal()]
+        for piece in magnet
+    ]
+    after = simulated(ring, known, measured, [*causes_of(changes), *scatter])
     kicks = as_kicked(measured, before)[2]
     noise = np.zeros(2) if measured.noise is None else np.sqrt(2) * np.nan_to_num(measured.noise)
     gain = 1 + DRIFT * rng.standard_normal((len(measured.monitors), 2))

@@ -12,7 +12,7 @@ energy's: without losses it is conserved, and what is lost is given back at the 
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -68,9 +68,11 @@ class ResponseModel:
         dimension: 6; or 4 for a beam whose energy stays, whatever the correctors do.
         frequency: relative change of the RF frequency from the one at which the design orbit is
             closed; six coordinates.
+        astray: kicks that the design orbit follows and other energies do not, behind each magnet in
+            x and y, see `beam.kicks`, rad, [magnet, 2]; six coordinates. None: there are none.
 
     Attributes:
-        ring, layers, maps, frequency: what it was made from.
+        ring, layers, maps, frequency, astray: what it was made from.
         state: the closed orbit at the start of the ring, [n].
         path: at the start, at the layers' exits and at the end of the ring, [layer + 2, n].
         tangents: matrices from the start to there, [layer + 2, n, n].
@@ -86,10 +88,18 @@ class ResponseModel:
     layers: LayerMaps
     maps: RingMaps
 
-    def __init__(self, ring: Ring, dimension: int = 6, frequency: float = 0.0) -> None:
+    def __init__(
+        self,
+        ring: Ring,
+        dimension: int = 6,
+        frequency: float = 0.0,
+        astray: Array | None = None,
+    ) -> None:
         self.ring = ring
         self.layers = LayerMaps(ring, dimension)
-        self.maps = ring_maps(ring, dimension, self.layers)
+        self.astray = astray
+        magnets = np.arange(len(ring.magnets))
+        self.maps = self._dispersed(ring_maps(ring, dimension, self.layers), magnets)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
         self._chain = Chain(self.maps)
         self._close(frequency)
@@ -126,10 +136,25 @@ class ResponseModel:
         other.layers, touched = self.layers.changed_to(ring)
         if touched:  # else what kicks do is another, and the orbit is the same
             other._forget()
-            other.maps = changed_maps(self.maps, other.layers, touched)
+            other.maps = other._dispersed(changed_maps(self.maps, other.layers, touched), touched)
             other._chain = Chain(other.maps)
             other._close(self.frequency)
         return other
+
+    def _dispersed(self, maps: RingMaps, layers: Sequence[int] | Indices) -> RingMaps:
+        """With what `astray` says behind some layers: px -= kick p, and tau -= kick x with it, or
+        the map were not symplectic."""
+        if self.astray is None:
+            return maps
+        own = np.array([k for k in layers if k < len(self.astray)], dtype=np.int64)
+        behind = np.tile(np.eye(self.dimension), (len(own), 1, 1))
+        for plane in (0, 1):
+            kick = self.astray[own, plane]
+            behind[:, 2 * plane + 1, 5] = behind[:, 4, 2 * plane] = -kick
+        arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2")}
+        for weights in arrays.values():
+            weights[own] = np.einsum("kij,kj...->ki...", behind, weights[own])
+        return replace(maps, **arrays)
 
     def _forget(self) -> None:
         """What is cached is of this orbit."""

@@ -61,13 +61,17 @@ def _as_the_ring_names_them(ring: Ring, measured: OrbitResponse) -> OrbitRespons
     return replace(measured, monitors=monitors, correctors=correctors)
 
 
-def response_change(before: ResponseData, errors: Errors, after: ResponseData) -> ResponseData:
+def response_change(
+    before: ResponseData, errors: Errors, after: ResponseData, astray: Array | None = None
+) -> ResponseData:
     """What the second measurement would have been in the ring of the first.
 
     Args:
         before: of the design; correctors and monitors as in `after`.
-        errors: of ring, monitors and correctors, fitted to it.
+        errors: of ring, monitors, correctors and energy, fitted to it.
         after: the second measurement.
+        astray: kicks of the closed orbit, which make the dispersion that a changed gradient acts
+            on, see `ResponseModel`.
 
     Returns:
         In the design with the ring's errors and the correctors' rolls, a measurement by perfect
@@ -86,6 +90,8 @@ def response_change(before: ResponseData, errors: Errors, after: ResponseData) -
         ring=apply(before.ring, (*errors.ring, *_rolls(columns, errors.angle))),
         kicks=kicks,
         noise=noise,
+        energy=errors.energy,
+        astray=astray,
     )
     orbits = Predicted(there, Errors.none(there)).straight + change
     rf = before.measured.rf

@@ -39,6 +39,9 @@ class ResponseData:
         kicks: the steps, rad, the RF's relative, [column].
         plane: in which each column kicks, [column].
         noise: rms of a reading, m, [monitor, 2].
+        energy: of the beam beside the one that its magnets are set for, relative.
+        astray: kicks of its closed orbit, rad, see `ResponseModel`, [magnet, 2]; None: there are
+            none.
     """
 
     ring: Ring
@@ -48,6 +51,8 @@ class ResponseData:
     kicks: Array
     plane: Indices
     noise: Array
+    energy: float = 0.0
+    astray: Array | None = None
 
     @property
     def energy_of_rf(self) -> float:
@@ -57,7 +62,8 @@ class ResponseData:
     @cached_property
     def design(self) -> ResponseModel:
         """Of the ring as it is given; UnstableRingError where it has no closed orbit."""
-        return ResponseModel(self.ring)
+        model = ResponseModel(self.ring, astray=self.astray)
+        return model.at_energy(self.energy) if self.energy else model
 
     @property
     def shape(self) -> tuple[int, int]:

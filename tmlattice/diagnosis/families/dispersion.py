@@ -13,7 +13,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.kicks import dispersion_behind, dispersion_of_kicks, energy_of_way
+from tmlattice.beam.kicks import (
+    dispersion_behind,
+    dispersion_of_kicks,
+    energy_of_way,
+    kicking,
+)
 from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
@@ -152,6 +157,23 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
                 "makes: kicks of the closed orbit do (errors of bends, displaced quadrupoles, "
                 "correctors), which the data do not tell apart"
             )
+
+
+def kicks_astray(values: Mapping[str, Array], data: ResponseData) -> Array | None:
+    """What was found, as kicks behind each magnet in x and y, rad, [magnet, 2]: see
+    `ResponseModel`. None where nothing was.
+
+    Args:
+        values: that were found, by variable.
+        data: the response.
+    """
+    astray = np.zeros((len(data.ring.magnets), 2))
+    for family in (HorizontalKicks(), VerticalKicks()):
+        own = values.get(family.variable, np.zeros(0))
+        if own.any():
+            where = kicking(data.ring, family.plane)
+            astray[where, family.plane] = own @ family.patterns(data).kicks
+    return astray if astray.any() else None
 
 
 def dispersion_beside(

@@ -216,7 +216,7 @@ class Trial:
     across: int
 
 
-WITHOUT_KICKS = (
+STEPS = (
     Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
     Trial((MonitorGain(),), 2, 0),
     Trial((QuadrupoleGradient(),), 4, 0),
@@ -228,18 +228,13 @@ WITHOUT_KICKS = (
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
-)
-"""What a lattice with its monitors and correctors can have wrong. Skew gradients move the tunes to
-second order, which the gradients then take back."""
-
-STEPS = (
-    *WITHOUT_KICKS,
     Trial((HorizontalKicks(),), 2, 0),
     Trial((EnergyOffset(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),
 )
-"""What is tried, one after another. A beam off its energy has another dispersion: it comes in once
-that has what else may be wrong with it."""
+"""What is tried, one after another. Skew gradients move the tunes to second order, which the
+gradients then take back. A beam off its energy has another dispersion: it comes in once that has
+what else may be wrong with it."""
 
 CHANGES = (
     Trial((CorrectorCalibration(),), 3, 0),

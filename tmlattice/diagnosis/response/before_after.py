@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.families.dispersion import kicks_astray
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, WITHOUT_KICKS, Trial
+from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,
@@ -114,13 +115,14 @@ def diagnose_change(
     before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    steps = WITHOUT_KICKS if trials else ()
+    steps = STEPS if trials else ()
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
+    astray = kicks_astray(fitted.values, first)
     said += more
     first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
 
     def change(measured: OrbitResponse) -> ResponseData:
-        return response_change(first, errors, response_data(ring, measured))
+        return response_change(first, errors, response_data(ring, measured), astray)
 
     _, data, exchanged_after = all_right(change, second.measured, holdout)
     there = data.ring
@@ -205,9 +207,8 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 def _reference(
     data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
-    """What a lattice can have wrong, as one measurement has it, then fitted to all of the first: a
-    ring whose dispersion is the measured one, for that is what a changed gradient acts on; kicks
-    would stay behind. The design where that goes astray. And what is to be said of it."""
+    """What a lattice can have wrong, as one measurement has it, then fitted to all of the first.
+    The design where that goes astray. And what is to be said of it."""
     nothing = replace(begin(data, _judged_by_nobody(split)), exploring=False)
     if not steps:
         return nothing, []
