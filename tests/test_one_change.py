@@ -1,6 +1,7 @@
 """One change of a machine that is known with errors: each weighed with what they make of it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tmlattice.diagnosis.response.before_after import ANY
 from tmlattice.diagnosis.response.dense import one_by_one
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, and_orbits, left_open, strongest
 from tmlattice.diagnosis.response.linear import linear, with_numbers
-from tmlattice.diagnosis.response.one_change import OneChange, _Line
+from tmlattice.diagnosis.response.one_change import OneChange, _Line, _peaks
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.weights import weight
@@ -21,6 +22,7 @@ from tmlattice.diagnosis.response.what_changed import what_changed
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.priors import EVEN
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -299,3 +301,32 @@ def test_one_more_look_that_leads_astray_loses_nothing(small_ring, monkeypatch):
     assert own.element == "QF::3"
     assert abs(own.amount - 0.02) < 4 * own.amount_sigma
     assert len(looks) == 2
+
+
+def test_what_the_readings_want_nothing_of_is_no_change():
+    """An amount that is even in its logarithm is ever denser towards zero: 2e-28 of the beam's
+    energy had been told of a machine that had hardly changed."""
+    amounts = np.geomspace(1e-5, 1.0, 120)
+    both = np.concatenate([-amounts[::-1], amounts])
+    prior = -np.log(np.abs(both))
+    assert not len(_peaks(both, prior, inner=False))
+    assert set(both[_peaks(both, prior, inner=True)]) == {-1e-5, 1e-5}
+    read = prior - 0.5 * ((both - 0.1) / 0.01) ** 2
+    (top,) = _peaks(both, read, inner=False)
+    assert both[top] == pytest.approx(0.1, rel=0.1)
+
+    rng = np.random.default_rng(3)
+    slope, noise = 1e3 * rng.normal(size=400), rng.normal(size=400)
+    unseen = noise - slope * (slope @ noise) / (slope @ slope)
+    problem = SimpleNamespace(
+        amounts=EVEN, first=None, at=lambda causes, start: SimpleNamespace(residual=noise)
+    )
+    changes = OneChange(SimpleNamespace(problem=problem))
+    hypothesis = ("quadrupole_gradient", "any")
+    nothing = np.zeros((1, 400))
+    assert changes._amount(_Line(unseen, slope, nothing), hypothesis, None) is None
+    amount, sigma, _ = changes._amount(
+        _Line(unseen + 2e-3 * slope, slope, nothing), hypothesis, None
+    )
+    assert amount == pytest.approx(2e-3, abs=4 * sigma)
+    assert sigma == pytest.approx(1 / np.linalg.norm(slope), rel=0.05)

@@ -25,6 +25,7 @@ from tmlattice.inference.rivals import Rival
 from tmlattice.inference.root import directions_of
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 AMOUNTS = np.geomspace(1e-5, 1.2, 120)
 """Of the largest fault: where the likeliest amount is looked for first."""
@@ -70,6 +71,20 @@ class _Line:
         return np.asarray(
             -0.5 * (inside + beyond[0, 0] - 2 * t * beyond[0, 1] + t**2 * beyond[1, 1])
         )
+
+
+def _peaks(amounts: Array, seen: Array, inner: bool) -> Indices:
+    """Where a density of amounts, by rising amount, is highest on either side of zero; at the
+    smallest amount only if that may be: towards zero an amount that is even in its logarithm is
+    ever denser, whatever is read."""
+    found = []
+    for side in (amounts < 0, amounts > 0):
+        own = np.flatnonzero(side)
+        order = own[np.argsort(np.abs(amounts[own]))]
+        before = np.append(-np.inf if inner else np.inf, seen[order[:-1]])
+        behind = np.append(seen[order[1:]], -np.inf)
+        found += order[(seen[order] > before) & (seen[order] >= behind)].tolist()
+    return np.array(found, dtype=int)
 
 
 class OneChange:
@@ -132,10 +147,15 @@ class OneChange:
             return np.asarray(line.log_density(amount**effect.power) + np.array(prior))
 
         seen = density(amounts)
-        top = int(seen.argmax())
-        if not seen[top] > line.log_density(np.zeros(1))[0]:
+        peaks = _peaks(amounts, seen, inner=near is not None)
+        gained = line.log_density(amounts[peaks] ** effect.power) > line.log_density(np.zeros(1))
+        peaks = peaks[gained]
+        if not len(peaks):
             return None
-        low, high = amounts[max(top - 1, 0)], amounts[min(top + 1, len(amounts) - 1)]
+        top = int(peaks[seen[peaks].argmax()])
+        same = amounts[np.sign(amounts) == np.sign(amounts[top])]
+        low, high = (same[max((same < amounts[top]).sum() - 1, 0)],
+                     same[min((same <= amounts[top]).sum(), len(same) - 1)])  # fmt: skip
         best = minimize_scalar(
             lambda a: -float(density(np.array([a]))[0]), bounds=(low, high), method="bounded",
             options={"xatol": 1e-6 * (high - low)},
@@ -150,9 +170,9 @@ class OneChange:
             h *= 2
             ends = density(np.array([amount - h, amount, amount + h]))
         sigma = float(h / np.sqrt(bend)) if bend > 0 else abs(amount)
-        mirror = amounts * amount < 0
-        if mirror.any():  # where the sign is hardly seen, that is in the error
-            other = int(np.flatnonzero(mirror)[seen[mirror].argmax()])
+        mirror = peaks[amounts[peaks] * amount < 0]
+        if len(mirror):  # where the sign is hardly seen, that is in the error
+            other = int(mirror[seen[mirror].argmax()])
             odds = float(np.exp(min(seen[other] - ends[1], 0.0)))
             sigma = float(np.hypot(sigma, np.sqrt(odds / (1 + odds)) * (amount - amounts[other])))
         return amount, sigma, float(ends[1])
