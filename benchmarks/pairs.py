@@ -28,12 +28,7 @@ from real_rings import imported, sources
 
 import tmlattice
 from tmlattice import Cause, read_measurement
-from tmlattice.diagnosis.families.dispersion import (
-    HorizontalKicks,
-    VerticalKicks,
-    errors_beside,
-    kicks_astray,
-)
+from tmlattice.diagnosis.families.dispersion import errors_beside, kicks_astray
 from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
 from tmlattice.diagnosis.response import procedure
 from tmlattice.effects import apply
@@ -115,7 +110,9 @@ def first_day(ring, measured):
     found = tmlattice.diagnose(ring, measured)
     # a spread would take three times the orbits, and changes theirs by next to nothing
     causes = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
-    known = Known(causes, kicks_of(response_data(ring, measured), found.dispersion))
+    data = response_data(ring, measured)
+    fitted = Predicted(data, errors_beside(data, found.dispersion).with_causes(data, causes))
+    known = Known(causes, kicks_astray(fitted))
     model = simulated(ring, known, measured)
     read, told, kicks = as_kicked(measured, model)
     good = stranger(read, told, 1) < STRANGE
@@ -125,20 +122,6 @@ def first_day(ring, measured):
     monitors = [name for name, own in zip(measured.monitors, left, strict=True) if own < STRANGE]
     measured, model = (own.select(correctors, monitors) for own in (measured, model))
     return known, measured, model
-
-
-def kicks_of(data, dispersion):
-    """Kicks behind each magnet that make a dispersion, rad, as in `kicks_astray`."""
-    made = errors_beside(data, dispersion).dispersion
-    if not np.any(made):
-        return None
-    values = {
-        family.variable: np.linalg.lstsq(
-            family.patterns(data).rf.T, made[:, family.plane], rcond=None
-        )[0]
-        for family in (HorizontalKicks(), VerticalKicks())
-    }
-    return kicks_astray(values, data)
 
 
 def as_kicked(measured, model):
@@ -166,16 +149,16 @@ def simulated(ring, known, measured, changes=()):
     made = simulate_response(
         ring, causes, correctors=list(measured.correctors), kick=KICK, noise=0.0, progress=False,
         rf_step=0.0 if rf is None or rf.orbit is None else rf.step,
-    ).measured.select(monitors=measured.monitors)  # fmt: skip
+    ).measured  # fmt: skip
+    made = made.select(monitors=[m.name for m in ring.monitors if m.name in measured.monitors])
     if known.astray is None:
-        return made
+        return made.select(monitors=measured.monitors)
     data = response_data(ring, made)
     errors = Errors.none(data).with_causes(data, causes)
     with_kicks, without = (
         Predicted(replace(data, astray=astray), errors).read for astray in (known.astray, None)
     )
     more = with_kicks - without
-    made = data.measured  # its monitors in the ring's order
     rf = made.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=rf.orbit + more[-1])

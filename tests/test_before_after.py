@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from tmlattice import diagnose, load_ring
 from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.response import few
+from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import write_ring
@@ -24,6 +25,7 @@ from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_change import response_change
 from tmlattice.observe.response_data import response_data
+from tmlattice.observe.split import split_columns
 from tmlattice.report.plain import report_text
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
@@ -352,3 +354,14 @@ def test_correctors_of_the_machine_before_kick_as_they_were_fitted(small_ring, b
     change = response_change(data, errors, data).measured
     fitted = Predicted(data, errors).kicked[:-1]
     assert np.abs(change.response - fitted).max() < 1e-5 * np.abs(fitted).max()
+
+
+def test_an_unchanged_machine_leaves_nothing_of_large_steps(small_ring, before):
+    """Their orbits are bent, on both days."""
+    data = response_data(small_ring, before)
+    large = np.append(np.full(len(data.kicks) - 1, 50.0), 1.0)  # of correctors alone
+    data = replace(data, kicks=large * data.kicks, orbits=large[:, None, None] * data.orbits)
+    change = response_change(data, Errors.none(data), data)
+    state = bend(begin(change, split_columns(change, 0.2, np.random.default_rng(0))))
+    assert np.abs(state.at.bent).max() > 1e-7
+    assert np.abs(state.at.left).max() < 1e-12

@@ -357,6 +357,10 @@ def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_rin
     assert np.std(made) > 1e-3
     assert more == pytest.approx(made, abs=2e-3 * np.abs(made).max())  # first order in the kicks
     assert model.path == pytest.approx(design.path, abs=1e-12)  # no orbit
+    correctors, step = ["v1", "v4", "v11"], 1e-6  # which have kicks astray of their own
+    up, down = (model.closed_orbits(correctors, np.full(3, side * step / 2)) for side in (1, -1))
+    response = model.response(correctors)
+    assert (up - down) / step == pytest.approx(response, abs=1e-7 * np.abs(response).max())
 
     name, step = "QF::3", 1e-5
     ends = [

@@ -95,6 +95,8 @@ class ResponseModel:
         frequency: float = 0.0,
         astray: Array | None = None,
     ) -> None:
+        if astray is not None and (dimension != 6 or astray.shape != (len(ring.magnets), 2)):
+            raise ValueError("kicks astray are [magnet, 2], and of six coordinates")
         self.ring = ring
         self.layers = LayerMaps(ring, dimension)
         self.astray = astray
@@ -142,19 +144,25 @@ class ResponseModel:
         return other
 
     def _dispersed(self, maps: RingMaps, layers: Sequence[int] | Indices) -> RingMaps:
-        """With what `astray` says behind some layers: px -= kick p, and tau -= kick x with it, or
-        the map were not symplectic."""
+        """With what `astray` says behind some layers."""
         if self.astray is None:
             return maps
         own = np.array([k for k in layers if k < len(self.astray)], dtype=np.int64)
-        behind = np.tile(np.eye(self.dimension), (len(own), 1, 1))
-        for plane in (0, 1):
-            kick = self.astray[own, plane]
-            behind[:, 2 * plane + 1, 5] = behind[:, 4, 2 * plane] = -kick
         arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2")}
         for weights in arrays.values():
-            weights[own] = np.einsum("kij,kj...->ki...", behind, weights[own])
+            weights[own] = self._with_astray(own, weights[own])
         return replace(maps, **arrays)
+
+    def _with_astray(self, layers: Indices, weights: Array) -> Array:
+        """Weights of some layers, and behind each px -= kick p, and tau -= kick x, or the map
+        were not symplectic, [layer, n, ...]."""
+        if self.astray is None:
+            return weights
+        behind = np.tile(np.eye(self.dimension), (len(layers), 1, 1))
+        for plane in (0, 1):
+            kick = self.astray[layers, plane]
+            behind[:, 2 * plane + 1, 5] = behind[:, 4, 2 * plane] = -kick
+        return np.asarray(np.einsum("kij,kj...->ki...", behind, weights))
 
     def _forget(self) -> None:
         """What is cached is of this orbit."""
@@ -296,7 +304,9 @@ class ResponseModel:
             element = ring.elements[i]
             changed = element.changed(angle=element.angle + float(kick))
             replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
-        V0, V1, V2 = (np.stack(v) for v in zip(*replaced, strict=True))
+        V0, V1, V2 = (
+            self._with_astray(layer, np.stack(own)) for own in zip(*replaced, strict=True)
+        )
         good = np.zeros(len(paths), dtype=bool)
         share(
             settle, len(paths), *turn.W, turn.curved, layer, V0, V1, V2, self._solve, self._turn,

@@ -70,8 +70,8 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
         known = found.problem.learnt(found.fit if causes else found.before)
         beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
         return replace(known, causes=(*known.causes, *beside))
-    if not isinstance(view, ResponseView) or not diagnosis.steps:
-        return None
+    if not isinstance(view, ResponseView) or not diagnosis.steps or diagnosis.since_reference:
+        return None  # of a change the small errors are the reference's
     usual = background_rms({"all": None})
     everywhere = [(name, place) for name in usual for place in find(name).places(diagnosis.ring)]
     if view.data.size * len(everywhere) ** 2 <= PRODUCTS:

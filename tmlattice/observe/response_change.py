@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, apply
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -74,9 +74,9 @@ def response_change(
             on, see `ResponseModel`.
 
     Returns:
-        In the design with the ring's errors and the correctors' rolls, a measurement by perfect
-        monitors with steps as the correctors really made them: that ring's response, and on top of
-        it the difference of the two.
+        In the design with the ring's errors, its energy, kicks astray and the correctors' rolls, a
+        measurement by perfect monitors with steps as the correctors really made them: that ring's
+        response to steps of that size, and on top of it the difference of the two.
     """
     columns = before.measured.correctors
     mend = np.linalg.inv(errors.monitors)
@@ -93,12 +93,21 @@ def response_change(
         energy=errors.energy,
         astray=astray,
     )
-    orbits = Predicted(there, Errors.none(there)).straight + change
+    orbits = _as_stepped(there) + change
     rf = before.measured.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=orbits[-1])
     measured = replace(before.measured, kicks=kicks[:-1], response=orbits[:-1], noise=noise, rf=rf)
     return replace(there, measured=measured, orbits=orbits)
+
+
+def _as_stepped(data: ResponseData) -> Array:
+    """Orbit changes of the ring, as large as the steps make them: they are in both measurements."""
+    there = Predicted(data, Errors.none(data))
+    try:
+        return there.bend().straight
+    except UnstableRingError:
+        return there.straight
 
 
 def _rolls(columns: Sequence[str], roll: Array) -> list[Cause]:

@@ -159,20 +159,18 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
             )
 
 
-def kicks_astray(values: Mapping[str, Array], data: ResponseData) -> Array | None:
-    """What was found, as kicks behind each magnet in x and y, rad, [magnet, 2]: see
-    `ResponseModel`. None where nothing was.
-
-    Args:
-        values: that were found, by variable.
-        data: the response.
+def kicks_astray(at: Predicted) -> Array | None:
+    """What makes the dispersion that the errors have beside the ring's, as kicks behind each magnet
+    in x and y, rad, [magnet, 2]: see `ResponseModel`. In the ring with its errors, in which other
+    kicks make it than in the design. None where there is no such dispersion.
     """
-    astray = np.zeros((len(data.ring.magnets), 2))
-    for family in (HorizontalKicks(), VerticalKicks()):
-        own = values.get(family.variable, np.zeros(0))
-        if own.any():
-            where = kicking(data.ring, family.plane)
-            astray[where, family.plane] = own @ family.patterns(data).kicks
+    ring, astray = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
+    beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
+    for plane in (0, 1):
+        if beside[:, plane].any():
+            patterns = patterns_of_kicks(at, plane)
+            amounts = np.linalg.lstsq(patterns.rf.T, beside[:, plane], rcond=None)[0]
+            astray[kicking(ring, plane), plane] = amounts @ patterns.kicks
     return astray if astray.any() else None
 
 

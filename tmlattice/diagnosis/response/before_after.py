@@ -4,7 +4,8 @@
 >>> [(own.effect, own.element, own.amount, own.amount_sigma) for own in change.findings]
 
 The ring, its monitors and its correctors are fitted to the first measurement; what that leaves is
-in both and cancels in their difference (`observe.response_change`), which is fitted in turn. Drifts
+in both and cancels in their difference (`observe.response_change`), which is fitted in turn, in a
+ring that has the first one's dispersion: kicks that make it, and the beam's energy, too. Drifts
 of monitors and correctors, whose sizes are learnt, are nuisances. Magnets scatter, too: how far
 those of one supply differ in their change is learnt, and is in the error of every amount, as is
 what the fit of the first leaves open (`left_open`). Findings are supplies (magnets whose names
@@ -109,15 +110,16 @@ def diagnose_change(
     before, after = alike(ring, before, after)
     first, second = response_data(ring, before), response_data(ring, after)
     said += assumed_of(after, second)
-    if _same(first, second):
+    same = _same(first, second)
+    if same:
         trials = []
         said.append("the two measurements are the same, to the last digit")
     before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    steps = STEPS if trials else ()
+    steps = () if same else STEPS
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
-    astray = kicks_astray(fitted.values, first)
+    astray = kicks_astray(fitted.at)
     said += more
     first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
 

@@ -114,7 +114,8 @@ class OneChange:
             for _ in range(LINEARISED):
                 slope = self._made((Cause(*hypothesis, at),)) / at**effect.power
                 line = _Line(self.left, slope, spread)
-                found = self._amount(line, hypothesis, None if found is None else at)
+                near = None if found is None else at
+                found = self._amount(line, hypothesis, near) or self._amount(line, hypothesis, None)
                 if found is None:
                     return None
                 if effect.discrete or abs(found[0] - at) <= SAME * abs(found[0]):

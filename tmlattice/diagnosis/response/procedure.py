@@ -271,8 +271,8 @@ def as_diagnosis(
         heldout_shots=(),
         unexplained=_unexplained(fit),
         tunes={
-            "before": ring_tunes(ring),
-            "after": ring_tunes(repaired, fit.state.at.errors.energy),
+            "before": ring_tunes(ring, data.energy),
+            "after": ring_tunes(repaired, data.energy + fit.state.at.errors.energy),
         },
         next=None,
         sensitivity={},
