@@ -28,7 +28,7 @@ TYPICAL = 10.0
 LEAST = 0.2
 """Of the noise: what the model lacks at least, and what noise is left beside a jitter."""
 ROUNDED = 1e-6
-"""Of the noise: two equal responses differ by less."""
+"""Of the readings: two equal responses differ by less."""
 DISPERSION = "quadrupole_gradient"
 """The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
 times what all others are, and would make the monitors' gains what fits it."""
@@ -159,7 +159,7 @@ def good_monitors(state: State, bad: float = BAD) -> Flags:
             rms[gain < 0.2] = np.inf  # reversed, until gains come in
             read_at_all = count > 0  # what was never read says nothing of the other plane
             typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
-            typical = max(typical, ROUNDED * float(np.median(data.noise)))
+            typical = max(typical, ROUNDED * float(np.sqrt(np.nanmean(orbits[rows] ** 2))))
             # else the fit is astray, not half of the monitors
             share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
             own = np.minimum(own, np.where(read_at_all, share, 0.0))
