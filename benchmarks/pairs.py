@@ -44,7 +44,7 @@ SHIFT = 0.03
 DRIFT = 2e-3
 """rms, relative, of gains and kicks from one day to the other."""
 SCATTER = 1e-4
-"""rms, relative, of what every quadrupole has changed by that was not changed."""
+"""rms, relative: as well as every quadrupole comes back, and one that was changed is set."""
 STRANGE = 0.05
 """Share of the square of a column, or a monitor, that a multiple of its model leaves where it takes
 no part: what is exchanged, say, would have the change of another one."""

@@ -115,7 +115,9 @@ class OneChange:
                 slope = self._made((Cause(*hypothesis, at),)) / at**effect.power
                 line = _Line(self.left, slope, spread)
                 near = None if found is None else at
-                found = self._amount(line, hypothesis, near) or self._amount(line, hypothesis, None)
+                found = self._amount(line, hypothesis, near)
+                if found is None and near is not None:  # it is far from there
+                    found = self._amount(line, hypothesis, None)
                 if found is None:
                     return None
                 if effect.discrete or abs(found[0] - at) <= SAME * abs(found[0]):
@@ -154,9 +156,9 @@ class OneChange:
         if not len(peaks):
             return None
         top = int(peaks[seen[peaks].argmax()])
-        same = amounts[np.sign(amounts) == np.sign(amounts[top])]
-        low, high = (same[max((same < amounts[top]).sum() - 1, 0)],
-                     same[min((same <= amounts[top]).sum(), len(same) - 1)])  # fmt: skip
+        same = amounts[amounts * amounts[top] > 0]  # of its sign
+        at = int(np.searchsorted(same, amounts[top]))
+        low, high = same[max(at - 1, 0)], same[min(at + 1, len(same) - 1)]
         best = minimize_scalar(
             lambda a: -float(density(np.array([a]))[0]), bounds=(low, high), method="bounded",
             options={"xatol": 1e-6 * (high - low)},

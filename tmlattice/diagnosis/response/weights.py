@@ -154,12 +154,12 @@ def good_monitors(state: State, bad: float = BAD) -> Flags:
         if rows.sum() < FEW:
             continue
         own = np.full(data.shape[1], np.inf)
+        rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, SPARED):
             rms, gain, count = _beside_own_gain(read[rows], orbits[rows], spared)
             rms[gain < 0.2] = np.inf  # reversed, until gains come in
             read_at_all = count > 0  # what was never read says nothing of the other plane
-            typical = np.median(rms[read_at_all]) if read_at_all.any() else np.inf
-            typical = max(typical, ROUNDED * float(np.sqrt(np.nanmean(orbits[rows] ** 2))))
+            typical = max(np.median(rms[read_at_all]), rounded) if read_at_all.any() else np.inf
             # else the fit is astray, not half of the monitors
             share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
             own = np.minimum(own, np.where(read_at_all, share, 0.0))
