@@ -29,10 +29,10 @@ from real_rings import imported, sources
 import tmlattice
 from tmlattice import Cause, read_measurement
 from tmlattice.diagnosis.families.dispersion import errors_beside, kicks_astray
-from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
 from tmlattice.diagnosis.response import procedure
 from tmlattice.effects import apply
 from tmlattice.errors import TmlatticeError
+from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
@@ -62,7 +62,7 @@ class Known(NamedTuple):
 def drawn(ring, rng, null):
     """Changes: (what it is told of, amount, {magnet: relative change})."""
     own = magnets(ring, ("quadrupole",), powered=True)
-    kinds, members = supplied_alike(own)
+    kinds, members = supplied_alike(ring, own)
     several = [i for i in range(len(kinds)) if members[:, i].sum() > 1]
     changes, taken = [], set()
     if null:
@@ -191,7 +191,7 @@ def second_day(measured, ring, known, before, changes, rng):
 def judged(ring, result, changes):
     """Names of what was found and missed, findings that are none, and pulls."""
     own = magnets(ring, ("quadrupole",), powered=True)
-    kinds, members = supplied_alike(own)
+    kinds, members = supplied_alike(ring, own)
     true = {magnet[0].name: 0.0 for magnet in own}
     for _, _, of, _, _ in changes:
         true.update(of)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 from collections import Counter
 from dataclasses import replace
 from importlib.resources import files
@@ -78,7 +79,7 @@ def change(small_ring, before, after):
     return diagnose(small_ring, after, reference=before)
 
 
-def with_names_of_their_own(ring, folder):
+def with_names_of_their_own(ring, folder, form="{}_a{}"):
     """QF_a0 for QF::0: what MAD-X and many a laboratory call magnets."""
     write_ring(ring, folder / "ring.json")
     document = json.loads((folder / "ring.json").read_text())
@@ -86,7 +87,7 @@ def with_names_of_their_own(ring, folder):
     count = Counter()
     for i, name in enumerate(document["sequence"]):
         if known[name]["kind"] == "quadrupole":
-            own = f"{name}_a{count[name]}"
+            own = form.format(name, count[name])
             count[name] += 1
             known[own] = known[name]
             document["sequence"][i] = own
@@ -114,6 +115,27 @@ def test_a_supply_of_magnets_with_names_of_their_own(small_ring, before, after, 
     weaker = apply(ring, [supply])
     assert weaker["QF_a3"].k1 == pytest.approx(1.01 * ring["QF_a3"].k1)
     assert weaker["QD_a3"].k1 == ring["QD_a3"].k1
+
+
+def test_a_supply_of_magnets_that_are_alike_in_the_design_alone(
+    small_ring, before, after, change, tmp_path
+):
+    """Where no two names begin alike, as at BESSY II and MLS (q1m1t1r, q1m2t1r, ...)."""
+    ring = with_names_of_their_own(small_ring, tmp_path, "{}m{}r")
+    supply = "QFm0r and 15 of its strength"
+    result = diagnose(ring, after, reference=before)
+    found = {(own.effect, own.element): own.amount for own in result.findings}
+    same = {own.effect: own.amount for own in change.findings}
+    assert found == pytest.approx({
+        ("family_gradient", supply): same["family_gradient"],
+        ("quadrupole_gradient", "QDm5r"): same["quadrupole_gradient"],
+    })  # fmt: skip
+    weaker = apply(ring, [Cause("quadrupole_gradient", "QFm3r", 0.02)])  # alike it was designed
+    weaker = apply(weaker, [Cause("family_gradient", supply.upper(), 0.01)])
+    for at, k1 in (("QFm3r", 1.02 * 1.01), ("QFm4r", 1.01)):
+        assert weaker[at].k1 == pytest.approx(k1 * ring[at].k1)
+    assert weaker["QDm3r"].k1 == ring["QDm3r"].k1
+    assert pickle.loads(pickle.dumps(weaker)).supplies == ring.supplies
 
 
 SINGLE = {"QF::3": 8e-3, "QF::9": -7e-3, "QF::12": 6e-3, "QD::1": 1e-2, "QD::5": -8e-3,
@@ -367,6 +389,8 @@ def test_a_change_is_one_of_the_ring_at_its_beams_energy(small_ring):
     assert {(own.effect, own.element.casefold()) for own in change.findings} == {
         (own.effect, own.element.casefold()) for own in CHANGED
     }
+    (told,) = [said for said in change.warnings if "off the nominal energy by" in said]
+    assert float(told.split(" by ")[1].split()[0]) == pytest.approx(energy.amount, rel=0.1)  # gradients take some
     rng = np.random.default_rng(7)  # as the machine has them
     static = [
         Cause("quadrupole_gradient", f"{name}::{i}", 3e-3 * rng.standard_normal())

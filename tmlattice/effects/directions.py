@@ -10,7 +10,7 @@ for is kept by `LayerMaps`, so that equal magnets cost one.
 """
 
 import io
-from collections.abc import Hashable, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice import cache
 from tmlattice.effects.effect import RingEffect, find
-from tmlattice.lattice import Element
+from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
 from tmlattice.maps.magnets import Quadratic, Weights
@@ -114,9 +114,7 @@ def directions_nearby(
         else:
             origin, places = layers.origin
             found = directions_nearby(origin, hypotheses)
-            changed = [layers.ring.elements[place] for place in places]
-            names = {e.name for e in changed} | {e.family for e in changed}
-            again = [i for i, (_, place) in enumerate(hypotheses) if place in names or not place]
+            again = [i for i, one in enumerate(hypotheses) if _is_on(layers.ring, one, places)]
             if again:
                 found = found.replaced(again, directions(layers, [hypotheses[i] for i in again]))
         if layers.origin is not None:
@@ -124,6 +122,15 @@ def directions_nearby(
         layers.memory[key] = found
     remembered: Directions = layers.memory[key]
     return remembered
+
+
+def _is_on(ring: Ring, hypothesis: tuple[str, str | None], places: Collection[int]) -> bool:
+    """Whether it sits on some of these elements, or on the beam."""
+    name, place = hypothesis
+    effect = find(name)
+    if place is None or not isinstance(effect, RingEffect):
+        return True
+    return any(own in places for own in effect.members(ring, place))
 
 
 def directions(

@@ -294,20 +294,26 @@ class FamilyEffect(StrengthEffect):
 
     def places(self, ring: Ring) -> list[str | None]:
         """Families in the order of their first members; where every magnet is a family of its own,
-        what several of their names begin with."""
+        what several of their names begin with; and those that nothing but the design has alike."""
         powered = [e for e in ring.elements if self.sits_on(e)]
         named = _several(e.family for e in powered)
-        return [*(named or _several(stem(e.name) for e in powered))]
+        return [*(named or _several(stem(e.name) for e in powered)), *self._alike(ring)]
 
     def _named(self, ring: Ring) -> list[str | None]:
         """And what the names of several families begin with."""
         begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
         return [*self.places(ring), *begin]
 
+    def _alike(self, ring: Ring) -> list[str]:
+        return [name for name, own in ring.supplies.items() if self.sits_on(ring[own[0]])]
+
     def members(self, ring: Ring, place: str | None) -> list[int]:
         """All magnets of the family; or, where none is called so, those whose names begin so, up
-        to an underscore, a dot or a number of their own."""
+        to an underscore, a dot or a number of their own; or those of `Ring.supplies`."""
         name = (place or "").casefold()
+        for alike in self._alike(ring):
+            if name == alike.casefold():
+                return [ring.index(own) for own in ring.supplies[alike]]
         powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
         family = [i for i in powered if ring.elements[i].family.casefold() == name]
         return family or [i for i in powered if stem(ring.elements[i].name) == name]

@@ -203,6 +203,7 @@ class Ring(Speaks):
         energy: of a particle, rest energy included, GeV.
         changes: what was changed since it was loaded, by element name.
         mass: rest energy of a particle, GeV; an electron's unless the lattice says otherwise.
+        design: the ring that this one was changed from; None: it is one.
     """
 
     name: str
@@ -210,6 +211,7 @@ class Ring(Speaks):
     energy: float
     changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mass: float = ELECTRON_GEV
+    design: "Ring | None" = field(default=None, compare=False)
 
     plot = Method(
         "tmlattice.plots.speaking",
@@ -322,6 +324,14 @@ class Ring(Speaks):
         place = self.index(name)
         return tuple(self.elements[i].name for i in self._whole.get(place, (place,)))
 
+    @cached_property
+    def supplies(self) -> dict[str, tuple[str, ...]]:
+        """Quadrupoles without a family that the design has alike, pieces too, by what tells of
+        them; see `lattice.supplies`."""
+        from tmlattice.lattice.supplies import alike_by_design
+
+        return alike_by_design(self) if self.design is None else self.design.supplies
+
     def counts(self) -> dict[str, int]:
         """Number of elements by kind."""
         return dict(Counter(element.kind for element in self.elements))
@@ -347,7 +357,7 @@ class Ring(Speaks):
         new = list(self.elements)
         for place, element in elements.items():
             new[place] = element
-        return replace(self, elements=tuple(new))
+        return replace(self, elements=tuple(new), design=self.design or self)
 
 
 def number_names(names: Iterable[str]) -> list[str]:
@@ -366,7 +376,7 @@ def number_names(names: Iterable[str]) -> list[str]:
     return numbered
 
 
-FIELDS = ("name", "elements", "energy", "changes", "mass")
+FIELDS = ("name", "elements", "energy", "changes", "mass", "design")
 
 KEPT = ("kept",)
 """Where a ring's `memory` has the key under which it is kept in the cache, if it is."""

@@ -13,13 +13,13 @@ from tmlattice.diagnosis.families.fields import (
     SkewGradient,
     VerticalFocusing,
 )
-from tmlattice.diagnosis.families.magnets import straights
 from tmlattice.diagnosis.families.steps import (
     CorrectorCalibration,
     CorrectorRoll,
     MonitorGain,
     MonitorRoll,
 )
+from tmlattice.diagnosis.families.ways import straights
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause

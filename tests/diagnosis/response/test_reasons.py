@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import families, magnets, supplied_alike
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
 from tmlattice.diagnosis.response.reasons import (
     Instead,
@@ -20,6 +19,7 @@ from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
+from tmlattice.lattice.supplies import families, magnets, supplied_alike
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -97,19 +97,29 @@ def test_arcs_and_straights_are_regions(small_ring):
 def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
     """BESSY II and MLS: q1m1t1r, q1m2t1r, ... are one supply, and nothing shares a name."""
     here = magnets(small_ring, ("quadrupole",), powered=True)
-    own = [(replace(first, name=f"q{i}m2r"),) for i, (first,) in enumerate(here)]
-    own[-1] = (replace(own[-1][0], k1=1.01 * own[-1][0].k1),)
+    renamed = {small_ring.index(first.name): replace(first, name=f"q{i}m2r", family=f"q{i}m2r")
+               for i, (first,) in enumerate(here)}  # fmt: skip
+    last = max(renamed)
+    renamed[last] = replace(renamed[last], k1=1.01 * renamed[last].k1)
+    ring = replace(small_ring.with_elements(renamed), design=None)
+    own = magnets(ring, ("quadrupole",), powered=True)
     assert families([pieces[0].name for pieces in own])[0] == []
-    names, members = supplied_alike(own)
+    names, members = supplied_alike(ring, own)
     assert members.sum(axis=0).tolist() == [16, 15]
     first = own[0][0].name
     assert names[0] == f"{first} and 15 of its strength"
     k1 = np.array([pieces[0].k1 for pieces in own])
     assert all(np.ptp(k1[column > 0]) == 0 for column in members.T)
     alike = [pieces for pieces in own if pieces[0].k1 == own[0][0].k1]
-    assert supplied_alike(alike[:2])[0] == [f"{first} and {alike[1][0].name}"]
-    # those that share a name stay as they are
-    assert supplied_alike(here)[0] == families([pieces[0].name for pieces in here])[0]
+    others = {ring.index(name): replace(ring[name], k1=0.0)
+              for name in ring.supplies[names[0]][2:]}  # fmt: skip
+    two = replace(ring.with_elements(others), design=None)
+    left = magnets(two, ("quadrupole",), powered=True)
+    assert supplied_alike(two, left)[0][0] == f"{first} and {alike[1][0].name}"
+    # a changed ring has the supplies of its design, and those that share a name stay as they are
+    assert supplied_alike(ring.with_changed(first, k1=0.5), own)[0] == names
+    kinds = families([pieces[0].name for pieces in here])[0]
+    assert supplied_alike(small_ring, here)[0] == kinds
 
 
 def of_families(amounts, seed=0, noise=2e-3):

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import TAILS, Family, Told
-from tmlattice.diagnosis.families.magnets import between, magnets, straights, supplied_alike
+from tmlattice.diagnosis.families.ways import between, straights
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
+from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
@@ -121,7 +122,7 @@ class FamilyGradient(QuadrupoleGradient):
         return [Group("quadrupole_gradient of families", self._families(data)[1], 0.01)]
 
     def _families(self, data: ResponseData) -> tuple[list[str], Array]:
-        return supplied_alike(magnets(data.ring, ("quadrupole",), powered=True))
+        return supplied_alike(data.ring, magnets(data.ring, ("quadrupole",), powered=True))
 
 
 class _Thin(_Magnets):

@@ -27,9 +27,9 @@ from tmlattice.diagnosis.families.fields import (
     SkewGradient,
     VerticalFocusing,
 )
-from tmlattice.diagnosis.families.magnets import families
 from tmlattice.effects import Cause, Monitors
 from tmlattice.inference.priors import Group
+from tmlattice.lattice.supplies import families
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import magnets
 from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
 from tmlattice.errors import UnstableRingError
+from tmlattice.lattice.supplies import magnets
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import between, families
+from tmlattice.diagnosis.families.ways import between
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
+from tmlattice.lattice.supplies import families
 from tmlattice.observe.orbit_response import DELTA
 
 Array = NDArray[np.float64]

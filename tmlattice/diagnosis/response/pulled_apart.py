@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import magnets, supplied_alike
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.rf_by_others import rf_fitted
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.normal import Normal, solve
+from tmlattice.lattice.supplies import magnets, supplied_alike
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def pulled_apart(state: State, false_alarm: float = DEFAULT.false_alarm) -> Pull
     if chi2.sf(total, read.size) > false_alarm:
         return None
     own = magnets(state.data.ring, ("quadrupole",), powered=True)
-    kinds, members = supplied_alike(own)
+    kinds, members = supplied_alike(state.data.ring, own)
     mean = np.vstack([(members / members.sum(axis=0)).T, np.eye(len(own))])
     names = [*kinds, *(pieces[0].name for pieces in own)]
     at, said = there.where[single.variable], []

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import magnets
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
@@ -26,6 +25,7 @@ from tmlattice.diagnosis.response.stated import of_readings, of_sizes
 from tmlattice.inference.levels import CLEAR, Levels
 from tmlattice.inference.normal import solve
 from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
+from tmlattice.lattice.supplies import magnets
 
 Array = NDArray[np.float64]
 

@@ -19,6 +19,7 @@ from tmlattice.diagnosis.response.small_errors import sizes_in
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import weighed, weight
 from tmlattice.effects import RingEffect, find
+from tmlattice.effects.quadrupoles import FamilyGradient
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Hypothesis
@@ -113,16 +114,16 @@ def _of_gradients(
     """Single ones, those of supplies, and the same as absolute ones."""
     ring = state.data.ring
     places = {name: i for i, own in enumerate(family.shares(state.data)) for name in own}
-    supplies: dict[str, list[int]] = {}
     for name, i in places.items():
         out[("quadrupole_gradient", name)] = (0, family.variable, [i], [1.0])
         strength = ring[name].k1 * ring[name].length
         out[("gradient_absolute", name)] = (0, family.variable, [i], [1 / strength])
-        supplies.setdefault(ring[name].family, []).append(i)
-    for supply, members in supplies.items():
-        if len(set(members)) > 1:
-            own = sorted(set(members))
-            out[("family_gradient", supply)] = (0, family.variable, own, [1.0] * len(own))
+    supply = FamilyGradient()
+    for place in supply.places(ring):
+        members = [ring.elements[i].name for i in supply.members(ring, place)]
+        own = sorted({places[name] for name in members if name in places})
+        if len(own) > 1:
+            out[(supply.name, place)] = (0, family.variable, own, [1.0] * len(own))
 
 
 # --- products -------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from scipy.linalg import block_diag
 
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
-from tmlattice.diagnosis.families.magnets import families
 from tmlattice.diagnosis.findings import cause_of, finding_of
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, strongest
 from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
@@ -29,6 +28,7 @@ from tmlattice.inference.levels import Levels, Reason
 from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
+from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_problem import Response
 
@@ -180,7 +180,8 @@ def _candidates(
         name = QuadrupoleGradient.name if quadrupoles else family.name
         alone = scatter[family.name] ** 2 * own
         if quadrupoles:
-            kinds, members = families(places)
+            ring = state.data.ring
+            kinds, members = supplied_alike(ring, magnets(ring, ("quadrupole",), powered=True))
             alone = alone + (REPRODUCED / 2) ** 2 * members @ members.T
             causes += [(FamilyGradient.name, kind) for kind in kinds]
             own = np.hstack([members, own])

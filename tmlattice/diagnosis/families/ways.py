@@ -1,52 +1,18 @@
-"""Which elements of a ring are one magnet, which magnets share a supply, and where one may hide.
+"""Where magnets stand: between which others, and ways on which an insertion device may hide.
 
->>> [own[0].name for own in magnets(ring, ("quadrupole",), powered=True)]
+>>> [way.name for way in straights(ring)]
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
 
-Array = NDArray[np.float64]
-
 STRAIGHT = 1.0
 """m; where so much way lies between two magnets an insertion device may stand."""
-
-
-def families(names: Sequence[str]) -> tuple[list[str], Array]:
-    """Stems that more than one has, and who belongs to them, [name, family] of 0 and 1."""
-    stems = [stem(name) for name in names]
-    kinds = [kind for kind in dict.fromkeys(stems) if stems.count(kind) > 1]
-    return kinds, np.array([[float(own == kind) for kind in kinds] for own in stems]).reshape(
-        len(names), len(kinds)
-    )
-
-
-def supplied_alike(own: Sequence[tuple[Element, ...]]) -> tuple[list[str], Array]:
-    """Families of quadrupoles, and who belongs to them, [magnet, family] of 0 and 1: by name, and
-    where each has a name of its own (BESSY II, MLS), those that the design has alike in length and
-    gradient, for one supply or one setting is behind them.
-
-    Args:
-        own: magnets, each with its pieces.
-    """
-    kinds, members = families([pieces[0].name for pieces in own])
-    alone = np.flatnonzero(members.sum(axis=1) == 0)
-    designs: dict[tuple[float, float], list[int]] = {}
-    for i in alone.tolist():
-        length = sum(e.length for e in own[i])
-        designs.setdefault((round(length, 5), round(own[i][0].k1, 6)), []).append(i)
-    more = [alike for alike in designs.values() if len(alike) > 1]
-    for first, second, *others in more:
-        like = f"{len(others) + 1} of its strength" if others else own[second][0].name
-        kinds.append(f"{own[first][0].name} and {like}")
-    columns = [np.isin(np.arange(len(own)), alike).astype(float)[:, None] for alike in more]
-    return kinds, np.hstack([members, *columns])
 
 
 def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> list[str]:
@@ -64,25 +30,6 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
         f"{plane} {stem(others[i - 1].name)} {stem(others[i].name)}"
         for plane, i in zip(planes, behind, strict=True)
     ]
-
-
-def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:
-    """Magnets of some kinds, each with its pieces; pieces that are edges of other magnets are none.
-
-    Args:
-        ring: where they stand.
-        kinds: of elements.
-        powered: those alone that have a gradient.
-    """
-    found: dict[str, tuple[Element, ...]] = {}
-    for element in ring.elements:
-        if element.kind in kinds and (element.k1 != 0 or not powered):
-            pieces = [ring[name] for name in ring.pieces(element.name)]
-            if max(pieces, key=lambda piece: piece.length).kind not in kinds:
-                continue
-            own = [e for e in pieces if e.kind in kinds and (e.k1 != 0 or not powered)]
-            found.setdefault(own[0].name, tuple(own))
-    return list(found.values())
 
 
 def straights(ring: Ring, beside: bool = False) -> list[Element]:
