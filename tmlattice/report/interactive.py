@@ -33,7 +33,7 @@ from tmlattice.plots.diagnosis import (
 )
 from tmlattice.plots.names import plural
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings
-from tmlattice.report.amounts import amount_text, words
+from tmlattice.report.amounts import amount_text, micrometres, words
 from tmlattice.report.tables import standouts
 
 Figure = dict[str, Any]
@@ -334,13 +334,14 @@ def gap(diagnosis: Diagnosis) -> Figure:
     bars = {
         "type": "bar", "orientation": "h", "y": rows, "x": _short(rms), "width": 0.55,
         "marker": {"color": [_colour(BEFORE)] + [_colour(AFTER)] * (len(rms) - 1)},
-        "text": [f"{value:.1f}" for value in rms], "textposition": "auto",
-        "hovertext": labels, "hovertemplate": "%{hovertext}<br>%{x:.1f} µm<extra></extra>",
+        "text": [micrometres(1e-6 * value).removesuffix(" µm") for value in rms],
+        "textposition": "auto",
+        "hovertext": labels, "hovertemplate": "%{hovertext}<br>%{x:.3g} µm<extra></extra>",
         "showlegend": False,
     }  # fmt: skip
     wide = max(rms) > 20 * max(min(rms), 1e-9)
-    line = _trace([noise, noise], [-0.5, len(rms) - 0.5], f"noise {noise:.1f} µm", "@ink",
-                  dash="dash")  # fmt: skip
+    line = _trace([noise, noise], [-0.5, len(rms) - 0.5], f"noise {micrometres(1e-6 * noise)}",
+                  "@ink", dash="dash")  # fmt: skip
     layout = _layout(
         110 + pitch * len(rms),
         xaxis=_axis("held-out readings less model, rms [µm]", type="log" if wide else "linear"),

@@ -11,7 +11,7 @@ import numpy as np
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
-from tmlattice.report.amounts import amount_text, least_text, probability_text, words
+from tmlattice.report.amounts import amount_text, least_text, micrometres, probability_text, words
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.remedies import (
     consequence_text,
@@ -152,12 +152,12 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
     first, last = diagnosis.steps[0], diagnosis.steps[-1]
     return (
         "Small errors all along the ring, or of correctors: with them the gap of fitted correctors "
-        f"falls from {1e6 * diagnosis.fit_before.rms:.1f} to {1e6 * diagnosis.fit_after.rms:.1f} "
-        "µm, that of held-out ones from "
-        f"{1e6 * first.heldout_rms_in_plane:.1f} to {1e6 * last.heldout_rms_in_plane:.1f} µm"
+        f"falls from {micrometres(diagnosis.fit_before.rms)} to "
+        f"{micrometres(diagnosis.fit_after.rms)}, that of held-out ones from "
+        f"{micrometres(first.heldout_rms_in_plane)} to {micrometres(last.heldout_rms_in_plane)}"
         + (
-            f", in the other plane from {1e6 * first.heldout_rms_coupling:.1f} to "
-            f"{1e6 * last.heldout_rms_coupling:.1f} µm"
+            f", in the other plane from {micrometres(first.heldout_rms_coupling)} to "
+            f"{micrometres(last.heldout_rms_coupling)}"
             if np.isfinite(last.heldout_rms_coupling)
             else ""
         )
@@ -337,7 +337,7 @@ def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 
 def _misfit_text(misfit: Misfit) -> str:
-    size = f"{1e6 * misfit.rms:.1f} µm, " if np.isfinite(misfit.rms) else ""
+    size = f"{micrometres(misfit.rms)}, " if np.isfinite(misfit.rms) else ""
     return f"{size}chi² {_chi2(misfit.chi2_per_dof)}"
 
 
@@ -358,7 +358,7 @@ def noise_text(diagnosis: Diagnosis) -> str:
     """The noise of a reading; empty where no monitor reads."""
     if not np.isfinite(diagnosis.noise).any():
         return ""
-    x, y = (f"{1e6 * sigma:.1f} µm" if np.isfinite(sigma) else "no reading"
+    x, y = (micrometres(sigma) if np.isfinite(sigma) else "no reading"
             for sigma in diagnosis.noise)  # fmt: skip
     return f"{x} in x, {y} in y" + (" (estimated)" if diagnosis.noise_estimated else "")
 

@@ -14,7 +14,7 @@ insertion devices: by evidence, see `inference.levels`.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families.dispersion import kicks_astray
+from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, kicks_astray
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
@@ -120,7 +120,7 @@ def diagnose_change(
     steps = () if same else STEPS
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     astray = kicks_astray(fitted.at)
-    said += more
+    said += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
     first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
 
     def change(measured: OrbitResponse) -> ResponseData:
@@ -216,10 +216,17 @@ def _reference(
         return nothing, []
     try:
         fit = fit_steps(data, split, steps, len(steps), progress)
-        said = [f"of the reference: {own}" for own in fit.said]
-        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), said
+        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.said)
     except (TmlatticeError, np.linalg.LinAlgError):
-        return nothing, ["the reference could not be fitted: the change is one of the design"]
+        return nothing, ["it could not be fitted, and the change is one of the design"]
+
+
+def _of_the_ring(fitted: State) -> Iterator[str]:
+    """What no list of causes shows of the ring that changed."""
+    energy = fitted.at.errors.energy
+    if energy:
+        yield f"its beam is off the nominal energy by {energy:.3g} (relative), and so are the tunes"
+    yield from dispersion_by_kicks(fitted.values, fitted.data)
 
 
 def _by_good_monitors(
