@@ -390,7 +390,9 @@ def test_a_change_is_one_of_the_ring_at_its_beams_energy(small_ring):
         (own.effect, own.element.casefold()) for own in CHANGED
     }
     (told,) = [said for said in change.warnings if "off the nominal energy by" in said]
-    assert float(told.split(" by ")[1].split()[0]) == pytest.approx(energy.amount, rel=0.1)  # gradients take some
+    assert float(told.split(" by ")[1].split()[0]) == pytest.approx(
+        energy.amount, rel=0.1
+    )  # gradients take some
     rng = np.random.default_rng(7)  # as the machine has them
     static = [
         Cause("quadrupole_gradient", f"{name}::{i}", 3e-3 * rng.standard_normal())
