@@ -64,6 +64,10 @@ class MeasurementError(TmlatticeError):
     """A measurement that does not fit the ring, or is not a measurement."""
 
 
+class OtherFormatError(MeasurementError):
+    """A file that is not of the kind that it was read as; it may be of another."""
+
+
 class ChoiceError(TmlatticeError, ValueError):
     """A word for which there is a list, and that is not on it; the message gives the list."""
 

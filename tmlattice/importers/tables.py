@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.lattice import Ring
@@ -28,7 +28,7 @@ from tmlattice.measurement import (
 )
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
-from tmlattice.measurement.tables import Unit
+from tmlattice.measurement.tables import KINDS, Unit
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
@@ -92,12 +92,12 @@ def bring_turns(
     Raises:
         MeasurementError: it cannot be read, or its readings cannot be of that unit.
     """
-    failed: MeasurementError | None = None
     for one in [kind] if kind else ["lhc", "sps"]:
         try:
             data = read_turn_by_turn(path, one, unit=unit or "mm")
-        except MeasurementError as error:
-            failed = failed or error
+        except OtherFormatError:
+            if kind:
+                raise
             continue
         doubts: tuple[str, ...] = ()
         if ring is not None:
@@ -117,8 +117,11 @@ def bring_turns(
         if turns > MOST:
             said.append(f"the first {MOST} turns are taken")
         return Imported(_stored(data, ring), ring, tuple(said), doubts)
-    assert failed is not None
-    raise failed
+    raise OtherFormatError(
+        f"'{path}' is no file that is known: give a MATLAB LOCO file (.mat), HDF5 files of a "
+        "response with lattice and names, or a table (.csv, .tsv, .txt, .h5, .sdds); of turns "
+        f"name the kind with --turns ({KINDS})"
+    )
 
 
 def _of_ring(data: Measurement, ring: Ring) -> tuple[Measurement, tuple[str, ...]]:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.measurement.documents import located
 from tmlattice.measurement.monitors import Names, merge_spellings
 from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read_rows
@@ -67,6 +67,10 @@ def read_table(
         )
 
 
+KINDS = "lhc, sps, psb, doros, iota, ptc, trackone, ascii, madng, superkekb"
+"""Of turn-by-turn files that the package `turn_by_turn` reads."""
+
+
 def read_turn_by_turn(
     path: str | Path,
     datatype: str = "lhc",
@@ -80,8 +84,8 @@ def read_turn_by_turn(
 
     Args:
         path: the file.
-        datatype: its kind: lhc, sps, psb, doros, iota, ptc, trackone, ascii, madng, superkekb
-            (SDDS, HDF5, TFS and text files of these machines and codes).
+        datatype: its kind, one of `KINDS` (SDDS, HDF5, TFS and text files of these machines and
+            codes).
         launches: nominal (x, px, y, py[, delta]) of the bunches, [shot, 4 or 5]; else 0.
         noise: rms of a reading, see `Measurement`.
         monitors: the ring's names, checked where given; the names and their order are then the
@@ -90,7 +94,8 @@ def read_turn_by_turn(
             write mm.
 
     Raises:
-        MeasurementError: the file cannot be read as that kind, or its readings cannot be metres.
+        OtherFormatError: the file cannot be read as that kind.
+        MeasurementError: its readings cannot be metres.
     """
     import turn_by_turn
 
@@ -102,9 +107,9 @@ def read_turn_by_turn(
         data = turn_by_turn.read(path, datatype=datatype)
         tables = [(bunch.X, bunch.Y) for bunch in data.matrices]
     except Exception as error:  # whatever a reader meets in a file of another kind
-        raise MeasurementError(
+        raise OtherFormatError(
             f"{path}: cannot be read as '{datatype}' ({type(error).__name__}: {error}); name the "
-            "kind of the file (lhc, sps, psb, doros, iota, ptc, trackone, ascii, madng, superkekb)"
+            f"kind of the file ({KINDS})"
         ) from error
     spellings = list(dict.fromkeys(str(n) for x, y in tables for n in (*x.index, *y.index)))
     found, places = merge_spellings(spellings)
