@@ -3,8 +3,8 @@
 The response that was measured is the first day. The second is the same, with what changes of some
 supplies and of some single magnets do to the readings of all that was fitted to the first (AT's
 closed orbits, with less without; kicks that the dispersion has and no orbit shows, which AT lacks,
-by the package's maps), drifts of monitors and correctors, magnets that come back to 1e-4, and noise
-of its own.
+by the package's maps), drifts of monitors and correctors, magnets that come back to 1e-4 and
+supplies to half of that, and noise of its own.
 What the model of the ring lacks is in both days, as it is in two real ones; so is the first one's
 noise, and the second's is drawn larger by that: two days differ by the noise of both.
 
@@ -44,7 +44,8 @@ SHIFT = 0.03
 DRIFT = 2e-3
 """rms, relative, of gains and kicks from one day to the other."""
 SCATTER = 1e-4
-"""rms, relative: as well as every quadrupole comes back, and one that was changed is set."""
+"""rms, relative: as well as every quadrupole comes back, and one that was changed is set; half of
+it as well as all of a supply do together."""
 STRANGE = 0.05
 """Share of the square of a column, or a monitor, that a multiple of its model leaves where it takes
 no part: what is exchanged, say, would have the change of another one."""
@@ -168,10 +169,13 @@ def simulated(ring, known, measured, changes=()):
 
 def second_day(measured, ring, known, before, changes, rng):
     """What would have been measured then, of a ring with some causes on the first day."""
+    own = magnets(ring, ("quadrupole",), powered=True)
+    members = supplied_alike(ring, own)[1]
+    back = SCATTER * rng.standard_normal(len(own))
+    back += SCATTER / 2 * members @ rng.standard_normal(members.shape[1])
     scatter = [
         Cause("quadrupole_gradient", piece.name, amount)
-        for magnet in magnets(ring, ("quadrupole",), powered=True)
-        for amount in [SCATTER * rng.standard_normal()]
+        for magnet, amount in zip(own, back, strict=True)
         for piece in magnet
     ]
     after = simulated(ring, known, measured, [*causes_of(changes), *scatter])
