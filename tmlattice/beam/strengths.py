@@ -5,9 +5,8 @@ polynomials of the change, to rounding, so that a fit moves four hundred strengt
 their exact derivatives in a millisecond.
 """
 
-import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -56,11 +55,7 @@ class Strength:
 
     def magnet(self, change: float) -> Element:
         """The magnet with its strength changed by a relative amount."""
-        magnet = self.elements[-1]
-        source = copy.deepcopy(magnet.source)  # the object may stand in many places
-        strength = self.value * (1 + change)
-        setattr(source, self.attribute, strength)
-        return replace(magnet, source=source, **{self.attribute: strength})  # type: ignore[arg-type]
+        return self.elements[-1].changed(**{self.attribute: self.value * (1 + change)})
 
     def weights(self, change: float, dimension: int = 4) -> Weights:
         """OCELOT's W0, W1, W2 of the layer with its magnet's strength changed by a relative

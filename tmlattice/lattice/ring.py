@@ -1,6 +1,5 @@
 """A ring: named elements in beam order, each with the OCELOT object that it stands for."""
 
-import copy
 import json
 import math
 from collections import Counter
@@ -153,7 +152,9 @@ class Element:
         Raises:
             LatticeError: it has no such attribute, or its length would change.
         """
-        source = copy.deepcopy(self.source)  # the object may stand in many places
+        from tmlattice.lattice.source import copied
+
+        source = copied(self.source)  # the object may stand in many places
         for attribute, amount in attributes.items():
             if attribute == "l" or not hasattr(source, attribute):
                 raise LatticeError(

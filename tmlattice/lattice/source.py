@@ -3,6 +3,7 @@
 Nothing of a lattice is known here: a file's reader and a ring's kept elements both ask for it.
 """
 
+import copy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,18 @@ def blank(cls: str) -> dict[str, Any]:
     """The numbers of a fresh element of an OCELOT class: what may be stored, and its defaults."""
     values = vars(element_class(cls)(eid="blank").element)
     return {k: v for k, v in values.items() if k not in NOT_PHYSICS}
+
+
+def copied(source: Any) -> Any:
+    """An element with numbers of its own, to be changed: a twentieth of a deep copy's time.
+
+    Arrays are shared with the first: set them, never their entries.
+    """
+    own = copy.copy(source)
+    for name, value in (("element", copy.copy(source.element)), ("_tms", None),
+                        ("_first_order_tms", None)):  # fmt: skip
+        object.__setattr__(own, name, value)  # past what would clear the first one's maps
+    return own
 
 
 def source_of(cls: str, parameters: dict[str, Any]) -> Any:
