@@ -20,6 +20,7 @@ from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
 from tmlattice.lattice.slices import stem
+from tmlattice.lattice.supplies import alike_by_design
 from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
@@ -304,16 +305,18 @@ class FamilyEffect(StrengthEffect):
         begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
         return [*self.places(ring), *begin]
 
-    def _alike(self, ring: Ring) -> list[str]:
-        return [name for name, own in ring.supplies.items() if self.sits_on(ring[own[0]])]
+    def _alike(self, ring: Ring) -> dict[str, tuple[str, ...]]:
+        return {
+            name: own for name, own in alike_by_design(ring).items() if self.sits_on(ring[own[0]])
+        }
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
         """All magnets of the family; or, where none is called so, those whose names begin so, up
-        to an underscore, a dot or a number of their own; or those of `Ring.supplies`."""
+        to an underscore, a dot or a number of their own; or those that the design has alike."""
         name = (place or "").casefold()
-        for alike in self._alike(ring):
+        for alike, own in self._alike(ring).items():
             if name == alike.casefold():
-                return [ring.index(own) for own in ring.supplies[alike]]
+                return [ring.index(one) for one in own]
         powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
         family = [i for i in powered if ring.elements[i].family.casefold() == name]
         return family or [i for i in powered if stem(ring.elements[i].name) == name]

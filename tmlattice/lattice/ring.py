@@ -325,14 +325,6 @@ class Ring(Speaks):
         place = self.index(name)
         return tuple(self.elements[i].name for i in self._whole.get(place, (place,)))
 
-    @cached_property
-    def supplies(self) -> dict[str, tuple[str, ...]]:
-        """Quadrupoles without a family that the design has alike, pieces too, by what tells of
-        them; see `lattice.supplies`."""
-        from tmlattice.lattice.supplies import alike_by_design
-
-        return alike_by_design(self) if self.design is None else self.design.supplies
-
     def counts(self) -> dict[str, int]:
         """Number of elements by kind."""
         return dict(Counter(element.kind for element in self.elements))

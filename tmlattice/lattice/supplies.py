@@ -14,6 +14,9 @@ from tmlattice.lattice.slices import stem
 
 Array = NDArray[np.float64]
 
+KEY = "alike by design"
+"""Under which a ring remembers it."""
+
 
 def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:
     """Magnets of some kinds, each with its pieces; pieces that are edges of other magnets are none.
@@ -45,7 +48,7 @@ def families(names: Sequence[str]) -> tuple[list[str], Array]:
 
 def supplied_alike(ring: Ring, own: Sequence[tuple[Element, ...]]) -> tuple[list[str], Array]:
     """Families of quadrupoles, and who belongs to them, [magnet, family] of 0 and 1: by name, and
-    where each has a name of its own (BESSY II, MLS), by `Ring.supplies`.
+    where each has a name of its own (BESSY II, MLS), by `alike_by_design`.
 
     Args:
         ring: where they stand.
@@ -53,15 +56,26 @@ def supplied_alike(ring: Ring, own: Sequence[tuple[Element, ...]]) -> tuple[list
     """
     names = [pieces[0].name for pieces in own]
     kinds, members = families(names)
-    more = {kind: np.isin(names, alike) for kind, alike in ring.supplies.items()}
+    more = {kind: np.isin(names, alike) for kind, alike in alike_by_design(ring).items()}
     more = {kind: alike for kind, alike in more.items() if alike.sum() > 1}
     columns = [alike.astype(float)[:, None] for alike in more.values()]
     return [*kinds, *more], np.hstack([members, *columns])
 
 
 def alike_by_design(ring: Ring) -> dict[str, tuple[str, ...]]:
-    """Quadrupoles that share no name with others, and are as long and as strong: names of all of
-    them, and of their pieces. One supply or one setting is behind them."""
+    """Quadrupoles that share no name with others, and are as long and as strong in the design: by
+    what tells of them, names of them all and of their pieces. One supply or one setting is behind
+    them, in a ring that was changed from the design, too.
+    """
+    if ring.design is not None:
+        return alike_by_design(ring.design)
+    if KEY not in ring.memory:
+        ring.memory[KEY] = _alike(ring)
+    found: dict[str, tuple[str, ...]] = ring.memory[KEY]
+    return found
+
+
+def _alike(ring: Ring) -> dict[str, tuple[str, ...]]:
     own = magnets(ring, ("quadrupole",), powered=True)
     alone = families([pieces[0].name for pieces in own])[1].sum(axis=1) == 0
     designs: dict[tuple[float, float], list[tuple[Element, ...]]] = {}

@@ -19,7 +19,7 @@ from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
-from tmlattice.lattice.supplies import families, magnets, supplied_alike
+from tmlattice.lattice.supplies import alike_by_design, families, magnets, supplied_alike
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -112,7 +112,7 @@ def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
     assert all(np.ptp(k1[column > 0]) == 0 for column in members.T)
     alike = [pieces for pieces in own if pieces[0].k1 == own[0][0].k1]
     others = {ring.index(name): replace(ring[name], k1=0.0)
-              for name in ring.supplies[names[0]][2:]}  # fmt: skip
+              for name in alike_by_design(ring)[names[0]][2:]}  # fmt: skip
     two = replace(ring.with_elements(others), design=None)
     left = magnets(two, ("quadrupole",), powered=True)
     assert supplied_alike(two, left)[0][0] == f"{first} and {alike[1][0].name}"
