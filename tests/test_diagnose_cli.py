@@ -355,6 +355,26 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
     plt.close(ax.figure)
 
 
+def test_a_gap_of_a_model_that_loses_the_beam_is_drawn(diagnoses):
+    """In the page, too, whose numbers are JSON."""
+    import matplotlib.pyplot as plt
+
+    from tmlattice.plots.diagnosis import plot_gap
+    from tmlattice.report import interactive
+
+    diagnosis = diagnoses["named"]
+    first, *others = diagnosis.heldout.misfits
+    lost = dataclasses.replace(first, rms=np.nan, chi2_per_dof=np.nan)
+    heldout = dataclasses.replace(diagnosis.heldout, misfits=(lost, *others))
+    diagnosis = dataclasses.replace(diagnosis, heldout=heldout)
+    ax = plot_gap(diagnosis)
+    ax.figure.canvas.draw()
+    assert np.isfinite(ax.get_xlim()).all()
+    assert "nan" in [text.get_text() for text in ax.texts]
+    plt.close(ax.figure)
+    json.dumps(interactive.gap(diagnosis), allow_nan=False)
+
+
 @pytest.mark.parametrize("count", [1, 3, 8])
 def test_names_under_the_bars_of_the_gap_do_not_overlap(diagnoses, count):
     """Long names of many findings, each beside its own bar."""

@@ -31,6 +31,7 @@ from tmlattice.measurement import (
 )
 from tmlattice.optics import matrix_tunes
 from tmlattice.report import tables
+from tmlattice.speaks import micrometres
 
 FAULT = tmlattice.Cause("quadrupole_gradient", "QD::5", -0.05)
 
@@ -224,3 +225,12 @@ def test_what_a_room_names_above_itself_is_there():
     for method in seen:
         assert callable(method.function), (method.module, method.name)
         assert method.__doc__
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [(1.234e-5, "12.3 µm"), (1e-6, "1.0 µm"), (2.78e-8, "0.028 µm"), (4e-7, "0.4 µm"),
+     (0.0, "0 µm"), (np.nan, "nan µm")],
+)  # fmt: skip
+def test_sizes_below_a_micrometre_are_no_zeros(metres, text):
+    assert micrometres(metres) == text

@@ -44,3 +44,8 @@ def shown(names: Iterable[str], most: int = 3) -> str:
     """The first few names."""
     every = list(names)
     return ", ".join([*every[:most], *(["..."] if len(every) > most else [])])
+
+
+def micrometres(metres: float) -> str:
+    """A size in micrometres: one decimal, or two digits of what is below one; nan stays nan."""
+    return f"{1e6 * metres:.1f} µm" if metres >= 1e-6 else f"{1e6 * metres:.2g} µm"

@@ -22,7 +22,7 @@ from tmlattice.effects import (
     find,
     set_elements,
 )
-from tmlattice.effects.directions import directions, kept_directions
+from tmlattice.effects.directions import directions, kept_directions, sitting_on
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 
@@ -236,10 +236,9 @@ class Group:
         if self._latest is not None and self._latest[0] == key:
             return self._latest[1]
         ring = self.there.ring
-        touched = {ring.elements[place].name for place in self.replaced}
-        families = {ring.elements[place].family for place in self.replaced}
-        again = [i for i, (_, place) in enumerate(key) if place in touched or place in families]
-        layers = LayerMaps(ring.with_elements(self.replaced), self.there.layers.dimension)
+        set_ring = ring.with_elements(self.replaced)
+        again = sitting_on(ring, set_ring, key, self.replaced)
+        layers = LayerMaps(set_ring, self.there.layers.dimension)
         fresh = directions(layers, [key[i] for i in again])
         found = base.replaced(again, fresh)
         if len(key) > FEW:

@@ -38,14 +38,14 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
             amount = float(words[-1])
         except (ValueError, IndexError):
             words = []
-        if len(words) not in (2, 3):
+        if len(words) < 2:  # NAME AMOUNT; ELEMENT may have blanks
             self.fail(
                 f"'{value}' is no effect; give NAME [ELEMENT] AMOUNT in quotes, such as "
                 "\"quadrupole_gradient qd::12 -0.2\" ('tmlattice effects' lists the names)",
                 param,
                 ctx,
             )
-        return words[0], words[1] if len(words) == 3 else None, amount
+        return words[0], " ".join(words[1:-1]) or None, amount
 
 
 @click.command("simulate", cls=Careful)

@@ -45,6 +45,7 @@ from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
 from tmlattice.optics import ring_tunes
+from tmlattice.speaks import micrometres
 from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
@@ -314,7 +315,7 @@ def _said(
     """What a reader should know, each once."""
     found = [*said, *ready.said, *told.said]
     if ready.estimated:
-        x, y = (f"{1e6 * sigma:.1f} µm" for sigma in noise)
+        x, y = map(micrometres, noise)
         found.append(f"the noise was estimated from the data: {x} in x, {y} in y")
     if ready.problem.data.active.sum() == 1 and told.findings:
         found.append(

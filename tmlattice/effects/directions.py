@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice import cache
-from tmlattice.effects.effect import RingEffect, find
+from tmlattice.effects.effect import FamilyEffect, RingEffect, find
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
@@ -114,7 +114,7 @@ def directions_nearby(
         else:
             origin, places = layers.origin
             found = directions_nearby(origin, hypotheses)
-            again = [i for i, one in enumerate(hypotheses) if _is_on(layers.ring, one, places)]
+            again = sitting_on(origin.ring, layers.ring, hypotheses, places)
             if again:
                 found = found.replaced(again, directions(layers, [hypotheses[i] for i in again]))
         if layers.origin is not None:
@@ -124,13 +124,39 @@ def directions_nearby(
     return remembered
 
 
-def _is_on(ring: Ring, hypothesis: tuple[str, str | None], places: Collection[int]) -> bool:
-    """Whether it sits on some of these elements, or on the beam."""
+def sitting_on(
+    before: Ring, after: Ring, hypotheses: Sequence[tuple[str, str | None]], places: Collection[int]
+) -> list[int]:
+    """Which hypotheses sit on elements that differ, in one of two rings.
+
+    Args:
+        before: remembers who sits where.
+        after: the same ring but for some elements.
+        hypotheses: (effect, place), effects of the ring only.
+        places: of these elements.
+    """
+    key = ("sitting on", tuple(hypotheses))
+    if key not in before.memory:
+        at: dict[int, list[int]] = {}
+        for i, hypothesis in enumerate(hypotheses):
+            for place in _members(before, hypothesis):
+                at.setdefault(place, []).append(i)
+        families = [i for i, (name, _) in enumerate(hypotheses)
+                    if isinstance(find(name), FamilyEffect)]  # fmt: skip
+        before.memory[key] = (at, families)
+    at, families = before.memory[key]
+    found = {i for place in places for i in at.get(place, ())}
+    changed = set(places)  # a magnet of a family may have been off, or be off now
+    found |= {i for i in families if not changed.isdisjoint(_members(after, hypotheses[i]))}
+    return sorted(found)
+
+
+def _members(ring: Ring, hypothesis: tuple[str, str | None]) -> list[int]:
     name, place = hypothesis
     effect = find(name)
-    if place is None or not isinstance(effect, RingEffect):
-        return True
-    return any(own in places for own in effect.members(ring, place))
+    if not isinstance(effect, RingEffect):
+        raise TypeError(f"{name} does not act on the ring")
+    return effect.members(ring, place)
 
 
 def directions(

@@ -20,7 +20,6 @@ from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
 from tmlattice.lattice.slices import stem
-from tmlattice.lattice.supplies import alike_by_design
 from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
@@ -305,10 +304,13 @@ class FamilyEffect(StrengthEffect):
         begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
         return [*self.places(ring), *begin]
 
-    def _alike(self, ring: Ring) -> dict[str, tuple[str, ...]]:
-        return {
-            name: own for name, own in alike_by_design(ring).items() if self.sits_on(ring[own[0]])
+    def _alike(self, ring: Ring) -> dict[str, list[int]]:
+        """Supplies that the design tells alone, and who of each can have the effect."""
+        there = {
+            name: [i for i in map(ring.index, own) if self.sits_on(ring.elements[i])]
+            for name, own in ring.supplies.items()
         }
+        return {name: own for name, own in there.items() if own}
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
         """All magnets of the family; or, where none is called so, those whose names begin so, up
@@ -316,7 +318,7 @@ class FamilyEffect(StrengthEffect):
         name = (place or "").casefold()
         for alike, own in self._alike(ring).items():
             if name == alike.casefold():
-                return [ring.index(one) for one in own]
+                return own
         powered = [i for i, e in enumerate(ring.elements) if self.sits_on(e)]
         family = [i for i in powered if ring.elements[i].family.casefold() == name]
         return family or [i for i in powered if stem(ring.elements[i].name) == name]

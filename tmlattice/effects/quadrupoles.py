@@ -186,4 +186,7 @@ class FamilyGradient(_OnQuadrupole, FamilyEffect):
         "setting with the lattice file."
     )
     largest = 0.05
-    sits_on_text = "families of two or more quadrupoles with k1 not 0, by the family's name"
+    sits_on_text = (
+        "families of two or more quadrupoles with k1 not 0, by the family's name, or of what the "
+        "design has alike"
+    )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
+from tmlattice.importers.columns import SDDS
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.lattice import Ring
@@ -76,6 +77,12 @@ def bring_table(path: Path, ring: Ring | None) -> Imported:
     return _wide(path, header, rows, ring)
 
 
+_FILES = (
+    "give a MATLAB LOCO file (.mat), HDF5 files of a response with lattice and names, or a table "
+    "(.csv, .tsv, .txt, .h5, .sdds); "
+)
+
+
 def bring_turns(
     path: Path, ring: Ring | None, kind: str | None = None, unit: Unit | None = None
 ) -> Imported:
@@ -90,14 +97,17 @@ def bring_turns(
         unit: of the file; None: mm.
 
     Raises:
-        MeasurementError: it cannot be read, or its readings cannot be of that unit.
+        OtherFormatError: it cannot be read.
+        MeasurementError: its readings cannot be of that unit.
     """
+    why: OtherFormatError | None = None
     for one in [kind] if kind else ["lhc", "sps"]:
         try:
             data = read_turn_by_turn(path, one, unit=unit or "mm")
-        except OtherFormatError:
+        except OtherFormatError as error:
             if kind:
                 raise
+            why = why or error
             continue
         doubts: tuple[str, ...] = ()
         if ring is not None:
@@ -117,11 +127,13 @@ def bring_turns(
         if turns > MOST:
             said.append(f"the first {MOST} turns are taken")
         return Imported(_stored(data, ring), ring, tuple(said), doubts)
-    raise OtherFormatError(
-        f"'{path}' is no file that is known: give a MATLAB LOCO file (.mat), HDF5 files of a "
-        "response with lattice and names, or a table (.csv, .tsv, .txt, .h5, .sdds); of turns "
-        f"name the kind with --turns ({KINDS})"
+    table = (
+        "for its columns name the lattice with --lattice; " if path.suffix.lower() in SDDS else ""
     )
+    raise OtherFormatError(
+        f"'{path}' is no file that is known: {table or _FILES}of turns name the kind with --turns "
+        f"({KINDS})"
+    ) from why
 
 
 def _of_ring(data: Measurement, ring: Ring) -> tuple[Measurement, tuple[str, ...]]:

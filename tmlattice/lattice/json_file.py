@@ -6,6 +6,7 @@ reading, as everywhere. A matrix is stored by its nonzero entries (`"12"` is row
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cache
 from importlib.resources import files
@@ -16,6 +17,7 @@ import numpy as np
 
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
+from tmlattice.lattice.alike import Supplies
 from tmlattice.lattice.places import place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, NO_ERRORS, Element, Errors, Ring, number_names
 from tmlattice.lattice.source import blank, made
@@ -77,6 +79,7 @@ def save_ring(ring: Ring, path: str | Path) -> None:
                 "energy_gev": ring.energy,
                 **({} if ring.mass == ELECTRON_GEV else {"mass_gev": ring.mass}),
                 "changes": {name: dict(change) for name, change in ring.changes.items()},
+                **({"supplies": ring.supplies} if ring.supplies else {}),
                 "definitions": definitions,
                 "sequence": sequence,
             },
@@ -147,7 +150,21 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
     )
     energy = float(content["energy_gev"]) if energy is None else energy
     mass = float(content.get("mass_gev", ELECTRON_GEV))
-    return Ring(name, elements, energy, content.get("changes", {}), mass)
+    ring = Ring(name, elements, energy, content.get("changes", {}), mass)
+    return replace(ring, known_supplies=_supplies(path, ring, content.get("supplies")))
+
+
+def _supplies(path: Path, ring: Ring, stated: Mapping[str, list[str]] | None) -> Supplies | None:
+    if stated is None:
+        return None
+    known = {element.name for element in ring.elements}
+    for supply, names in stated.items():
+        if strange := [name for name in names if name not in known]:
+            raise LatticeError(
+                f"'{path}': the supply '{supply}' has '{strange[0]}', which is no element; take it "
+                "out"
+            )
+    return {supply: tuple(names) for supply, names in stated.items()}
 
 
 def _content(path: Path) -> Any:

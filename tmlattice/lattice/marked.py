@@ -54,7 +54,7 @@ def marked(
     families, kinds, sources = zip(*places, strict=True)
     placed = place_elements(families, sources, kinds)
     kept = (replace(e, errors=own) for e, own in zip(placed, errors, strict=True))
-    return replace(ring, elements=tuple(kept))
+    return replace(ring, elements=tuple(kept), known_supplies=None)
 
 
 def _patterns(text: str | Sequence[str] | None) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.late import Method
+from tmlattice.lattice.alike import Supplies, alike_by_design
 from tmlattice.speaks import Speaks, last_part, shown
 
 Kind = Literal[
@@ -204,7 +205,7 @@ class Ring(Speaks):
         energy: of a particle, rest energy included, GeV.
         changes: what was changed since it was loaded, by element name.
         mass: rest energy of a particle, GeV; an electron's unless the lattice says otherwise.
-        design: the ring that this one was changed from; None: it is one.
+        known_supplies: those of the design that this ring was changed from; None: it is one.
     """
 
     name: str
@@ -212,7 +213,7 @@ class Ring(Speaks):
     energy: float
     changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mass: float = ELECTRON_GEV
-    design: "Ring | None" = field(default=None, compare=False)
+    known_supplies: Supplies | None = field(default=None, compare=False)
 
     plot = Method(
         "tmlattice.plots.speaking",
@@ -313,8 +314,17 @@ class Ring(Speaks):
         return slices_of(self.elements)
 
     @cached_property
-    def _whole(self) -> dict[int, tuple[int, ...]]:
+    def whole(self) -> dict[int, tuple[int, ...]]:
+        """Of each piece of a magnet the places of all its pieces."""
         return {i: pieces for pieces in self.slices.values() for i in pieces}
+
+    @cached_property
+    def supplies(self) -> Supplies:
+        """Quadrupoles that share no name with others and are alike in the design, see
+        `lattice.alike`."""
+        if self.known_supplies is not None:
+            return self.known_supplies
+        return alike_by_design(self.elements, self.whole)
 
     def pieces(self, name: str) -> tuple[str, ...]:
         """Names of all pieces of the magnet that an element is a piece of; else its own.
@@ -323,7 +333,7 @@ class Ring(Speaks):
             UnknownNameError: no such element.
         """
         place = self.index(name)
-        return tuple(self.elements[i].name for i in self._whole.get(place, (place,)))
+        return tuple(self.elements[i].name for i in self.whole.get(place, (place,)))
 
     def counts(self) -> dict[str, int]:
         """Number of elements by kind."""
@@ -350,7 +360,7 @@ class Ring(Speaks):
         new = list(self.elements)
         for place, element in elements.items():
             new[place] = element
-        return replace(self, elements=tuple(new), design=self.design or self)
+        return replace(self, elements=tuple(new), known_supplies=self.supplies)
 
 
 def number_names(names: Iterable[str]) -> list[str]:
@@ -369,7 +379,7 @@ def number_names(names: Iterable[str]) -> list[str]:
     return numbered
 
 
-FIELDS = ("name", "elements", "energy", "changes", "mass", "design")
+FIELDS = ("name", "elements", "energy", "changes", "mass", "known_supplies")
 
 KEPT = ("kept",)
 """Where a ring's `memory` has the key under which it is kept in the cache, if it is."""

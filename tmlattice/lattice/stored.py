@@ -77,7 +77,8 @@ def load(key: str, name: str) -> Ring | None:
         s = start + length / 2
         elements.append(Element(own, family, kind, s, length, k1, k2, angle, tilt, source))
         start += length
-    ring = Ring(name, tuple(elements), kept["energy"], kept["changes"], kept["mass"])
+    ring = Ring(name, tuple(elements), kept["energy"], kept["changes"], kept["mass"],
+                kept.get("supplies"))  # fmt: skip
     ring.memory[KEPT] = key
     return ring
 
@@ -104,6 +105,7 @@ def save(key: str, ring: Ring) -> None:
         "energy": ring.energy,
         "mass": ring.mass,
         "changes": {name: dict(change) for name, change in ring.changes.items()},
+        "supplies": ring.known_supplies,
         "definitions": list(index),
         "families": families,
         "sequence": sequence,

@@ -19,6 +19,7 @@ from tmlattice.plots.plan import plot_plan
 from tmlattice.plots.readings import AFTER, BEFORE, mark, plot_readings, readings_caption
 from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import lattice_strip
+from tmlattice.speaks import micrometres
 
 Array = NDArray[np.float64]
 
@@ -310,16 +311,23 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     ax.barh(rows, rms, height=0.55, color=[BEFORE] + [AFTER] * (len(rms) - 1))
     for row, value in zip(rows, rms, strict=True):
         ax.annotate(
-            f"{value:.1f}", (value, row), xytext=(4, 0), textcoords="offset points", va="center"
+            micrometres(1e-6 * value).removesuffix(" µm"),
+            (value, row),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
         )
-    ax.axvline(noise, color="k", linestyle="--", linewidth=1, label=f"noise {noise:.1f} µm")
+    ax.axvline(
+        noise, color="k", linestyle="--", linewidth=1, label=f"noise {micrometres(1e-6 * noise)}"
+    )
     ax.set_yticks(rows, ["\n".join(wrap(label, LABEL)) for label in gap_labels(diagnosis)])
     ax.set_ylim(max(len(rms), 2) - 0.4, -0.6)  # the design on top
-    if rms.max() > 20 * max(rms.min(), 1e-9):
+    there = np.append(rms[np.isfinite(rms)], noise)  # a model may lose a beam
+    if there.max() > 20 * max(there.min(), 1e-9):
         ax.set_xscale("log")
-        ax.set_xlim(0.4 * min(rms.min(), noise), 2.5 * rms.max())
+        ax.set_xlim(0.4 * there.min(), 2.5 * there.max())
     else:
-        ax.set_xlim(0, 1.18 * max(rms.max(), noise))
+        ax.set_xlim(0, 1.18 * there.max())
     shots = ", ".join(map(str, diagnosis.heldout_shots))
     title = f"Held-out shots {shots}" if shots else "Held-out readings"
     ax.set_xlabel("held-out readings less model, rms [µm]")

@@ -47,13 +47,6 @@ def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
     return f"{value:+.{digits}f} ± {error:.{digits}f} {unit}"
 
 
-def micrometres(metres: float) -> str:
-    """A length in micrometres: one decimal, or two digits of what is below one."""
-    value = 1e6 * abs(metres)
-    digits = 1 if value >= 1 or value == 0 else int(np.clip(1 - np.floor(np.log10(value)), 1, 6))
-    return f"{1e6 * metres:.{digits}f} µm"
-
-
 def least_text(effect: str, amount: float) -> str:
     """The least amount that would be seen; a fault's largest where that is less."""
     kind = find(effect)

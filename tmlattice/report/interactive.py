@@ -33,8 +33,9 @@ from tmlattice.plots.diagnosis import (
 )
 from tmlattice.plots.names import plural
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings
-from tmlattice.report.amounts import amount_text, micrometres, words
+from tmlattice.report.amounts import amount_text, words
 from tmlattice.report.tables import standouts
+from tmlattice.speaks import micrometres
 
 Figure = dict[str, Any]
 

@@ -23,18 +23,18 @@ def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
         (
             step.effect,
             str(step.parameters),
-            micrometres(step.heldout_rms_in_plane),
-            micrometres(step.heldout_rms_position),
-            micrometres(step.heldout_rms_coupling),
-            micrometres(step.heldout_rms_roll),
-            micrometres(step.dispersion_rms),
+            three_digits(step.heldout_rms_in_plane),
+            three_digits(step.heldout_rms_position),
+            three_digits(step.heldout_rms_coupling),
+            three_digits(step.heldout_rms_roll),
+            three_digits(step.dispersion_rms),
             f"{step.heldout_chi2_per_dof:.3g}",
         )
         for step in steps
     ]
 
 
-def micrometres(metres: float) -> str:
+def three_digits(metres: float) -> str:
     """Three digits; nothing where nothing was read."""
     return f"{1e6 * metres:.3g}" if np.isfinite(metres) else ""
 
@@ -60,7 +60,7 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
             f"{1e6 * row.heldout_rms_in_plane:.3g}",
             f"{1e6 * row.heldout_rms_position:.3g}",
             f"{1e6 * row.on_top_in_plane:.3g}",
-            "" if row.control_in_plane is None else micrometres(row.control_in_plane),
+            "" if row.control_in_plane is None else three_digits(row.control_in_plane),
             row.judgement,
         )
         for row in result.hypotheses or ()

@@ -11,7 +11,7 @@ import numpy as np
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
-from tmlattice.report.amounts import amount_text, least_text, micrometres, probability_text, words
+from tmlattice.report.amounts import amount_text, least_text, probability_text, words
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.remedies import (
     consequence_text,
@@ -20,6 +20,7 @@ from tmlattice.report.remedies import (
     remedy_text,
     title,
 )
+from tmlattice.speaks import micrometres
 
 __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  # of its page too
 
@@ -163,7 +164,7 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
         )
         + (
             ", and that of the RF's response from "
-            f"{1e6 * first.dispersion_rms:.0f} to {1e6 * last.dispersion_rms:.0f} µm."
+            f"{micrometres(first.dispersion_rms)} to {micrometres(last.dispersion_rms)}."
             if np.isfinite(last.dispersion_rms)
             else "."
         )

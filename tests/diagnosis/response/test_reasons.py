@@ -19,7 +19,8 @@ from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
-from tmlattice.lattice.supplies import alike_by_design, families, magnets, supplied_alike
+from tmlattice.lattice.alike import families
+from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -101,7 +102,7 @@ def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
                for i, (first,) in enumerate(here)}  # fmt: skip
     last = max(renamed)
     renamed[last] = replace(renamed[last], k1=1.01 * renamed[last].k1)
-    ring = replace(small_ring.with_elements(renamed), design=None)
+    ring = replace(small_ring.with_elements(renamed), known_supplies=None)
     own = magnets(ring, ("quadrupole",), powered=True)
     assert families([pieces[0].name for pieces in own])[0] == []
     names, members = supplied_alike(ring, own)
@@ -112,8 +113,8 @@ def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
     assert all(np.ptp(k1[column > 0]) == 0 for column in members.T)
     alike = [pieces for pieces in own if pieces[0].k1 == own[0][0].k1]
     others = {ring.index(name): replace(ring[name], k1=0.0)
-              for name in alike_by_design(ring)[names[0]][2:]}  # fmt: skip
-    two = replace(ring.with_elements(others), design=None)
+              for name in ring.supplies[names[0]][2:]}  # fmt: skip
+    two = replace(ring.with_elements(others), known_supplies=None)
     left = magnets(two, ("quadrupole",), powered=True)
     assert supplied_alike(two, left)[0][0] == f"{first} and {alike[1][0].name}"
     # a changed ring has the supplies of its design, and those that share a name stay as they are

@@ -29,7 +29,7 @@ from tmlattice.diagnosis.families.fields import (
 )
 from tmlattice.effects import Cause, Monitors
 from tmlattice.inference.priors import Group
-from tmlattice.lattice.supplies import families
+from tmlattice.lattice.alike import families
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 

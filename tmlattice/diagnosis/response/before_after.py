@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, kicks_astray
+from tmlattice.diagnosis.families.energy import EnergyOffset
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
@@ -40,6 +41,7 @@ from tmlattice.diagnosis.response.exchanged_since import all_right, since
 from tmlattice.diagnosis.response.few import Few, few_causes, knows_more
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import LeftOpen, and_orbits, left_open
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
@@ -50,6 +52,7 @@ from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.normal import solve
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -63,6 +66,8 @@ ANY = 6.0
 """rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets from which a change of all of them is told though none stands out."""
+SEEN = 3.0
+"""Standard deviations from which an energy of the reference is told."""
 LEAST_NOISE = 0.2
 """Share of the stated noise that two measurements differ by at least."""
 
@@ -223,9 +228,15 @@ def _reference(
 
 def _of_the_ring(fitted: State) -> Iterator[str]:
     """What no list of causes shows of the ring that changed."""
-    energy = fitted.at.errors.energy
+    energy, where = fitted.at.errors.energy, EnergyOffset.variable
     if energy:
-        yield f"its beam is off the nominal energy by {energy:.3g} (relative), and so are the tunes"
+        there = linear(fitted, EnergyOffset.block)
+        sigma = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where[where]]
+        if abs(energy) > SEEN * sigma[0]:
+            yield (
+                f"its beam is off the nominal energy by {energy:.2e} ± {sigma[0]:.0e} (relative), "
+                "and the tunes are those there"
+            )
     yield from dispersion_by_kicks(fitted.values, fitted.data)
 
 

@@ -16,7 +16,7 @@ from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.ways import between
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
-from tmlattice.lattice.supplies import families
+from tmlattice.lattice.alike import families
 from tmlattice.observe.orbit_response import DELTA
 
 Array = NDArray[np.float64]

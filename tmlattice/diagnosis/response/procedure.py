@@ -65,6 +65,7 @@ from tmlattice.observe.response_noise import overstated
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
+from tmlattice.speaks import micrometres
 
 Array = NDArray[np.float64]
 
@@ -355,7 +356,7 @@ def _warnings(fit: DenseFit) -> tuple[str, ...]:
     said = []
     if last.heldout_chi2_per_dof > MISSING:
         said.append(
-            f"On held-out readings {1e6 * last.heldout_rms_in_plane:.1f} µm are left, "
+            f"On held-out readings {micrometres(last.heldout_rms_in_plane)} are left, "
             f"{np.sqrt(last.heldout_chi2_per_dof):.1f} times the noise: an effect is missing."
         )
     left = {

@@ -1,0 +1,138 @@
+"""Quadrupoles that share no name, and that the design has alike: one supply, wherever it is asked.
+
+As at BESSY II and MLS (q1m1t1r, q1m2t1r, ...); a change by such a one is in `test_before_after`.
+"""
+
+import json
+import pickle
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from tmlattice import load_ring
+from tmlattice.beam.assembly import Group, assembly
+from tmlattice.cli.command import tmlattice
+from tmlattice.effects import Cause, apply, find
+from tmlattice.effects.directions import directions, directions_nearby
+from tmlattice.errors import LatticeError
+from tmlattice.lattice import save_ring
+from tmlattice.lattice.marked import marked
+from tmlattice.maps import LayerMaps
+
+SUPPLY = "QFm0r and 15 of its strength"
+HYPOTHESES = [
+    ("family_gradient", SUPPLY), ("family_gradient", "QDm0r and 15 of its strength"),
+    ("family_sextupole", "sf"), ("quadrupole_gradient", "QFm2r"), ("quadrupole_gradient", "QFm3r"),
+    ("radiation_loss_bends", None),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def ring(small_ring):
+    count = Counter()
+
+    def own(element):
+        name = f"{element.family}m{count[element.family]}r"
+        count[element.family] += 1
+        return replace(element, name=name, family=name)
+
+    return replace(
+        small_ring,
+        elements=tuple(own(e) if e.kind == "quadrupole" else e for e in small_ring.elements),
+    )
+
+
+def test_it_is_a_place_of_what_a_supply_has(ring, small_ring):
+    supply = find("family_gradient")
+    assert supply.places(ring) == [SUPPLY, "QDm0r and 15 of its strength"]
+    assert supply.places(small_ring) == ["QF", "QD"]
+    changed = apply(ring, [Cause("family_gradient", SUPPLY.upper(), 0.01)])
+    for e, before in zip(changed.elements, ring.elements, strict=True):
+        own = before.kind == "quadrupole" and before.k1 > 0
+        assert e.k1 == pytest.approx(1.01 * before.k1 if own else before.k1)
+    assert find("family_sextupole").places(ring) == find("family_sextupole").places(small_ring)
+
+
+def test_a_changed_ring_has_those_of_its_design(ring, tmp_path):
+    rng = np.random.default_rng(1)
+    wrong = [Cause("quadrupole_gradient", e.name, 1e-3 * rng.standard_normal())
+             for e in ring.elements if e.kind == "quadrupole"]  # fmt: skip
+    changed = apply(ring, wrong)
+    assert replace(changed, known_supplies=None).supplies == {}  # by its strengths none
+    save_ring(changed, tmp_path / "as_found.json")
+    for same in (changed, pickle.loads(pickle.dumps(changed)),
+                 load_ring(tmp_path / "as_found.json")):  # fmt: skip
+        assert same.supplies == ring.supplies
+        assert find("family_gradient").members(same, SUPPLY) == find("family_gradient").members(
+            ring, SUPPLY
+        )
+
+
+@pytest.mark.parametrize("off", ["QFm0r", "QFm1r"])
+def test_a_magnet_that_is_off_is_no_member(ring, off):
+    there = ring.with_changed(off, k1=0.0)
+    members = find("family_gradient").members(there, SUPPLY)
+    assert len(members) == 15
+    assert ring.index(off) not in members
+    assert apply(there, [Cause("family_gradient", SUPPLY, 0.01)])[off].k1 == 0
+
+
+def test_marked_correctors_part_their_magnets(ring):
+    """Halves of a magnet are members, both."""
+    cut = marked(ring, correctors=["QFm0r", "QFm1r"])
+    members = [cut.elements[i].name for i in find("family_gradient").members(cut, SUPPLY)]
+    assert len(members) == 18
+    assert {"QFm0r", "QFm0r_2", "QFm1r", "QFm1r_2"} < set(members)
+
+
+def test_a_supply_of_what_is_no_element(ring, tmp_path):
+    save_ring(ring, tmp_path / "ring.json")
+    document = json.loads((tmp_path / "ring.json").read_text())
+    document["supplies"][SUPPLY][2] = "QFm99r"
+    (tmp_path / "ring.json").write_text(json.dumps(document))
+    with pytest.raises(LatticeError, match=f"the supply '{SUPPLY}' has 'QFm99r', which is no"):
+        load_ring(tmp_path / "ring.json")
+
+
+def test_a_place_with_blanks_on_the_command_line(ring, tmp_path):
+    save_ring(ring, tmp_path / "ring.json")
+    found = CliRunner().invoke(tmlattice, [
+        "simulate", str(tmp_path / "ring.json"), "--shots", "1", "--out", str(tmp_path / "out"),
+        "--effect", f"family_gradient {SUPPLY} 0.01", "--truth", str(tmp_path / "truth.json"),
+    ])  # fmt: skip
+    assert found.exit_code == 0, found.output
+    truth = json.loads((tmp_path / "truth.json").read_text())
+    assert [cause["element"] for cause in truth["effects"]] == [SUPPLY]
+
+
+def by_hypothesis(found):
+    """{hypothesis: rows}, wherever they stand."""
+    out = {}
+    for i, hypothesis in enumerate(found.hypotheses):
+        rows = np.flatnonzero(found.owner == i)
+        rows = rows[np.argsort(found.layer[rows], kind="stable")]
+        out[hypothesis] = [getattr(found, name)[rows] for name in ("layer", "D0", "D1", "D2")]
+    return out
+
+
+@pytest.mark.parametrize("k1", [1.17, 0.0])
+def test_derivatives_of_a_changed_ring(ring, k1):
+    """Those that are kept of the ring before, and those that a shot's settings change: as worked
+    out anew. A magnet that is off has none."""
+    layers = LayerMaps(ring, 6)
+    directions_nearby(layers, HYPOTHESES)
+    there = ring.with_changed("QFm3r", k1=k1)
+    fresh = by_hypothesis(directions(LayerMaps(there, 6), HYPOTHESES))
+    nearby = by_hypothesis(directions_nearby(layers.changed_to(there)[0], HYPOTHESES))
+    settings = {"QFm3r": {"k1_relative": k1 / ring["QFm3r"].k1 - 1}}
+    shots = Group(0, np.zeros(1, dtype=int), settings, False, assembly(ring, (), 6))
+    for found in (nearby, by_hypothesis(shots.directions(HYPOTHESES))):
+        for hypothesis in HYPOTHESES:
+            if k1 == 0 and hypothesis[1] == "QFm3r":
+                continue  # has none to ask for
+            for a, b in zip(found[hypothesis], fresh[hypothesis], strict=True):
+                assert a.shape == b.shape, hypothesis
+                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12 * np.abs(b).max(initial=1))
