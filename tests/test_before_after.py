@@ -295,6 +295,31 @@ def test_monitors_and_correctors_of_one_measurement_alone_do_no_harm(small_ring,
     assert any(before.monitors[0].casefold() in said for said in result.warnings)
 
 
+@pytest.mark.parametrize("days", ["after", "both"])
+@pytest.mark.parametrize("gone", ["y of every other monitor", "x", "across"])
+def test_a_plane_that_is_not_read_takes_nothing_of_the_other(small_ring, before, after, gone, days):
+    """Monitors mix the planes: what one has read alone had been lost with the other."""
+
+    def less(measured):
+        response, orbit = measured.response.copy(), measured.rf.orbit.copy()
+        if gone == "across":
+            own = np.array(["x", "y"]) == np.array(measured.planes)[:, None]
+            response = np.where(own[:, None, :], response, np.nan)
+        elif gone == "x":
+            response[:, :, 0] = orbit[:, 0] = np.nan
+        else:
+            response[:, ::2, 1] = orbit[::2, 1] = np.nan
+        return replace(measured, response=response, rf=replace(measured.rf, orbit=orbit))
+
+    reference = less(before) if days == "both" else before
+    result = diagnose(small_ring, less(after), reference=reference)
+    found = {(own.effect, own.element.casefold()): own for own in result.findings}
+    assert set(found) == {(own.effect, own.element.casefold()) for own in CHANGED}
+    for cause in CHANGED:
+        own = found[cause.effect, cause.element.casefold()]
+        assert abs(own.amount - cause.amount) < 4 * own.amount_sigma
+
+
 def test_a_reference_of_another_kind_or_machine_is_a_sentence(small_ring, before, after):
     with pytest.raises(MeasurementError, match="give a reference of the same kind"):
         diagnose(small_ring, after, reference=object())

@@ -719,7 +719,8 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
     assert found.measurement.monitors == ("bpm::0", "bpm::6")
     assert "'BPM.OF.ANOTHER'" in " ".join(found.doubts)
     (tmp_path / "b.sdds").write_text("nothing")
-    with pytest.raises(TmlatticeError, match="is no file that is known: for its columns name the lattice"):
+    unknown = "is no file that is known: for its columns name the lattice"
+    with pytest.raises(TmlatticeError, match=unknown):
         bring_in([tmp_path / "b.sdds"])
 
 

@@ -79,11 +79,10 @@ def response_change(
         response to steps of that size, and on top of it the difference of the two.
     """
     columns = before.measured.correctors
-    mend = np.linalg.inv(errors.monitors)
     scale = (before.kicks / after.kicks)[:, None, None]
-    change = np.einsum("mij,cmj->cmi", mend, after.orbits * scale - before.orbits)
+    change = _as_the_beam(errors.monitors, after.orbits * scale - before.orbits)
     noise = np.hypot(before.noise, after.noise * np.abs(np.median(scale)))
-    noise = np.sqrt(np.einsum("mij,mj->mi", mend**2, noise**2))
+    noise = np.sqrt(_as_the_beam(errors.monitors, noise**2, power=2))
     kicks = np.append(before.kicks[:-1] * errors.kick[:-1], before.kicks[-1])
     there = replace(
         before,
@@ -99,6 +98,20 @@ def response_change(
         rf = replace(rf, orbit=orbits[-1])
     measured = replace(before.measured, kicks=kicks[:-1], response=orbits[:-1], noise=noise, rf=rf)
     return replace(there, measured=measured, orbits=orbits)
+
+
+def _as_the_beam(monitors: Array, read: Array, power: int = 1) -> Array:
+    """Readings [..., monitor, 2] as perfect monitors have them, where the other plane is not read
+    by the own gain alone: what a monitor mixes of a change is next to nothing.
+
+    Args:
+        monitors: gains and what mixes the planes, [monitor, 2, 2].
+        read: of the monitors.
+        power: of the factors: 2 for variances.
+    """
+    both = np.einsum("mij,...mj->...mi", np.linalg.inv(monitors) ** power, read)
+    alone = read / np.diagonal(monitors, axis1=1, axis2=2) ** power
+    return np.where(np.isnan(both), alone, both)
 
 
 def _as_stepped(data: ResponseData) -> Array:
