@@ -50,8 +50,10 @@ def told(found, usual):
     """A line of findings, beside those of the untouched pair."""
     own = {(f.effect, str(f.element)): (f.amount, f.amount_sigma) for f in found.findings}
     lost = [name for name in usual if name not in own]
-    others = [(*name, *amount) for name, amount in own.items() if name not in usual]
-    moved = [abs(own[name][0] - usual[name][0]) / own[name][1] for name in usual if name in own]
+    others = [(*name, amount, sigma or np.nan) for name, (amount, sigma) in own.items()
+              if name not in usual]  # fmt: skip
+    moved = [abs(own[name][0] - usual[name][0]) / (own[name][1] or np.nan)
+             for name in usual if name in own]  # fmt: skip
     least = [abs(amount / sigma) for amount, sigma in own.values() if sigma]
     return (
         f"{found.verdict}, {len(own) - len(others)} of {len(usual)}; lost: "

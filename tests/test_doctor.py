@@ -283,10 +283,17 @@ def test_diagnose_stops_and_goes_on_with_what_is_assumed(small_ring, machine):
 
 
 def test_a_reference_is_looked_at_too(small_ring, healthy):
-    with pytest.raises(MeasurementError, match=r"the reference alone .*: x has the wrong sign"):
-        diagnose(
-            small_ring, healthy, reference=replace(healthy, readings=healthy.readings * [-1, 1])
-        )
+    """What is wrong in one of the two alone no assumption of both mends."""
+    wrong = replace(healthy, readings=healthy.readings * [-1, 1])
+    for which, data, reference, one in (
+        ("the reference", healthy, wrong, True), ("the second measurement", wrong, healthy, True),
+        ("", wrong, wrong, False),
+    ):  # fmt: skip
+        with pytest.raises(MeasurementError, match="x has the wrong sign") as raised:
+            diagnose(small_ring, data, reference=reference)
+        said = str(raised.value)
+        assert said.startswith(f"{which} alone (mend its file") == one
+        assert "--assume x-reversed" in said
 
 
 def test_a_response_stops_and_goes_on_with_what_is_assumed(small_ring, steps):

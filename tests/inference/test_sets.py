@@ -147,4 +147,4 @@ def test_amounts_are_told_over_whether_a_neighbour_is_there():
     assert amount == pytest.approx(mean)
     within = (1 - share) * alone[1][0, 0] + share * both[1][0, 0]
     assert variance == pytest.approx(within + beside)
-    assert own.reasons([0], alone=False)[0].sigma == pytest.approx(np.sqrt(variance))
+    assert own.reasons([0], [(own, 1.0)])[0].sigma == pytest.approx(np.sqrt(variance))

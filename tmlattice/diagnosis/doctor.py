@@ -142,14 +142,20 @@ def consulted(
         MeasurementError: something has to be mended first.
         UnknownNameError: see `check_data`.
     """
-    said = []
-    for where, one in (("", data), ("the reference: ", reference)):
-        if one is not None:
-            checkup = check_data(ring, one, radiation=radiation)
-            checkup.stop(where and "the reference alone (mend its file, --assume is of both): ")
-            told = [check.sentence for check in checkup.told if check.name in _TOLD]
-            said += [where + sentence for sentence in told if sentence not in said]
-    return said
+    own = check_data(ring, data, radiation=radiation)
+    if reference is None:
+        own.stop()
+        return [check.sentence for check in own.told if check.name in _TOLD]
+    other = check_data(ring, reference, radiation=radiation)
+    wrong, as_wrong = (
+        {check.name for check in one.checks if check.status == "wrong"} for one in (own, other)
+    )
+    alone = "{} alone (mend its file, --assume is of both): "
+    own.stop("" if wrong <= as_wrong else alone.format("the second measurement"))
+    other.stop(alone.format("the reference"))
+    said = [check.sentence for check in own.told if check.name in _TOLD]
+    told = [check.sentence for check in other.told if check.name in _TOLD]
+    return said + [f"the reference: {sentence}" for sentence in told if sentence not in said]
 
 
 Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)

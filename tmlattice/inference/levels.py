@@ -10,6 +10,7 @@ linear and Gaussian, so that every amount comes with the error that the scatter 
 """
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ SWEEPS = 5
 """Times that every reason is exchanged against its rivals."""
 SEEN = 1e-6
 """Share of what is known of a candidate that others have to leave of it."""
+LEARNT = 2.0
+"""Log evidence that a size of what cannot be told has to gain to be learnt."""
 RIVAL = 3.0
 """Log evidence by which a rival may be behind to be told beside a reason: a twentieth."""
 
@@ -82,6 +85,52 @@ class Levels:
         self.information = candidates.T @ lu_solve(factor, information) @ candidates
         self.information = (self.information + self.information.T) / 2
         self.candidates = candidates
+
+    def beside(self, others: Sequence[int], rms: float) -> "Levels":
+        """With an amount of this rms of each of some, which nobody knows: they are candidates no
+        more, and are in the errors of all the rest."""
+        at = np.array(others, dtype=int)
+        inside = self.information[np.ix_(at, at)] + np.eye(len(at)) / rms**2
+        across = self.information[:, at]
+        taken = np.linalg.solve(inside, np.column_stack([across.T, self.score[at]]))
+        made = copy(self)
+        made.information = self.information - across @ taken[:, :-1]
+        made.score = self.score - across @ taken[:, -1]
+        wide = np.linalg.slogdet(inside)[1] + 2 * len(at) * np.log(rms)
+        made.background = self.background + float(self.score[at] @ taken[:, -1] - wide) / 2
+        made.information[at] = made.information[:, at] = made.score[at] = 0.0
+        return made
+
+    def beside_others(
+        self, chosen: Sequence[int], alike: Collection[int], rms: Sequence[float]
+    ) -> "BesideOthers":
+        """Some of what is alike changed: the others may have, too, each by less than can be told.
+
+        Where the evidence wants it they are in the errors, and what is not clear then is one of
+        them, or is not there.
+
+        Args:
+            chosen: that are there.
+            alike: candidates that are, chosen ones among them.
+            rms: of the amounts of the others, that are tried: as likely together as that they are
+                not there.
+        """
+        stay = list(chosen)
+        if not set(alike) & set(stay):
+            return BesideOthers(self, stay, 0.0, ((self, 1.0),))
+        while True:
+            chosen, others = stay, [own for own in alike if own not in stay]
+            sizes = [0.0, *rms] if others else [0.0]
+            made = [self.beside(others, one) if one else self for one in sizes]
+            logs = np.array([own.background + own.log_evidence(chosen) for own in made])
+            best = int(np.argmax(logs - LEARNT * (np.array(sizes) > 0)))
+            stay = made[best]._pruned(list(chosen), CLEAR)
+            if len(stay) == len(chosen):
+                logs[1:] -= np.log(max(len(rms), 1))
+                chance = np.exp(logs - logsumexp(logs)).tolist()
+                return BesideOthers(
+                    made[best], stay, sizes[best], tuple(zip(made, chance, strict=True))
+                )
 
     def fitted(self, chosen: Sequence[int]) -> tuple[Array, Array]:
         """Amounts and covariance of some candidates together."""
@@ -181,19 +230,26 @@ class Levels:
         wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
         return amounts + more, wider - more**2
 
-    def reasons(self, chosen: Sequence[int], alone: bool = True) -> list[Reason]:
+    def reasons(
+        self, chosen: Sequence[int], over: Sequence[tuple["Levels", float]] = ()
+    ) -> list[Reason]:
         """With amounts, errors and rivals, by falling chi-square.
 
         Args:
             chosen: all that are there.
-            alone: whether nothing else is there; else one that is not clear may be, see `averaged`.
+            over: levels with their probabilities, in each of which one more may be there that is
+                not clear, see `averaged`; none: nothing else is there.
         """
         if not chosen:
             return []
         amounts, covariance = self.fitted(chosen)
         variance = np.diag(covariance)
-        if not alone:
-            amounts, variance = self.averaged(chosen)
+        if over:
+            each = [own.averaged(chosen) for own, _ in over]
+            chance = np.array([share for _, share in over])
+            means, within = (np.array([own[i] for own in each]) for i in (0, 1))
+            amounts = chance @ means
+            variance = chance @ (within + (means - amounts) ** 2)
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])
@@ -208,3 +264,20 @@ class Levels:
                 )
             )  # fmt: skip
         return sorted(found, key=lambda reason: -reason.statistic)
+
+
+@dataclass(frozen=True, eq=False)
+class BesideOthers:
+    """What is there where others may be that cannot be told.
+
+    Attributes:
+        levels: to ask for the chosen, with the others' likeliest size in the errors.
+        chosen: those that stay.
+        rms: of the others, 0 where nothing wants them.
+        over: the levels with every size of the others, with its probability.
+    """
+
+    levels: Levels
+    chosen: list[int]
+    rms: float
+    over: tuple[tuple[Levels, float], ...]

@@ -14,7 +14,7 @@ insertion devices: by evidence, see `inference.levels`.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,7 +26,7 @@ from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, kicks_astray
 from tmlattice.diagnosis.families.energy import EnergyOffset
 from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
@@ -331,8 +331,10 @@ def _verdict(state: State) -> str:
     return "distributed" if group is not None and group.rms > EVERYWHERE else "nothing"
 
 
-def _said(data: ResponseData, fit: DenseFit, state: State, scatter: float | None) -> list[str]:
-    """How well two measurements agree, and by how much magnets of a supply scatter."""
+def _said(
+    data: ResponseData, fit: DenseFit, state: State, scatter: Mapping[str, float]
+) -> list[str]:
+    """How well two measurements agree, and by how much magnets, and supplies, scatter."""
     left = data.pick(state.at.left)[:-1][:, state.good]
     agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
     stated = 1e6 * float(np.median(data.noise))
@@ -340,9 +342,15 @@ def _said(data: ResponseData, fit: DenseFit, state: State, scatter: float | None
         f"with what changed the two measurements agree to {agree:.2g} µm (their stated noise makes "
         f"{stated:.2g})"
     ]
-    if scatter is not None:
+    if scatter:
+        size = scatter[QuadrupoleGradient.name]
         said.append(
-            f"magnets of one supply differ in their change by {scatter:.1g} (rms, relative), "
-            f"which is in the errors; changes below {REPRODUCED:g} are taken for none"
+            f"magnets of one supply differ in their change by {size:.1g} (rms, relative), which is "
+            f"in the errors; changes below {REPRODUCED:g} are taken for none"
+        )
+    if size := scatter.get(FamilyGradient.name, 0.0):
+        said.append(
+            f"other supplies changed, too, by {size:.1g} (rms, relative), which is in the errors: "
+            "which ones, and by how much each, these readings do not tell"
         )
     return said

@@ -4,7 +4,8 @@
 
 Magnets of a supply scatter in their change, and by how much says how well a change of a supply is
 known. What a fit of every magnet learns of it has the changes of single magnets in it; so the
-scatter, too, is what the evidence of the candidates beside it wants.
+scatter, too, is what the evidence of the candidates beside it wants. Where some supplies changed
+others may have, too, that cannot be told one by one: by how much is learnt in the same way.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +25,7 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.levels import Levels, Reason
+from tmlattice.inference.levels import BesideOthers, Levels, Reason
 from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
@@ -48,6 +49,8 @@ AGAIN = 3
 """How often it is asked anew what changed, beside what the ring's errors make of what was found."""
 FINER = 0.5
 """Steps in which less scatter is tried."""
+OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
+"""Rms of the changes of supplies that cannot be told, relative, that are tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +67,13 @@ class _Weighed:
     """Candidates beside some scatter, those that are there, and the log evidence of all that."""
 
     among: _Candidates
-    levels: Levels
-    chosen: list[int]
+    there: BesideOthers
     evidence: float
 
 
 def what_changed(
     state: State, judgement: Judgement, open_: LeftOpen | None = None
-) -> tuple[list[Finding], float | None]:
+) -> tuple[list[Finding], dict[str, float]]:
     """Supplies, magnets and devices that changed: all of them, for what is left out is scatter.
 
     Args:
@@ -80,12 +82,13 @@ def what_changed(
         open_: what is not known of the ring that changed; None: it is known.
 
     Returns:
-        The findings; and by how much magnets of a supply scatter in their change, rms, relative;
-        None where no quadrupoles were fitted.
+        The findings; and by how much magnets of a supply scatter in their change, rms, relative,
+        and supplies that are not told (0: they did not), by the effects' names; empty where no
+        quadrupoles were fitted.
     """
-    found, between = _found(state, judgement, {})
+    found, scatter = _found(state, judgement, {})
     if open_ is None or not found:
-        return found, between
+        return found, scatter
     data = state.data
     base = Predicted(data, Errors.none(data)).bend()
     problem = Response(base=base, used=np.isfinite(data.orbits), places={})
@@ -95,10 +98,10 @@ def what_changed(
             blurred = _blurred(problem, open_, found)
         except UnstableRingError:  # what was found is too much for the ring
             break
-        found, between = _found(state, judgement, blurred)
+        found, scatter = _found(state, judgement, blurred)
         if not found or {(own.effect, own.element) for own in found} == before:
             break
-    return found, between
+    return found, scatter
 
 
 def _blurred(problem: Response, open_: LeftOpen, found: Sequence[Finding]) -> dict[int, Array]:
@@ -115,9 +118,9 @@ def _blurred(problem: Response, open_: LeftOpen, found: Sequence[Finding]) -> di
 
 def _found(
     state: State, judgement: Judgement, blurred: Mapping[int, Array]
-) -> tuple[list[Finding], float | None]:
+) -> tuple[list[Finding], dict[str, float]]:
     found: list[Finding] = []
-    between = None
+    of_magnets: dict[str, float] = {}
     for block in (0, 1):
         fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}
         if not fitted:
@@ -126,12 +129,13 @@ def _found(
         if block in blurred:
             there = with_numbers(there, state, block, "left open", blurred[block])
         scatter, own = _by_evidence(state, block, there, fitted)
-        between = scatter.get(QuadrupoleGradient.name, between)
+        if QuadrupoleGradient.name in scatter:
+            of_magnets = {**scatter, FamilyGradient.name: own.there.rms}
         found += [
             _finding(state.data.ring, own.among.causes, reason, judgement)
-            for reason in own.levels.reasons(own.chosen, alone=False)
+            for reason in own.there.levels.reasons(own.there.chosen, own.there.over)
         ]
-    return found, between
+    return found, of_magnets
 
 
 def _by_evidence(
@@ -148,8 +152,10 @@ def _by_evidence(
             information / wider**2, pull / wider**2, among.members, among.scatter,
             np.full(len(odds), USUAL), np.array(odds),
         )  # fmt: skip
-        chosen = levels.choose(MOST)
-        return _Weighed(among, levels, chosen, levels.background + levels.log_evidence(chosen))
+        supplies = [i for i, (name, _) in enumerate(among.causes) if name == FamilyGradient.name]
+        there = levels.beside_others(levels.choose(MOST), supplies, OTHERS)
+        evidence = there.levels.background + there.levels.log_evidence(there.chosen)
+        return _Weighed(among, there, evidence)
 
     least = {
         f.name: REPRODUCED if isinstance(f, QuadrupoleGradient) else STRAY for f in fitted.values()
