@@ -50,15 +50,16 @@ def told(found, usual):
     """A line of findings, beside those of the untouched pair."""
     own = {(f.effect, str(f.element)): (f.amount, f.amount_sigma) for f in found.findings}
     lost = [name for name in usual if name not in own]
-    others = [(*name, amount, sigma or np.nan) for name, (amount, sigma) in own.items()
-              if name not in usual]  # fmt: skip
+    others = [f"{effect} {where} " + ("" if sigma is None else f"{amount:+.2g} ± {sigma:.1g}")
+              for (effect, where), (amount, sigma) in own.items()
+              if (effect, where) not in usual]  # fmt: skip
     moved = [abs(own[name][0] - usual[name][0]) / (own[name][1] or np.nan)
              for name in usual if name in own]  # fmt: skip
     least = [abs(amount / sigma) for amount, sigma in own.values() if sigma]
     return (
         f"{found.verdict}, {len(own) - len(others)} of {len(usual)}; lost: "
         f"{', '.join(name for _, name in lost) or 'none'}; others: "
-        f"{'; '.join(f'{e} {w} {a:+.2g} ± {s:.1g}' for e, w, a, s in others) or 'none'}; moved by "
+        f"{'; '.join(others) or 'none'}; moved by "
         f"{max(moved, default=0):.1f} of their errors at most, all above "
         f"{min(least, default=np.inf):.1f}"
     )
