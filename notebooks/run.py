@@ -15,7 +15,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 FOLDER = Path(__file__).parent
-TIMEOUT = 300  # s, of one cell
+TIMEOUT = 1800  # s, of one cell: what PETRA III lacks takes ten minutes beside other work
 
 
 def execute(path: Path) -> nbformat.NotebookNode:
