@@ -20,7 +20,6 @@ import variants
 
 import tmlattice
 from tmlattice.errors import TmlatticeError
-from tmlattice.measurement.assume import ASSUMPTIONS
 
 CHANGED = ("lnls_2014-07-17_before", "lnls_2014-07-17_after")
 NULL = ("lnls_2014-07-11_a", "lnls_2014-07-11_b")
@@ -36,8 +35,7 @@ def tried(ring, before, after, assumed=()):
         found = tmlattice.diagnose(ring, after, reference=before, assume=assumed)
     except TmlatticeError as error:
         said = str(error)
-        offered = said.rpartition("go on with ")[2].split("; ")[0]
-        names = tuple(name for name in ASSUMPTIONS if f"--assume {name}" in offered)
+        names = variants.offered(said)
         if names and not assumed:
             return [f"stopped: {said}", *tried(ring, before, after, names)]
         return [f"refused: {said}"]

@@ -63,7 +63,7 @@ class Known(NamedTuple):
 def drawn(ring, rng, null):
     """Changes: (what it is told of, amount, {magnet: relative change})."""
     own = magnets(ring, ("quadrupole",), powered=True)
-    kinds, members = supplied_alike(ring, own)
+    kinds, members = supplied_alike(ring)
     several = [i for i in range(len(kinds)) if members[:, i].sum() > 1]
     changes, taken = [], set()
     if null:
@@ -170,7 +170,7 @@ def simulated(ring, known, measured, changes=()):
 def second_day(measured, ring, known, before, changes, rng):
     """What would have been measured then, of a ring with some causes on the first day."""
     own = magnets(ring, ("quadrupole",), powered=True)
-    members = supplied_alike(ring, own)[1]
+    members = supplied_alike(ring)[1]
     back = SCATTER * rng.standard_normal(len(own))
     back += SCATTER / 2 * members @ rng.standard_normal(members.shape[1])
     scatter = [
@@ -195,7 +195,7 @@ def second_day(measured, ring, known, before, changes, rng):
 def judged(ring, result, changes):
     """Names of what was found and missed, findings that are none, and pulls."""
     own = magnets(ring, ("quadrupole",), powered=True)
-    kinds, members = supplied_alike(ring, own)
+    kinds, members = supplied_alike(ring)
     true = {magnet[0].name: 0.0 for magnet in own}
     for _, _, of, _, _ in changes:
         true.update(of)

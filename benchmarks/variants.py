@@ -443,6 +443,12 @@ VARIANTS: dict[str, Callable[[Case, Rng], Case]] = {
 
 
 # --- the trial ------------------------------------------------------------------------------------
+def offered(said: str) -> tuple[str, ...]:
+    """What a diagnosis that stopped asks to assume."""
+    first = said.rpartition("go on with ")[2].split("; ")[0]
+    return tuple(name for name in ASSUMPTIONS if f"--assume {name}" in first)
+
+
 def tried(make: Callable[[], Case], seed: int, assumed: tuple[str, ...] = ()) -> dict[str, Any]:
     """What comes of a case; a second time with what the first asks to assume."""
     begun = time.process_time()
@@ -452,8 +458,7 @@ def tried(make: Callable[[], Case], seed: int, assumed: tuple[str, ...] = ()) ->
     except TmlatticeError as error:
         said = str(error)
         seconds = time.process_time() - begun
-        offered = said.rpartition("go on with ")[2]
-        names = tuple(name for name in ASSUMPTIONS if f"--assume {name}" in offered.split("; ")[0])
+        names = offered(said)
         if names and not assumed:
             return {"stopped": said, **tried(lambda: case, seed, names)}
         return {"error": said, "seconds": seconds, "assumed": assumed}

@@ -320,6 +320,33 @@ def test_a_plane_that_is_not_read_takes_nothing_of_the_other(small_ring, before,
         assert abs(own.amount - cause.amount) < 4 * own.amount_sigma
 
 
+def test_a_change_is_one_of_the_beam_by_monitors_that_mix_the_planes(small_ring, before):
+    """Gains, rolls and a shear of each monitor, none the transpose of another: what the beam did is
+    what was put in, in both planes; by the own gain where the other plane is not read."""
+    rng = np.random.default_rng(5)
+    data = response_data(small_ring, before)
+    monitors = np.eye(2) + 0.2 * rng.standard_normal((len(before.monitors), 2, 2))
+    errors = replace(Errors.none(data), monitors=monitors)
+    beam = 1e-6 * rng.standard_normal(data.orbits.shape)
+    read = np.einsum("mij,cmj->cmi", monitors, beam)
+    change, nothing = (
+        response_change(data, errors, replace(data, orbits=data.orbits + more))
+        for more in (read, 0.0)
+    )
+    assert change.orbits - nothing.orbits == pytest.approx(beam, abs=1e-17)
+    mend = np.linalg.inv(monitors)
+    made = np.array(
+        [[np.hypot(*(row * data.noise[m])) for row in own] for m, own in enumerate(mend)]
+    )
+    assert change.noise == pytest.approx(np.sqrt(2) * made)
+    alone = read.copy()
+    alone[..., 1] = np.nan
+    in_x = response_change(data, errors, replace(data, orbits=data.orbits + alone))
+    expected = read[..., 0] / monitors[:, 0, 0]
+    assert (in_x.orbits - nothing.orbits)[..., 0] == pytest.approx(expected, abs=1e-17)
+    assert np.isnan(in_x.orbits[..., 1]).all()
+
+
 def test_a_reference_of_another_kind_or_machine_is_a_sentence(small_ring, before, after):
     with pytest.raises(MeasurementError, match="give a reference of the same kind"):
         diagnose(small_ring, after, reference=object())

@@ -22,7 +22,7 @@ from tmlattice.effects import (
     find,
     set_elements,
 )
-from tmlattice.effects.directions import directions, kept_directions, sitting_on
+from tmlattice.effects.directions import directions, kept_directions, ring_effect, sitting_on
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 
@@ -140,9 +140,7 @@ class Assembly:
 
 
 def _members(ring: Ring, cause: Cause) -> list[int]:
-    effect = find(cause.effect)
-    assert isinstance(effect, RingEffect)
-    return effect.members(ring, cause.element)
+    return ring_effect(cause.effect).members(ring, cause.element)
 
 
 def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Assembly:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.closed_orbit import KICK, ResponseModel
 from tmlattice.beam.feed_down import feed_down
 from tmlattice.effects import RingEffect, directions, find
-from tmlattice.effects.directions import STEP, Directions
+from tmlattice.effects.directions import STEP, Directions, ring_effect
 from tmlattice.errors import EffectError
 from tmlattice.maps.quadratic import Quadratic, difference
 from tmlattice.maps.taylor import second_derivatives
@@ -231,8 +231,7 @@ class ResponseSlopes:
         """What an error in a corrector makes of its own kick, as a change of the launch."""
         model, columns = self.model, self.columns
         mixed = np.zeros_like(self.pulled)
-        effect, place = find(hypothesis[0]), hypothesis[1]
-        assert isinstance(effect, RingEffect)
+        effect, place = ring_effect(hypothesis[0]), hypothesis[1]
         members = effect.members(model.ring, place)
         for c in np.flatnonzero(np.isin(columns.place, members)):
             i, k = int(columns.place[c]), int(columns.layer[c])

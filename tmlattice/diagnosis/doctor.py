@@ -153,8 +153,9 @@ def consulted(
     alone = "{} alone (mend its file, --assume is of both): "
     own.stop("" if wrong <= as_wrong else alone.format("the second measurement"))
     other.stop(alone.format("the reference"))
-    said = [check.sentence for check in own.told if check.name in _TOLD]
-    told = [check.sentence for check in other.told if check.name in _TOLD]
+    said, told = (
+        [check.sentence for check in one.told if check.name in _TOLD] for one in (own, other)
+    )
     return said + [f"the reference: {sentence}" for sentence in told if sentence not in said]
 
 

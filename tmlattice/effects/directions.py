@@ -138,25 +138,32 @@ def sitting_on(
     key = ("sitting on", tuple(hypotheses))
     if key not in before.memory:
         at: dict[int, list[int]] = {}
-        for i, hypothesis in enumerate(hypotheses):
-            for place in _members(before, hypothesis):
-                at.setdefault(place, []).append(i)
-        families = [i for i, (name, _) in enumerate(hypotheses)
-                    if isinstance(find(name), FamilyEffect)]  # fmt: skip
+        families = []
+        for i, (name, place) in enumerate(hypotheses):
+            effect = ring_effect(name)
+            for member in effect.members(before, place):
+                at.setdefault(member, []).append(i)
+            if isinstance(effect, FamilyEffect):
+                families.append((i, effect, place))
         before.memory[key] = (at, families)
     at, families = before.memory[key]
     found = {i for place in places for i in at.get(place, ())}
     changed = set(places)  # a magnet of a family may have been off, or be off now
-    found |= {i for i in families if not changed.isdisjoint(_members(after, hypotheses[i]))}
+    found |= {i for i, effect, place in families
+              if not changed.isdisjoint(effect.members(after, place))}  # fmt: skip
     return sorted(found)
 
 
-def _members(ring: Ring, hypothesis: tuple[str, str | None]) -> list[int]:
-    name, place = hypothesis
+def ring_effect(name: str) -> RingEffect:
+    """The effect of this name, which acts on the ring.
+
+    Raises:
+        TypeError: it does not.
+    """
     effect = find(name)
     if not isinstance(effect, RingEffect):
         raise TypeError(f"{name} does not act on the ring")
-    return effect.members(ring, place)
+    return effect
 
 
 def directions(
@@ -176,9 +183,7 @@ def directions(
     reads = _Rows(2, n)
     first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
     for owner, (name, place) in enumerate(hypotheses):
-        effect = find(name)
-        if not isinstance(effect, RingEffect):
-            raise TypeError(f"{name} does not act on the ring")
+        effect = ring_effect(name)
         h = step * effect.largest
         for member in effect.members(ring, place):
             element = ring.elements[member]

@@ -10,27 +10,19 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.slices import stem
+from tmlattice.lattice.slices import Piece, stem
 
 Array = NDArray[np.float64]
 Supplies = Mapping[str, tuple[str, ...]]
 """Names of all magnets of each, their pieces too, by what tells of it."""
 
 
-class Body(Protocol):
-    """What is asked of an element."""
+class Body(Piece, Protocol):
+    """What more is asked of an element."""
 
     @property
     def name(self) -> str:
         """Unique in the ring."""
-
-    @property
-    def kind(self) -> str:
-        """As in `lattice.ring.Kind`."""
-
-    @property
-    def length(self) -> float:
-        """m."""
 
     @property
     def k1(self) -> float:

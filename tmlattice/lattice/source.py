@@ -35,7 +35,7 @@ def blank(cls: str) -> dict[str, Any]:
 
 
 def copied(source: Any) -> Any:
-    """An element with numbers of its own, to be changed: a twentieth of a deep copy's time.
+    """An element with numbers of its own, to be changed: a quarter of a deep copy's time.
 
     Arrays are shared with the first: set them, never their entries.
     """

@@ -1,10 +1,10 @@
 """Which elements of a ring are one magnet, and which magnets share a supply.
 
->>> own = magnets(ring, ("quadrupole",), powered=True)
->>> kinds, members = supplied_alike(ring, own)
+>>> [own[0].name for own in magnets(ring, ("quadrupole",), powered=True)]
+>>> kinds, members = supplied_alike(ring)
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +29,11 @@ def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[t
     ]
 
 
-def supplied_alike(ring: Ring, own: Sequence[tuple[Element, ...]]) -> tuple[list[str], Array]:
-    """Families of quadrupoles, and who belongs to them, [magnet, family] of 0 and 1: by name, and
-    where a magnet has a name of its own (BESSY II, MLS), by `Ring.supplies`.
-
-    Args:
-        ring: where they stand.
-        own: magnets, each with its pieces.
-    """
-    names = [pieces[0].name for pieces in own]
+def supplied_alike(ring: Ring) -> tuple[list[str], Array]:
+    """Families of powered quadrupoles, and who of these `magnets` belongs to them, [magnet, family]
+    of 0 and 1: by name, and where a magnet has a name of its own (BESSY II, MLS), by
+    `Ring.supplies`."""
+    names = [pieces[0].name for pieces in magnets(ring, ("quadrupole",), powered=True)]
     kinds, members = families(names)
     more = {kind: np.isin(names, alike) for kind, alike in ring.supplies.items()}
     more = {kind: alike for kind, alike in more.items() if alike.sum() > 1}

@@ -1,6 +1,6 @@
 """Figures of a diagnosis."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from textwrap import wrap
 
 import matplotlib.pyplot as plt
@@ -323,7 +323,7 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     ax.set_yticks(rows, ["\n".join(wrap(label, LABEL)) for label in gap_labels(diagnosis)])
     ax.set_ylim(max(len(rms), 2) - 0.4, -0.6)  # the design on top
     there = np.append(rms[np.isfinite(rms)], noise)  # a model may lose a beam
-    if there.max() > 20 * max(there.min(), 1e-9):
+    if over_decades(rms):
         ax.set_xscale("log")
         ax.set_xlim(0.4 * there.min(), 2.5 * there.max())
     else:
@@ -345,6 +345,12 @@ def gap_axes(diagnosis: Diagnosis) -> Axes:
     height = 1.3 + max(0.5, 0.1 + 0.17 * lines) * max(len(labels), 2)
     _, ax = plt.subplots(figsize=(8, height), layout="constrained")
     return ax
+
+
+def over_decades(rms: Iterable[float]) -> bool:
+    """Whether bars of these lengths want a logarithmic axis; a model that loses a beam has none."""
+    there = [value for value in rms if np.isfinite(value)]
+    return bool(there) and max(there) > 20 * max(min(there), 1e-9)
 
 
 def noise_rms(diagnosis: Diagnosis) -> float:

@@ -29,6 +29,7 @@ from tmlattice.plots.diagnosis import (
     gap_labels,
     middles,
     noise_rms,
+    over_decades,
     thresholds,
 )
 from tmlattice.plots.names import plural
@@ -340,12 +341,12 @@ def gap(diagnosis: Diagnosis) -> Figure:
         "hovertext": labels, "hovertemplate": "%{hovertext}<br>%{x:.3g} µm<extra></extra>",
         "showlegend": False,
     }  # fmt: skip
-    wide = max(rms) > 20 * max(min(rms), 1e-9)
     line = _trace([noise, noise], [-0.5, len(rms) - 0.5], f"noise {micrometres(1e-6 * noise)}",
                   "@ink", dash="dash")  # fmt: skip
+    scale = "log" if over_decades(rms) else "linear"
     layout = _layout(
         110 + pitch * len(rms),
-        xaxis=_axis("held-out readings less model, rms [µm]", type="log" if wide else "linear"),
+        xaxis=_axis("held-out readings less model, rms [µm]", type=scale),
         yaxis={"tickvals": rows, "ticktext": labels, "automargin": True, "fixedrange": True,
                "range": [len(rms) - 0.4, -0.6], "zeroline": False},
     )  # fmt: skip

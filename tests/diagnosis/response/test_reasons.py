@@ -105,7 +105,7 @@ def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
     ring = replace(small_ring.with_elements(renamed), known_supplies=None)
     own = magnets(ring, ("quadrupole",), powered=True)
     assert families([pieces[0].name for pieces in own])[0] == []
-    names, members = supplied_alike(ring, own)
+    names, members = supplied_alike(ring)
     assert members.sum(axis=0).tolist() == [16, 15]
     first = own[0][0].name
     assert names[0] == f"{first} and 15 of its strength"
@@ -115,12 +115,11 @@ def test_magnets_with_names_of_their_own_are_families_by_strength(small_ring):
     others = {ring.index(name): replace(ring[name], k1=0.0)
               for name in ring.supplies[names[0]][2:]}  # fmt: skip
     two = replace(ring.with_elements(others), known_supplies=None)
-    left = magnets(two, ("quadrupole",), powered=True)
-    assert supplied_alike(two, left)[0][0] == f"{first} and {alike[1][0].name}"
+    assert supplied_alike(two)[0][0] == f"{first} and {alike[1][0].name}"
     # a changed ring has the supplies of its design, and those that share a name stay as they are
-    assert supplied_alike(ring.with_changed(first, k1=0.5), own)[0] == names
+    assert supplied_alike(ring.with_changed(first, k1=0.5))[0] == names
     kinds = families([pieces[0].name for pieces in here])[0]
-    assert supplied_alike(small_ring, here)[0] == kinds
+    assert supplied_alike(small_ring)[0] == kinds
 
 
 def of_families(amounts, seed=0, noise=2e-3):

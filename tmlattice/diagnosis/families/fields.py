@@ -115,14 +115,11 @@ class FamilyGradient(QuadrupoleGradient):
 
     def count(self, data: ResponseData) -> int:
         """Families."""
-        return len(self._families(data)[0])
+        return len(supplied_alike(data.ring)[0])
 
     def groups(self, data: ResponseData) -> list[Group]:
         """Of families."""
-        return [Group("quadrupole_gradient of families", self._families(data)[1], 0.01)]
-
-    def _families(self, data: ResponseData) -> tuple[list[str], Array]:
-        return supplied_alike(data.ring, magnets(data.ring, ("quadrupole",), powered=True))
+        return [Group("quadrupole_gradient of families", supplied_alike(data.ring)[1], 0.01)]
 
 
 class _Thin(_Magnets):

@@ -104,7 +104,7 @@ def pulled_apart(state: State, false_alarm: float = DEFAULT.false_alarm) -> Pull
     if chi2.sf(total, read.size) > false_alarm:
         return None
     own = magnets(state.data.ring, ("quadrupole",), powered=True)
-    kinds, members = supplied_alike(state.data.ring, own)
+    kinds, members = supplied_alike(state.data.ring)
     mean = np.vstack([(members / members.sum(axis=0)).T, np.eye(len(own))])
     names = [*kinds, *(pieces[0].name for pieces in own)]
     at, said = there.where[single.variable], []

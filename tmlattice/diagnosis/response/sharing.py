@@ -58,7 +58,7 @@ def candidates(ring: Ring, own: Sequence[tuple[Element, ...]]) -> Candidates:
     add("all", "all quadrupoles", np.ones(len(own)))
     add("focusing", "all focusing quadrupoles", focusing)
     add("focusing", "all defocusing quadrupoles", 1 - focusing)
-    stems, by_stem = supplied_alike(ring, own)
+    stems, by_stem = supplied_alike(ring)
     for name, members in zip(stems, by_stem.T, strict=True):
         add("family", name, members)
     groups = [pieces[0].family.casefold() for pieces in own]

@@ -29,7 +29,7 @@ from tmlattice.inference.levels import BesideOthers, Levels, Reason
 from tmlattice.inference.normal import solve
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
-from tmlattice.lattice.supplies import magnets, supplied_alike
+from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_problem import Response
 
@@ -186,8 +186,7 @@ def _candidates(
         name = QuadrupoleGradient.name if quadrupoles else family.name
         alone = scatter[family.name] ** 2 * own
         if quadrupoles:
-            ring = state.data.ring
-            kinds, members = supplied_alike(ring, magnets(ring, ("quadrupole",), powered=True))
+            kinds, members = supplied_alike(state.data.ring)
             alone = alone + (REPRODUCED / 2) ** 2 * members @ members.T
             causes += [(FamilyGradient.name, kind) for kind in kinds]
             own = np.hstack([members, own])
