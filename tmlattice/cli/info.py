@@ -54,7 +54,7 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "counts": dict(sorted(ring.counts().items())),
         "layers": len(ring.magnets),
         "magnets_in_pieces": len(ring.slices),
-        "bend_angle": sum(e.angle for e in ring.elements if e.kind == "bend"),
+        "bend_angle": sum(e.bending for e in ring.elements),
         "tunes": None,
         "chromaticity": None,
         "beta_max": None,

@@ -11,6 +11,7 @@ its class or MADType where it has that field, else its strongest field at 2 cm f
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -54,11 +55,35 @@ def _normal(strength: complex, order: int) -> tuple[float, float]:
 def straight(
     element: Any, family: str, length: float, mad: str, roll: float, left_out: Counter[str]
 ) -> tuple[Kind, Any]:
-    """A thick multipole: one of OCELOT's where it has one field, else a combined one."""
+    """A thick multipole of AT; see `straight_magnet`."""
+
+    def count(reason: str) -> None:
+        left_out[reason] += 1
+
+    strengths, own = strengths_of(element), _own_order(element, mad)
+    return straight_magnet(strengths, own, length, roll, family, count)
+
+
+def straight_magnet(
+    strengths: NDArray[np.complex128],
+    own: int | None,
+    length: float,
+    roll: float,
+    family: str,
+    left_out: Callable[[str], None],
+) -> tuple[Kind, Any]:
+    """A thick straight magnet: one of OCELOT's where it has one field, else a combined one.
+
+    Args:
+        strengths: (k_n + i k_ns) / n! of order n, four at least, [order].
+        own: the order that its class names: 1 of a quadrupole.
+        length: m.
+        roll: rad.
+        family: its name.
+        left_out: takes the reason where a field is not modelled.
+    """
     from tmlattice.lattice.ocelot import elements as ocelot
 
-    strengths = strengths_of(element)
-    own = _own_order(element, mad)
     orders = [n for n in range(len(strengths)) if strengths[n] != 0]
     low = [n for n in orders if n <= 2]
     high = [n for n in orders if n > 2]
@@ -75,10 +100,10 @@ def straight(
         if high == [3]:
             k, tilt = _normal(complex(strengths[3]), 3)
             return "octupole", ocelot.Octupole(l=length, k3=k, tilt=tilt + roll, eid=family)
-        left_out["multipoles above the sextupole"] += 1
+        left_out("multipoles above the sextupole")
         return "multipole", ocelot.Drift(l=length, eid=family)
     if high:
-        left_out["orders of multipoles above the sextupole"] += 1
+        left_out("orders of multipoles above the sextupole")
     kind = _kind(strengths, own)
     if low == [1]:
         k, tilt = _normal(complex(strengths[1]), 1)

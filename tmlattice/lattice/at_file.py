@@ -7,7 +7,7 @@ Each AT element becomes an OCELOT element of the same first- and second-order ph
 - A bend keeps its edges (angles, gap, fringe integrals, pole curvature), k1 and k2. The nonlinear
   fringes of quadrupoles are of third order and left out. To second order OCELOT's bend is the
   fuller one: AT's has no product of curvature and gradient, and edges of first order.
-- Wigglers made of thin bends of alternating sign become one matrix each (`_merge_wigglers`).
+- Wigglers made of thin bends of alternating sign become one matrix each (`lattice.wigglers`).
 - A corrector kicks px += KickAngle[0], py += KickAngle[1]. It has one plane where its MADType
   (HKICKER, VKICKER) or its name says so; else it is two correctors in one place, NAME_h and NAME_v.
 - A cavity is a drift to the maps; over several turns it gives what its voltage says.
@@ -21,10 +21,9 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,7 @@ from tmlattice.lattice.madx_elements import ACTS
 from tmlattice.lattice.mat_file import check_mat
 from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
+from tmlattice.lattice.wigglers import merge_wigglers
 
 log = logging.getLogger(__name__)
 
@@ -46,12 +46,6 @@ Array = NDArray[np.float64]
 
 _VERTICAL = re.compile(r"^(f?v|c[hy]?v|pcv|pkv|c_?y|ky)|vcor|vkick|vcm|_v(_|\d|$)", re.IGNORECASE)
 _HORIZONTAL = re.compile(r"^(f?h|c[vx]?h|pch|pkh|c_?x|kx)|hcor|hkick|hcm|_h(_|\d|$)", re.IGNORECASE)
-
-THIN_BEND = 0.1
-"""m; a bend not longer than this may be a slice of a wiggler."""
-
-WIGGLER_SLICES = 8
-"""At least as many thin bends in a row, of both signs, are a wiggler."""
 
 
 def read_at(
@@ -133,7 +127,7 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     if left_out:
         what = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
         warnings.warn(f"'{name}': left out of the model: {what}", stacklevel=3)
-    merged = _merge_wigglers(converted, design.map_energy) * max(1, int(lattice.periodicity))
+    merged = merge_wigglers(converted, design.map_energy) * max(1, int(lattice.periodicity))
     families, kinds, sources = zip(*merged, strict=True)
     return replace(design, elements=place_elements(families, sources, kinds))
 
@@ -261,52 +255,3 @@ def _matrix(r: Array, family: str, length: float, energy: float) -> tuple[Kind, 
     if source.r[4, 4] == 0.0 and source.r[5, 5] == 0.0:
         source.r[4, 4] = source.r[5, 5] = 1.0
     return ("wiggler" if "wig" in family else "matrix"), source
-
-
-def _merge_wigglers(places: list[Place], energy: float) -> list[Place]:
-    """Each row of thin bends of alternating sign as one matrix element of the family `wiggler`.
-
-    The matrix is the product of the slices' own 6 x 6 matrices, edges included, so tunes and
-    dispersion stay; the slices' second order is dropped (their fields average out). A network
-    then has one layer a wiggler and not two hundred.
-    """
-    from tmlattice.lattice.ocelot import elements as ocelot
-
-    matrices: dict[int, Array] = {}
-    merged: list[Place] = []
-    row: list[Place] = []
-
-    def product(sources: Iterable[Any]) -> Array:
-        total = np.eye(6)
-        for source in sources:
-            if id(source) not in matrices:
-                own = np.eye(6)
-                for part in source.R(energy):
-                    own = part @ own
-                matrices[id(source)] = own
-            total = matrices[id(source)] @ total
-        return total
-
-    def close() -> None:
-        sources = [source for _, _, source in row]
-        angles = [float(source.angle) for source in sources]
-        turns = sum(a * b < 0 for a, b in pairwise(angles))
-        balanced = abs(sum(angles)) < 0.05 * sum(map(abs, angles))
-        if len(row) >= WIGGLER_SLICES and turns >= 2 and balanced:
-            whole = ocelot.Matrix(l=sum(float(source.l) for source in sources), eid="wiggler")
-            whole.r = product(sources)
-            log.info("%d thin bends from '%s' on are one wiggler", len(row), row[0][0])
-            merged.append(("wiggler", "wiggler", whole))
-        else:
-            merged.extend(row)
-        row.clear()
-
-    for place in places:
-        _, kind, source = place
-        if kind == "bend" and 0 < float(source.l) <= THIN_BEND:
-            row.append(place)
-            continue
-        close()
-        merged.append(place)
-    close()
-    return merged

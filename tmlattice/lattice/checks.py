@@ -105,8 +105,8 @@ def need_monitors(ring: Ring) -> None:
 
 def no_whole_turn(ring: Ring) -> str | None:
     """What to say of a ring whose bends do not sum to a turn; None where they do, or are none."""
-    bends = [e for e in ring.elements if e.kind == "bend" and e.angle]
-    total = sum(e.angle * math.cos(e.tilt) for e in bends)
+    bends = [e for e in ring.elements if e.bending]
+    total = sum(e.bending * math.cos(e.tilt) for e in bends)
     if not bends or abs(abs(total) / (2 * math.pi) - 1) < CLOSED:
         return None
     share = abs(total) / (2 * math.pi)

@@ -7,7 +7,8 @@ OCELOT element like its own, with the fields as everybody writes them (MAD-X, AT
 
 so that AT's PolynomB[n] is k_n / n! and PolynomA[n] is k_ns / n!. A sextupole with a skew coil and
 a quadrupole with a corrector's coil on its poles are such magnets. A thin one (l = 0) holds the
-integrated fields, k_n L.
+integrated fields, k_n L. It may also bend the design orbit by an angle, which then makes no kick on
+that orbit: `k0` is the dipole field beyond it.
 
 Its map is that of the constant Hamiltonian of its body, to second order: the equations of motion of
 all products of two coordinates are linear up to products of three: an exponential solves them.
@@ -27,6 +28,9 @@ ELECTRON_GEV = 0.51099895e-3
 
 FIELDS = ("k0", "k0s", "k1", "k1s", "k2", "k2s")
 """Dipole (1/m), quadrupole (1/m2), sextupole (1/m3); normal and skew."""
+DESIGN = ("angle", "lrad")
+"""Of a thin one: the angle by which the design orbit bends, rad, and the length of the bend that it
+stands for, m; over that length a bend focuses as angle^2 / lrad; 0: it does not."""
 
 _quadrupole = elements.Quadrupole().element
 _Magnet: Any = next(c for c in type(_quadrupole).__mro__ if c.__name__ == "Magnet")
@@ -46,14 +50,19 @@ def _motion(k: dict[str, float], energy: float) -> list[dict[tuple[int, ...], fl
     gamma = energy / ELECTRON_GEV
     beta = np.sqrt(1 - 1 / gamma**2) if gamma else 1.0
     slip = 1 / (beta * gamma) ** 2 if gamma else 0.0
+    # H = -angle x (1 + delta) + weak x^2 / 2, with delta = p / beta - slip p^2 / 2
+    angle = k.get("angle", 0.0)
+    weak = angle**2 / k["lrad"] if angle and k["lrad"] else 0.0
     return [
         {(1,): 1.0, (1, 5): -1 / beta},
-        {(): -k["k0"], (0,): -k["k1"], (2,): k["k1s"],
-         (0, 0): -k["k2"] / 2, (2, 2): k["k2"] / 2, (0, 2): k["k2s"]},
+        {(): -k["k0"], (0,): -k["k1"] - weak, (2,): k["k1s"],
+         (0, 0): -k["k2"] / 2, (2, 2): k["k2"] / 2, (0, 2): k["k2s"],
+         (5,): angle / beta, (5, 5): -slip * angle / 2},
         {(3,): 1.0, (3, 5): -1 / beta},
         {(): k["k0s"], (2,): k["k1"], (0,): k["k1s"],
          (0, 2): k["k2"], (0, 0): k["k2s"] / 2, (2, 2): -k["k2s"] / 2},
-        {(5,): -slip, (1, 1): 0.5 / beta, (3, 3): 0.5 / beta, (5, 5): 1.5 * slip / beta},
+        {(5,): -slip, (1, 1): 0.5 / beta, (3, 3): 0.5 / beta, (5, 5): 1.5 * slip / beta,
+         (0,): angle / beta, (0, 5): -slip * angle},
         {},
     ]  # fmt: skip
 
@@ -64,7 +73,7 @@ def body_map(
     """B [6], R [6, 6], T [6, 6, 6] (symmetric) of a straight body.
 
     Args:
-        fields: `FIELDS`; integrated where there is no length.
+        fields: `FIELDS`; integrated where there is no length, and there `DESIGN` as well.
         length: m; None: a thin one.
         energy: GeV.
     """
@@ -72,7 +81,8 @@ def body_map(
 
     index, motion = _products(), _motion(fields, energy)
     if length is None:  # kicks alone, no way
-        motion = [row if i in (1, 3) else {} for i, row in enumerate(motion)]
+        late = {term: amount for term, amount in motion[4].items() if 0 in term}
+        motion = [{}, motion[1], {}, motion[3], late, {}]
         length = 1.0
     slope = np.zeros((len(index), len(index)))
     for product, row in index.items():
@@ -99,12 +109,12 @@ class CombinedAtom(_Magnet):  # type: ignore[misc]
         super().__init__(eid=eid)
         self.l = l
         self.tilt = tilt
-        for name in FIELDS:
+        for name in (*FIELDS, *DESIGN):
             setattr(self, name, fields.get(name, 0.0))
 
     def _map(self, energy: float, delta_length: float | None) -> tuple[Array, Array, Array]:
         length = None if self.l == 0 else self.l if delta_length is None else delta_length
-        fields = {name: float(getattr(self, name)) for name in FIELDS}
+        fields = {name: float(getattr(self, name)) for name in (*FIELDS, *DESIGN)}
         B, R, T = body_map(fields, length, energy)
         return (rot_mtx(-self.tilt) @ B).reshape(6, 1), R, T  # OCELOT turns R and T, not B
 
@@ -129,6 +139,7 @@ class CombinedMultipole(OpticElement):  # type: ignore[misc]
     Args:
         l: length, m; 0: the fields are integrated.
         k0, k0s, k1, k1s, k2, k2s: see `FIELDS`.
+        angle, lrad: see `DESIGN`; only of a thin one.
         tilt: of all fields about the beam axis, rad.
         eid: its name.
     """
@@ -145,9 +156,13 @@ class CombinedMultipole(OpticElement):  # type: ignore[misc]
         k1s: float = 0.0,
         k2: float = 0.0,
         k2s: float = 0.0,
+        angle: float = 0.0,
+        lrad: float = 0.0,
         tilt: float = 0.0,
         eid: Any = None,
         tm: Any = None,
     ) -> None:
-        atom = CombinedAtom(l, tilt, eid, k0=k0, k0s=k0s, k1=k1, k1s=k1s, k2=k2, k2s=k2s)
+        atom = CombinedAtom(
+            l, tilt, eid, k0=k0, k0s=k0s, k1=k1, k1s=k1s, k2=k2, k2s=k2s, angle=angle, lrad=lrad
+        )
         super().__init__(atom, tm=tm)

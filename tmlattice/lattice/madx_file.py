@@ -1,133 +1,972 @@
-"""Reading a MAD-X sequence or line, a line of elegant, or one of Xsuite, through AT's readers."""
+"""Reading MAD-X: a file's statements are carried out, and its sequence or line is laid out.
 
-import json
+Every statement is in one of three lists: carried out; without effect on the ring (`NO_EFFECT`); or
+neither, and then the file is refused with that statement's name (`REFUSED`, and whatever is
+unknown). Nothing of a file is run: see `madx_language`.
+"""
+
+import contextlib
+import math
 import re
 import warnings
-from collections.abc import Sequence
-from contextlib import redirect_stdout
-from io import StringIO
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
-from tmlattice.lattice.at_file import quiet_at, ring_from_at
-from tmlattice.lattice.madx_parsers import parser_of
+from tmlattice.lattice.madx_beam import Beam
+from tmlattice.lattice.madx_language import (
+    CONSTANTS,
+    Evaluate,
+    Given,
+    Statement,
+    attributes,
+    compiled,
+    holds,
+    split,
+    statements,
+    unquoted,
+    values,
+)
+from tmlattice.lattice.parts import ACTING, MODELLED, NO_EFFECT, STATIC, Part, ring_of_parts
 from tmlattice.lattice.ring import Ring
 
-_BEAM = re.compile(r"(?:^|;)\s*beam\b[^;]*\b(energy|pc|gamma|beta|brho)\b", re.I | re.M)
+MOST_WORK = 4_000_000
+"""Statements (ten each), names and elements looked up; the LHC needs some hundred thousand."""
+MOST_ELEMENTS = 1_000_000
+MOST_FILES = 1000
+MOST_BYTES = 200_000_000
+ROUNDING = 1e-6
+"""m; elements may overlap by this much, as positions are rounded."""
+
+NO_STATEMENT = frozenset({
+    "title", "assign", "value", "show", "print", "printf", "help", "plot", "survey", "twiss",
+    "save", "write", "savebeta", "esave", "eprint", "eoption", "emit", "touschek", "ibs",
+    "aperture", "coguess", "track", "run", "observe", "start", "endtrack", "tkstart", "ripken",
+    "dynap", "sodd", "sixtrack", "dumpsequ", "create", "fill", "readtable", "readmytable",
+    "setplot", "resplot", "usemonitor", "usekick", "chdir", "rename", "copyfile", "removefile",
+    "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
+    "ptc_create_universe", "ptc_create_layout", "ptc_end", "ptc_twiss", "ptc_normal", "ptc_track",
+    "ptc_track_end", "ptc_observe", "ptc_start", "ptc_setswitch", "ptc_align", "ptc_trackline",
+    "ptc_printparametric", "ptc_printframes", "ptc_select", "ptc_select_moment", "ptc_dumpmaps",
+    "ptc_eplacement", "ptc_enforce6d", "ptc_knob", "ptc_moments", "ptc_read_errors", "ptc_script",
+    "ptc_setcavities", "ptc_setfieldcomp", "ptc_open_gino", "ptc_export_xml", "ptc_rviewer",
+    "ptc_oneturnmap", "ptc_varyknob", "ptc_setknobvalue", "ptc_refreshtables", "ptc_move_to_layout",
+    "ptc_setaccel_method", "ptc_gino", "ptc_select_checking", "ptc_refresh_k", "ptc_getnfieldcomp",
+    "set", "error", "help_", "resbeam_", "use_macro", "setvars_lin_", "select_ptc_",
+})  # fmt: skip
+"""Statements that leave the ring as it is."""
+NOT_RUN = {
+    "system": "SYSTEM is not run",
+    "makethin": "MAKETHIN is not carried out: magnets stay thick",
+}
+"""Statements that are passed over with a warning."""
+REFUSED: dict[str, str] = {
+    "match": "MATCH changes strengths by an optimisation, which is not carried out here; run MAD-X "
+             "and SAVE the sequence, or take MATCH out to read the strengths before it",
+    "ealign": "EALIGN moves elements by errors; take it out to read the ring as designed",
+    "efcomp": "EFCOMP gives elements field errors; take it out to read the ring as designed",
+    "seterr": "SETERR gives elements errors from a table; take it out to read the ring as designed",
+    "correct": "CORRECT sets correctors; take it out to read the ring before it",
+    "setvars": "SETVARS sets variables from a table; write their values",
+    "sxfread": "SXFREAD reads a ring from a file of SXF; give a sequence",
+    "extract": "EXTRACT makes a sequence of a part of another; SAVE that sequence and read it",
+    "setplugin": "SETPLUGIN runs a program; take it out",
+}  # fmt: skip
+"""Statements that may change the ring and are not carried out."""
+KEYWORDS = frozenset({*MODELLED, *STATIC, *ACTING, "rbend"}) | {"sequence", "line"}
+WORDS = frozenset({
+    "type", "apertype", "aperture", "aper_offset", "aper_tol", "aper_vx", "aper_vy", "comments",
+    "from", "refer", "refpos", "name", "method", "shape", "model", "range", "polarity", "calib",
+    "mech_sep", "v_pos", "slot_id", "assembly_id", "magnet", "kmax", "kmin", "next_sequ", "xsize",
+    "ysize", "reference",
+})  # fmt: skip
+"""Attributes that are texts, or whose numbers nothing here asks for."""
+
+
+@dataclass
+class _Definition:
+    """An element: its base class and its attributes, those of its parents included."""
+
+    name: str
+    keyword: str
+    values: dict[str, Any]
+    where: str
+
+
+@dataclass
+class _Node:
+    """An element's place in a sequence; `at` is that of its reference point, or of its centre."""
+
+    name: str
+    at: Evaluate
+    origin: str = ""
+    centred: bool = False
+
+
+@dataclass
+class _Sequence:
+    name: str
+    where: str
+    length: Evaluate
+    refer: str = "centre"
+    refpos: str = ""
+    nodes: list[_Node] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """An element with the position of its centre, m."""
+
+    name: str
+    centre: float
+    length: float
+
+
+@dataclass
+class _Line:
+    """Elements, lines and sequences: (how often, reversed, name or items)."""
+
+    items: list[tuple[int, bool, Any]]
 
 
 def read_madx(
     path: Path, name: str, sequence: str | None = None, energy: float | None = None
 ) -> Ring:
-    """The ring of a MAD-X or elegant file.
+    """The ring of a MAD-X file.
 
     Args:
-        path: `.seq`, `.madx` or elegant's `.lte`; files that it calls are read too.
+        path: `.seq`, `.madx`; files that it calls are read too.
         name: of the ring.
-        sequence: of the file's sequences or lines; else `ring`, else the only one
-            that stands in no other.
-        energy: GeV; else the file's BEAM (elegant's files have none).
+        sequence: of the file's sequences or lines; else the one that its last USE names; else
+            `ring`, else the only one that stands in no other.
+        energy: GeV; else that of the file's BEAM.
 
     Raises:
-        LatticeError: no sequence, several without a choice, no energy, or AT cannot read it.
+        LatticeError: a statement that is not understood, or that changes the ring and is not
+            carried out; no sequence, several without a choice, or no energy.
+
+    Warns:
+        Of names without a value, statements that are passed over, and what the model lacks.
     """
-    elegant = path.suffix.lower() == ".lte"
-    parser = parser_of(elegant)
+    reader = _Reader()
     try:
-        with redirect_stdout(StringIO()), quiet_at():
-            parser.parse_files(str(path))
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    found = [str(s) for s in parser.sequences]
-    use = _chosen(path, found, sequence, _outermost(parser, found))
-    if elegant:
-        stated = False
-    else:
-        beams = [dict(v) for k, v in parser.items() if str(k).startswith("beam%")]
-        text = path.read_text(encoding="utf-8", errors="replace")
-        stated = bool(_BEAM.search(text)) or beams != [dict(parser_of(False)["beam%"])]
-    if energy is None and not stated:
-        lacks = "no beam energy" if elegant else "no BEAM with an energy"
-        raise LatticeError(f"'{path}' has {lacks}; say energy= (GeV)")
+        reader.read(path)
+    except LatticeError as error:
+        raise LatticeError(f"'{path}' cannot be read as MAD-X: {error}") from error
+    use = reader.chosen(path, sequence)
+    beam = reader.beam(use)
+    if energy is None and not beam.has_energy:
+        raise LatticeError(f"'{path}' has no BEAM with an energy; say energy= (GeV)")
     try:
-        with redirect_stdout(StringIO()), quiet_at():
-            lattice = parser.lattice(use=use)
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    if parser.undefined:
-        names = parser.undefined
-        warnings.warn(
-            f"'{path}' does not define {first_of(names)} ({len(names)}): taken for 0, as by MAD-X",
-            stacklevel=2,
+        parts = reader.parts(use)
+        if reader.undefined:
+            names = sorted(reader.undefined)
+            reader.warnings.append(
+                f"{first_of(names)} ({len(names)}) have no value: taken for 0, as by MAD-X"
+            )
+        energy = beam.energy if energy is None else energy
+        if reader.warnings:
+            warnings.warn(f"'{path}': {'; '.join(reader.warnings)}", stacklevel=4)
+        return ring_of_parts(parts, name, energy, beam.mass, beam.charge)
+    except LatticeError as error:
+        raise LatticeError(f"'{path}' cannot be read as MAD-X: {error}") from error
+
+
+class _Stop(Exception):
+    """RETURN, or the end of all reading."""
+
+    def __init__(self, everything: bool) -> None:
+        self.everything = everything
+
+
+class _Reader:
+    """What the statements of a file have defined so far."""
+
+    def __init__(self) -> None:
+        self.variables: dict[str, float | Evaluate] = dict(CONSTANTS)
+        self.elements: dict[str, _Definition] = {}
+        self.sequences: dict[str, _Sequence] = {}
+        self.lines: dict[str, _Line] = {}
+        self.macros: dict[str, tuple[list[str], str]] = {}
+        self.beams: dict[str, Beam] = {"": Beam()}
+        self.order: list[str] = []
+        self.used = ""
+        self.undefined: set[str] = set()
+        self.warnings: list[str] = []
+        self.rbarc = self.thin_focusing = True
+        self._open: _Sequence | None = None
+        self._edited: _Sequence | None = None
+        self._selected: list[dict[str, str]] = []
+        self._files: list[Path] = []
+        self._count = 0
+        self._work = 0
+        self._depth = 0
+        self._reflected = False
+
+    # --- what expressions ask for ---------------------------------------------------------------
+    def work(self, steps: int = 1) -> None:
+        """Count the work that the file asks for."""
+        self._work += steps
+        if self._work > MOST_WORK:
+            raise LatticeError("the file asks for more work than any ring; write the ring out")
+
+    def variable(self, name: str) -> float:
+        """The value of a variable; one that has none is 0, as in MAD-X."""
+        self.work()
+        value = self.variables.get(name)
+        if value is None:
+            if name not in self.elements:
+                self.undefined.add(name)
+            return 0.0
+        return self._valued(value, name) if callable(value) else value
+
+    def _valued(self, evaluate: Evaluate, name: str) -> float:
+        self._depth += 1
+        if self._depth > 200:
+            raise LatticeError(f"'{name}' is defined by itself")
+        try:
+            return evaluate(self)
+        finally:
+            self._depth -= 1
+
+    def attribute(self, owner: str, name: str) -> float:
+        """The value of `owner->name`: of a beam, a sequence's length, an element's attribute."""
+        self.work()
+        if owner == "beam" or owner.startswith("beam%"):
+            return self.beam(owner.partition("%")[2]).attribute(name)
+        if owner in self.elements:
+            value = self._value(self.elements[owner], name)
+            return float(value[0] if isinstance(value, tuple) else value)
+        if owner in self.sequences and name == "l":
+            return self._valued(self.sequences[owner].length, owner)
+        raise LatticeError(f"'{owner}->{name}': no element '{owner}' is defined")
+
+    def _value(self, definition: _Definition, attribute: str) -> Any:
+        value = definition.values.get(attribute, 0.0)
+        return self._valued(value, definition.name) if callable(value) else value
+
+    # --- statements -----------------------------------------------------------------------------
+    def read(self, path: Path) -> None:
+        """Carry out the statements of a file."""
+        with contextlib.suppress(_Stop):
+            self._read_file(path)
+        if self._open is not None:
+            raise LatticeError(f"SEQUENCE '{self._open.name}' has no ENDSEQUENCE")
+
+    def _read_file(self, path: Path) -> None:
+        self._count += 1
+        if not path.is_file():
+            raise LatticeError(f"it calls '{path}', which is no file")
+        if self._count > MOST_FILES or path.stat().st_size > MOST_BYTES:
+            raise LatticeError(f"it calls '{path}': too many files, or too large ones")
+        self._files.append(path)
+        try:
+            self._read_text(path.read_text(encoding="utf-8", errors="replace"))
+        except _Stop as stop:
+            if stop.everything:
+                raise
+        finally:
+            self._files.pop()
+
+    def _read_text(self, text: str) -> None:
+        for statement in statements(text):
+            self.work(10)
+            try:
+                self._carry_out(statement)
+            except LatticeError as error:
+                if "in the statement" in str(error):
+                    raise
+                shown = plain(statement.text, 100)
+                raise LatticeError(f"{error} (in the statement '{shown}', {self._where(statement)})"
+                                   ) from error  # fmt: skip
+            except (ArithmeticError, ValueError, TypeError, IndexError) as error:
+                shown = plain(statement.text, 100)
+                raise LatticeError(
+                    f"{error or type(error).__name__} (in the statement '{shown}', "
+                    f"{self._where(statement)})"
+                ) from error
+
+    def _where(self, statement: Statement) -> str:
+        return f"line {statement.line} of {plain(self._files[-1].name, 60)}"
+
+    def _carry_out(self, statement: Statement) -> None:
+        text = statement.text
+        block = re.match(r"(if|elseif|while)\s*\(|(else)\b", text, re.IGNORECASE)
+        if block:
+            return self._block(text, (block[1] or block[2]).lower())
+        match = re.fullmatch(
+            r"([\w.]+)\s*(?:\(([^)]*)\))?\s*:\s*macro\s*=\s*\{(.*)\}", text, re.I | re.DOTALL
         )
-    return ring_from_at(lattice, name, energy)
-
-
-def _outermost(parser: Any, found: Sequence[str]) -> list[str]:
-    """Sequences and lines that stand in no other one."""
-    inside: set[str] = set()
-    by_id = {id(parser[name]): name for name in found}
-    for name in found:
-        for item in parser[name]:
-            named = isinstance(item, tuple) and item and isinstance(item[0], str)
-            what = parser.get(item[0]) if named else item
-            if id(what) in by_id:
-                inside.add(by_id[id(what)].casefold())
-    return [name for name in found if name.casefold() not in inside]
-
-
-def _chosen(
-    path: Path, found: Sequence[str], wanted: str | None, outermost: Sequence[str] = ()
-) -> str:
-    """Of the sequences and lines of a file the one that is the ring."""
-    if not found:
-        raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
-    names = {name.casefold(): name for name in found}
-    if not wanted and "ring" not in names and outermost:
-        found = outermost
-    use = wanted.casefold() if wanted else "ring" if "ring" in names else found[-1].casefold()
-    if use not in names:
-        raise unknown_name(f"sequence in '{path}' named", wanted or "", found)
-    if not wanted and "ring" not in names and len(found) > 1:
-        raise LatticeError(
-            f"'{path}' has the sequences {', '.join(found)}; name one with sequence="
+        if match:
+            names = [n.strip() for n in (match[2] or "").split(",") if n.strip()]
+            self.macros[match[1].lower()] = (names, match[3])
+            return None
+        match = re.fullmatch(
+            r"(?:(?:shared|const|real|int)\s+)*([\w.$]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
         )
-    return names[use]
+        if match:
+            return self._assign(match[1].lower(), Given(match[3], match[2] == ":="))
+        match = re.fullmatch(r"([\w.$%\"']+)\s*->\s*([\w.]+)\s*(:?=)\s*(.*)", text, re.DOTALL)
+        if match:
+            owner, given = unquoted(match[1]).lower(), Given(match[4], match[3] == ":=")
+            return self._set(owner, {match[2].lower(): given}, statement)
+        match = re.fullmatch(r"([\w.$]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
+                             re.DOTALL)  # fmt: skip
+        if match:
+            if match[2]:
+                raise LatticeError("lines and elements with arguments are not read; write them out")
+            return self._define(unquoted(match[1]).lower(), match[3], statement)
+        return self._command(text, statement)
+
+    def _assign(self, name: str, given: Given) -> None:
+        text = given.text.strip()
+        if name in CONSTANTS:
+            return  # MAD-X keeps its own
+        evaluate = compiled(unquoted(text))
+        self.variables[name] = evaluate if given.deferred else evaluate(self)
+
+    def _block(self, text: str, word: str) -> None:
+        head, _, body = text.partition("{")
+        body = body.rpartition("}")[0]
+        if word == "else":
+            if not self._branched:
+                self._read_text(body)
+            return
+        condition = head[head.index("(") + 1 : head.rindex(")")]
+        if word == "while":
+            while holds(condition, self):
+                self.work(10)
+                self._read_text(body)
+            return
+        if word == "elseif" and self._branched:
+            return
+        true = holds(condition, self)
+        if true:
+            self._read_text(body)
+        self._branched = true  # after what stands inside
+
+    _branched = False
+
+    def _define(self, name: str, rest: str, statement: Statement) -> None:
+        line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
+        if line:
+            self.lines[name] = _Line(self._line_items(line[1], 0))
+            self._known_as(name)
+            return
+        head, *items = split(rest)
+        if not items and " " in head:
+            head, *items = head.split(" ", 1)
+        given = attributes(items)
+        word = unquoted(head).lower()
+        if word == "sequence":
+            return self._begin(name, given, statement)
+        if word not in KEYWORDS and word not in self.elements:
+            if word in NO_STATEMENT or word in ("beam", "select", "call", "use", *REFUSED):
+                return self._command(rest, statement)
+            raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
+        parent = self.elements.get(word)
+        own = dict(parent.values) if parent else {}
+        keyword = parent.keyword if parent else word
+        definition = _Definition(name, keyword, own, self._where(statement))
+        self.elements[name] = definition
+        self._update(definition, given)
+        self._place(name, given)
+        return None
+
+    def _known_as(self, name: str) -> None:
+        if name in self.order:
+            self.order.remove(name)
+        self.order.append(name)
+
+    def _update(self, definition: _Definition, given: dict[str, Given]) -> None:
+        for attribute, value in given.items():
+            if attribute in ("at", "from"):
+                continue
+            if attribute in WORDS:
+                definition.values[attribute] = unquoted(value.text)
+            elif value.deferred:
+                definition.values[attribute] = self._deferred(value)
+            else:
+                definition.values[attribute] = values(value, self)
+
+    def _deferred(self, given: Given) -> Callable[[Any], Any]:
+        text = given.text.strip()
+        if text[:1] in "{(":
+            values(given, self)  # what is no list of expressions is refused here
+            return lambda names: values(given, names)
+        return compiled(text)
+
+    def _set(self, owner: str, given: dict[str, Given], statement: Statement) -> None:
+        """`owner->attribute = value`, and an element that is named again with other values."""
+        if owner == "beam" or owner.startswith("beam%"):
+            self._update_beam(owner.partition("%")[2], given)
+        elif owner in self.elements:
+            self._update(self.elements[owner], given)
+        elif owner in self.sequences:
+            if set(given) - {"l", "refer", "refpos"} - NO_EFFECT:
+                raise LatticeError(f"{first_of(sorted(given))} of a sequence cannot be changed")
+            if "l" in given:
+                self.sequences[owner].length = self._evaluate(given["l"])
+            if "refer" in given:
+                self.sequences[owner].refer = _refer(given["refer"])
+        else:
+            raise LatticeError(f"no element or command '{plain(owner, 60)}' is known")
+
+    def _evaluate(self, given: Given) -> Evaluate:
+        evaluate = compiled(given.text)
+        if given.deferred:
+            return evaluate
+        value = evaluate(self)
+        return lambda names: value
+
+    # --- commands -------------------------------------------------------------------------------
+    def _command(self, text: str, statement: Statement) -> None:
+        match = re.match(r"\"[^\"]*\"|[\w.$]+", text)
+        if match is None:
+            raise LatticeError("no element or command begins so")
+        word = unquoted(match[0]).lower()
+        rest = text[match.end() :].lstrip(" ,")
+        if word in NO_STATEMENT or word.startswith("ptc_"):
+            return None
+        if word in NOT_RUN:
+            if NOT_RUN[word] not in self.warnings:
+                self.warnings.append(NOT_RUN[word])
+            return None
+        if word in REFUSED:
+            raise LatticeError(REFUSED[word])
+        if word in ("return", "exit", "quit", "stop"):
+            raise _Stop(word != "return")
+        if word == "exec":
+            return self._execute(rest)
+        given = attributes(split(rest))
+        match word:
+            case "call":
+                return self._call(given)
+            case "option":
+                for option, name in (("rbarc", "rbarc"), ("thin_foc", "thin_focusing")):
+                    if option in given:
+                        setattr(self, name, bool(compiled(given[option].text)(self)))
+                return None
+            case "beam":
+                owner = unquoted(given.pop("sequence").text).lower() if "sequence" in given else ""
+                return self._update_beam(owner, given)
+            case "resbeam":
+                owner = unquoted(given["sequence"].text).lower() if "sequence" in given else ""
+                self.beams[owner] = Beam()
+                return None
+            case "use":
+                return self._use(given)
+            case "select":
+                return self._select(given)
+            case "endsequence":
+                if self._open is None:
+                    raise LatticeError("ENDSEQUENCE closes no SEQUENCE")
+                self._open = None
+                return None
+            case "seqedit":
+                return self._seqedit(unquoted(given["sequence"].text).lower())
+            case "endedit":
+                self._edited = None
+                return None
+        if self._edited is not None and word in _EDITS:
+            return getattr(self, f"_{word}")(given)  # type: ignore[no-any-return]
+        if word in self.elements or word in self.sequences or word in KEYWORDS:
+            if word in self.elements:
+                self._update(self.elements[word], given)
+            elif "at" not in given:
+                return self._set(word, given, statement)
+            if self._open is not None and "at" in given:
+                return self._place(word, given)
+            if self._open is not None and word in self.elements and not given:
+                raise LatticeError(f"'{plain(word, 60)}' has no AT in its sequence")
+            return None
+        raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
+
+    def _call(self, given: dict[str, Given]) -> None:
+        called = unquoted(given["file"].text if "file" in given else next(iter(given)))
+        folders = [self._files[-1].parent, self._files[0].parent]
+        found = [folder / called for folder in folders if (folder / called).is_file()]
+        self._read_file(found[0] if found else folders[0] / called)
+
+    def _execute(self, text: str) -> None:
+        match = re.fullmatch(r"([\w.]+)\s*(?:\((.*)\))?", text, re.DOTALL)
+        if match is None or match[1].lower() not in self.macros:
+            raise LatticeError(f"no macro '{plain(text, 60)}' is defined")
+        names, body = self.macros[match[1].lower()]
+        given = [item.strip() for item in split(match[2] or "")]
+        for name, value in zip(names, given, strict=False):
+            if value.startswith("$"):
+                number = self.variable(value[1:].lower())
+                value = str(int(number)) if number == int(number) else repr(number)  # noqa: PLW2901
+            inside = rf"(?<![A-Za-z0-9_]){re.escape(name)}(?![A-Za-z0-9_])"
+            body = re.sub(inside, value.replace("\\", r"\\"), body)
+        self._depth += 1
+        if self._depth > 100:
+            raise LatticeError(f"the macro '{match[1]}' calls itself without end")
+        self._read_text(body)
+        self._depth -= 1
+
+    def beam(self, sequence: str) -> Beam:
+        """The beam of a sequence, else the default one."""
+        return self.beams.get(sequence) or self.beams[""]
+
+    def _update_beam(self, owner: str, given: dict[str, Given]) -> None:
+        beam = self.beams.setdefault(owner, Beam())
+        own: dict[str, float | str] = {}
+        for name, value in given.items():
+            if name == "particle":
+                own[name] = unquoted(value.text)
+            elif value.text[:1] != "{":  # lists are of its synchrotron radiation integrals
+                own[name] = float(compiled(value.text)(self))
+        beam.update(own)
+
+    def _use(self, given: dict[str, Given]) -> None:
+        named = next((given[k].text for k in ("sequence", "period") if k in given), None)
+        named = named or next((k for k in given if k not in ("range", "survey")), "")
+        if "range" in given and unquoted(given["range"].text).lower().replace(" ", "") not in (
+            "#s/#e", ""
+        ):  # fmt: skip
+            raise LatticeError("USE with a RANGE takes a part of the sequence; use all of it")
+        self.used = unquoted(named).lower()
+        if self.used not in self.sequences and self.used not in self.lines:
+            raise LatticeError(f"USE names '{plain(self.used, 60)}', which no sequence or line is")
+
+    # --- sequences ------------------------------------------------------------------------------
+    def _begin(self, name: str, given: dict[str, Given], statement: Statement) -> None:
+        if self._open is not None:
+            raise LatticeError(f"SEQUENCE '{self._open.name}' has no ENDSEQUENCE before this one")
+        if "l" not in given:
+            raise LatticeError(f"SEQUENCE '{name}' has no length; give it L")
+        for word in ("next_sequ", "add_pass"):
+            if word in given and unquoted(given[word].text) not in ("", "0"):
+                raise LatticeError(f"{word.upper()} of a sequence is not read")
+        self._open = _Sequence(name, self._where(statement), self._evaluate(given["l"]))
+        if "refer" in given:
+            self._open.refer = _refer(given["refer"])
+        if "refpos" in given:
+            self._open.refpos = unquoted(given["refpos"].text).lower()
+        self.sequences[name] = self._open
+        self._known_as(name)
+
+    def _place(self, name: str, given: dict[str, Given]) -> None:
+        """An element's place in the sequence that is open."""
+        if self._open is None:
+            return
+        if "at" not in given:
+            return
+        origin = unquoted(given["from"].text).lower() if "from" in given else ""
+        self._open.nodes.append(_Node(name, self._evaluate(given["at"]), origin))
+
+    def _length(self, name: str) -> float:
+        """Of an element (along the arc), a sequence or a line, m."""
+        if name in self.sequences:
+            return self._valued(self.sequences[name].length, name)
+        if name in self.elements:
+            return self._element_length(self.elements[name])
+        raise LatticeError(f"no element '{plain(name, 60)}' is defined")
+
+    def _element_length(self, definition: _Definition) -> float:
+        length = float(self._value(definition, "l"))
+        if definition.keyword == "multipole":
+            return 0.0
+        if definition.keyword == "rbend" and self.rbarc:
+            half = float(self._value(definition, "angle")) / 2
+            return length * half / math.sin(half) if half else length
+        return length
+
+    def slots(self, sequence: _Sequence) -> list[_Slot]:
+        """Its elements and sequences with the positions of their centres, in their order."""
+        reference = {"entry": 0.5, "exit": -0.5}.get(sequence.refer, 0.0)
+        nodes: dict[str, list[_Node]] = {}
+        for node in sequence.nodes:
+            nodes.setdefault(node.name, []).append(node)
+        known: dict[int, float] = {}
+
+        def centre(node: _Node, depth: int = 0) -> float:
+            if id(node) in known:
+                return known[id(node)]
+            if depth > 200:
+                raise LatticeError(f"FROM of '{plain(node.name, 60)}' leads back to itself")
+            at = self._valued(node.at, node.name)
+            if not node.centred:
+                at += self._offset(node.name, reference)
+            if node.origin:
+                name, _, k = node.origin.partition("[")
+                if name not in nodes:
+                    raise LatticeError(
+                        f"FROM of '{plain(node.name, 60)}' names '{plain(name, 60)}', which is not "
+                        f"in the sequence '{sequence.name}'"
+                    )
+                at += centre(nodes[name][int(k.rstrip("]") or 1) - 1], depth + 1)
+            known[id(node)] = at
+            return at
+
+        self.work(len(sequence.nodes))
+        own = [_Slot(n.name, centre(n), self._length(n.name)) for n in sequence.nodes]
+        return sorted(own, key=lambda slot: slot.centre)
+
+    def _offset(self, name: str, reference: float) -> float:
+        """From the reference point of an element or a sequence to its centre, m."""
+        sub = self.sequences.get(name)
+        if sub is not None and sub.refpos:
+            found = [slot for slot in self.slots(sub) if slot.name == sub.refpos]
+            if not found:
+                raise LatticeError(f"REFPOS of '{name}' names '{sub.refpos}', which it has not")
+            return self._length(name) / 2 - found[0].centre
+        return reference * self._length(name)
+
+    def _flat(self, sequence: _Sequence, start: float = 0.0, depth: int = 0) -> list[_Slot]:
+        if depth > 50:
+            raise LatticeError(f"the sequence '{sequence.name}' contains itself")
+        flat: list[_Slot] = []
+        for slot in self.slots(sequence):
+            self.work()
+            if slot.name in self.sequences:
+                begin = start + slot.centre - slot.length / 2
+                flat += self._flat(self.sequences[slot.name], begin, depth + 1)
+            else:
+                flat.append(replace(slot, centre=start + slot.centre))
+        return flat
+
+    # --- SEQEDIT --------------------------------------------------------------------------------
+    def _seqedit(self, name: str) -> None:
+        if name not in self.sequences:
+            raise LatticeError(f"SEQEDIT names '{plain(name, 60)}', which no sequence is")
+        self._edited = self.sequences[name]
+        self._put(self.slots(self._edited))
+
+    def _put(self, slots: Sequence[_Slot]) -> None:
+        assert self._edited is not None
+        ordered = sorted(slots, key=lambda slot: slot.centre)
+        self._edited.nodes = [_Node(s.name, _constant(s.centre), centred=True) for s in ordered]
+
+    def _select(self, given: dict[str, Given]) -> None:
+        flag = unquoted(given["flag"].text).lower() if "flag" in given else ""
+        if flag != "seqedit":
+            return
+        if "clear" in given and given["clear"].text.lower() not in ("0", "false"):
+            self._selected = []
+        else:
+            words = ("class", "pattern", "range")
+            self._selected.append({k: unquoted(given[k].text) for k in words if k in given})
+
+    def _chosen_slots(self, slots: Sequence[_Slot]) -> list[_Slot]:
+        return [s for s in slots if any(self._matches(s, choice) for choice in self._selected)]
+
+    def _matches(self, slot: _Slot, choice: dict[str, str]) -> bool:
+        if "range" in choice:
+            raise LatticeError("SELECT with a RANGE is not read in SEQEDIT; use a PATTERN")
+        definition = self.elements.get(slot.name)
+        keyword = "" if definition is None else definition.keyword
+        if "class" in choice and keyword != choice["class"].lower():
+            return False
+        if "pattern" not in choice:
+            return "class" in choice
+        pattern = choice["pattern"]
+        if len(pattern) > 200 or re.search(r"[)\]*+}][*+{]", pattern):
+            raise LatticeError(f"the pattern '{plain(pattern, 60)}' is not read; name the elements")
+        try:
+            return re.search(pattern, slot.name, re.IGNORECASE) is not None
+        except re.error as error:
+            raise LatticeError(f"the pattern '{plain(pattern, 60)}' is none ({error})") from error
+
+    def _targets(self, given: dict[str, Given], slots: Sequence[_Slot]) -> list[_Slot]:
+        """The places that an edit names by ELEMENT, or those that SELECT has selected."""
+        if "element" not in given:
+            raise LatticeError("the edit names no ELEMENT")
+        named = unquoted(given["element"].text).lower()
+        if named == "selected":
+            return self._chosen_slots(slots)
+        name, _, k = named.partition("[")
+        found = [slot for slot in slots if slot.name == name]
+        if not found:
+            raise LatticeError(f"the sequence has no element '{plain(named, 60)}'")
+        return [found[int(k.rstrip("]")) - 1]] if k else found
+
+    def _install(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        slots = self.slots(self._edited)
+        name = unquoted(given["element"].text).lower()
+        if "class" in given:
+            parent = unquoted(given["class"].text).lower()
+            if parent not in self.elements and parent not in KEYWORDS:
+                raise LatticeError(f"no element class '{plain(parent, 60)}' is known")
+            old = self.elements.get(parent)
+            self.elements.setdefault(name, _Definition(
+                name, old.keyword if old else parent, dict(old.values) if old else {}, "INSTALL"
+            ))  # fmt: skip
+        reference = {"entry": 0.5, "exit": -0.5}.get(self._edited.refer, 0.0)
+        length = self._length(name)
+        at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
+        origins = [0.0]
+        if "from" in given:
+            origin = {"element": Given(given["from"].text)}
+            origins = [slot.centre for slot in self._targets(origin, slots)]
+            if unquoted(given["from"].text).lower() != "selected":
+                origins = origins[:1]
+        self._put([*slots, *(_Slot(name, at + origin, length) for origin in origins)])
+
+    def _remove(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        slots = self.slots(self._edited)
+        gone = {id(slot) for slot in self._targets(given, slots)}
+        self._put([slot for slot in slots if id(slot) not in gone])
+
+    def _replace(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        slots = self.slots(self._edited)
+        new = unquoted(given["by"].text).lower()
+        old = {id(slot) for slot in self._targets(given, slots)}
+        length = self._length(new)
+        self._put([replace(s, name=new, length=length) if id(s) in old else s for s in slots])
+
+    def _move(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        slots = self.slots(self._edited)
+        moved = {id(slot) for slot in self._targets(given, slots)}
+        if "to" in given:
+            to = float(compiled(given["to"].text)(self))
+            if "from" in given:
+                to += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
+
+            def centre(slot: _Slot) -> float:
+                return to
+        else:
+            by = float(compiled(given["by"].text)(self))
+
+            def centre(slot: _Slot) -> float:
+                return slot.centre + by
+
+        self._put([replace(s, centre=centre(s)) if id(s) in moved else s for s in slots])
+
+    def _flatten(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        self._put(self._flat(self._edited))
+
+    def _cycle(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        slots = self.slots(self._edited)
+        named = {"element": given.get("start", Given(""))}
+        first = self._targets(named, slots)[0]
+        length, zero = self._length(self._edited.name), first.centre - first.length / 2
+        before = slots.index(first)
+        self._put([replace(s, centre=s.centre - zero + (length if k < before else 0.0))
+                   for k, s in enumerate(slots)])  # fmt: skip
+
+    def _reflect(self, given: dict[str, Given]) -> None:
+        assert self._edited is not None
+        length = self._length(self._edited.name)
+        turned = [replace(s, centre=length - s.centre) for s in self.slots(self._edited)]
+        self._put(turned[::-1])
+
+    # --- lines ----------------------------------------------------------------------------------
+    def _line_items(self, text: str, depth: int) -> list[tuple[int, bool, Any]]:
+        bare = text.strip()
+        if depth > 50:
+            raise LatticeError("a line has more than 50 nested brackets")
+        if bare[:1] == "(" and bare[-1:] == ")":
+            bare = bare[1:-1]
+        items = []
+        for item in (i for part in split(bare) for i in split(part, "+")):
+            if not item:
+                continue
+            match = re.fullmatch(
+                r"(-?)\s*(?:(\d+)\s*\*)?\s*(-?)\s*(\(.*\)|\"[^\"]*\"|'[^']*'|[\w.$]+)",
+                item,
+                re.DOTALL,
+            )
+            if match is None:
+                raise LatticeError(f"'{plain(item, 60)}' is no item of a line")
+            times = int(match[2] or 1)
+            if times > MOST_ELEMENTS:
+                raise LatticeError(f"a line is repeated {times} times: no ring is as long")
+            what = match[4]
+            inner = self._line_items(what, depth + 1) if what[0] == "(" else unquoted(what).lower()
+            items.append((times, bool(match[1]) != bool(match[3]), inner))
+        return items
+
+    def _line_length(self, items: Any, known: dict[str, int], depth: int = 0) -> int:
+        """Elements of a line, counted before it is laid out."""
+        if depth > 100:
+            raise LatticeError("a line contains itself")
+        total = 0
+        for times, _, what in items:
+            if isinstance(what, list):
+                own = self._line_length(what, known, depth + 1)
+            elif what in self.lines:
+                if what not in known:
+                    known[what] = self._line_length(self.lines[what].items, known, depth + 1)
+                own = known[what]
+            else:
+                own = 1
+            total += times * own
+            if total > MOST_ELEMENTS:
+                raise LatticeError("its line has more elements than any ring")
+        return total
+
+    def _line_names(self, items: Any, backwards: bool = False) -> list[str]:
+        names: list[str] = []
+        for times, turned, what in reversed(items) if backwards else items:
+            if isinstance(what, str) and what not in self.lines:
+                own = [what]
+            else:
+                inner = what if isinstance(what, list) else self.lines[what].items
+                own = self._line_names(inner, backwards != turned)
+            names += times * own
+        return names
+
+    # --- the ring -------------------------------------------------------------------------------
+    def chosen(self, path: Path, wanted: str | None) -> str:
+        """Of the sequences and lines the one that is the ring."""
+        if not self.order:
+            raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
+        if wanted:
+            if wanted.casefold() not in self.order:
+                raise unknown_name(f"sequence in '{path}' named", wanted, self.order)
+            return wanted.casefold()
+        if self.used:
+            return self.used
+        if "ring" in self.order:
+            return "ring"
+        inside = {node.name for s in self.sequences.values() for node in s.nodes}
+        for line in self.lines.values():
+            inside |= _names_in(line.items)
+        outermost = [name for name in self.order if name not in inside] or self.order
+        if len(outermost) > 1:
+            raise LatticeError(
+                f"'{path}' has the sequences {', '.join(outermost)}; name one with sequence="
+            )
+        return outermost[0]
+
+    def parts(self, use: str) -> list[Part]:
+        """The elements of the ring in beam order, drifts included."""
+        made: dict[str, Part] = {}
+        beam = self.beam(use)
+        if use in self.sequences:
+            return self._laid_out(self.sequences[use], beam, made)
+        items = self.lines[use].items
+        self.work(self._line_length(items, {}))
+        parts: list[Part] = []
+        names = self._line_names(items)
+        length = sum(self._length(name) for name in names)
+        for name in names:
+            if name in self.sequences:
+                parts += self._laid_out(self.sequences[name], beam, made, length)
+            else:
+                parts.append(self._part(name, beam, made, length))
+        return parts
+
+    def _laid_out(
+        self, sequence: _Sequence, beam: Beam, made: dict[str, Part], length: float | None = None
+    ) -> list[Part]:
+        total = self._length(sequence.name)
+        parts: list[Part] = []
+        at, last = 0.0, "the start"
+        drifts: dict[float, Part] = {}
+
+        def drift(to: float, name: str) -> None:
+            way = to - at
+            if way < -ROUNDING:
+                raise LatticeError(
+                    f"in the sequence '{sequence.name}' {name} begins at {to:.6f} m, before the "
+                    f"end of {last} at {at:.6f} m; correct the positions or lengths"
+                )
+            if abs(way) > 1e-9:
+                way = round(way, 12)
+                parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
+
+        for slot in self._flat(sequence):
+            start = slot.centre - slot.length / 2
+            drift(start, f"'{plain(slot.name, 60)}'")
+            parts.append(self._part(slot.name, beam, made, length or total))
+            at, last = start + slot.length, f"'{plain(slot.name, 60)}'"
+        drift(total, "its end (L)")
+        return parts
+
+    def _part(self, name: str, beam: Beam, made: dict[str, Part], length: float) -> Part:
+        if name not in made:
+            if name not in self.elements:
+                raise LatticeError(f"no element '{plain(name, 60)}' is defined")
+            made[name] = self._new_part(self.elements[name], beam, length)
+        return made[name]
+
+    def _new_part(self, definition: _Definition, beam: Beam, ring_length: float) -> Part:
+        """An element's attributes as numbers; rectangular bends as sector bends."""
+        keyword = definition.keyword
+        own = {
+            k: self._value(definition, k)
+            for k in definition.values
+            if (k not in WORDS and k not in ("kick",)) or k == "kick"
+        }
+        match keyword:
+            case "rbend":
+                keyword = "sbend"
+                own["l"] = self._element_length(definition)
+                half = float(own.get("angle", 0.0)) / 2
+                own |= {e: float(own.get(e, 0.0)) + half for e in ("e1", "e2")}
+            case "rfcavity" if not own.get("freq") and own.get("harmon"):
+                gamma = beam.energy / beam.mass
+                speed = CONSTANTS["clight"] * math.sqrt(1 - 1 / gamma**2)
+                own["freq"] = 1e-6 * float(own["harmon"]) * speed / ring_length
+            case "matrix":
+                own = _with_matrix(own)
+            case "multipole":
+                own["l"] = 0.0
+                if not self.thin_focusing:
+                    own["lrad"] = 0.0
+        if float(beam.given.get("bv", 1.0)) == -1:
+            own = _reversed_fields(keyword, own)
+        return Part(definition.name, keyword, own, definition.where)
 
 
-def read_xsuite(
-    path: Path, name: str, sequence: str | None = None, energy: float | None = None
-) -> Ring:
-    """The ring of a JSON file of Xsuite: a line, or an environment with lines.
-
-    Args:
-        path: `.json`.
-        name: of the ring.
-        sequence: of an environment's lines; else `ring`, else the only one.
-        energy: GeV; else that of the line's reference particle.
-
-    Raises:
-        LatticeError: no line, several without a choice, no energy, or AT cannot read it.
-    """
-    import at
-
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    options, line = {}, content
-    if "lines" in content:
-        options["use"] = _chosen(path, list(content["lines"]), sequence)
-        line = content["lines"][options["use"]]
-    if energy is None and not line.get("particle_ref"):
-        raise LatticeError(f"'{path}' has no reference particle; say energy= (GeV)")
-    try:
-        with quiet_at():
-            lattice = at.load_xsuite(str(path), **options)
-    except Exception as error:
-        raise _unreadable(path, error, "Xsuite's JSON") from error
-    return ring_from_at(lattice, name, energy)
+_EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
+_ENTRY = re.compile(r"rm([1-6])([1-6])")
+_ODD = ("angle", "k0", "k1", "k2", "k3", "k0s", "k1s", "k2s", "k3s", "ks", "ksi", "hkick", "vkick",
+        "kick", "knl", "ksl", "e1", "e2", "h")  # fmt: skip
 
 
-def _unreadable(path: Path, error: Exception, what: str = "MAD-X") -> LatticeError:
-    what = "elegant's lattice" if path.suffix.lower() == ".lte" else what
-    said = plain("; ".join(map(str, error.args)), 300) or type(error).__name__
-    return LatticeError(f"'{path}' cannot be read as {what} ({said}); mend that statement")
+def _reversed_fields(keyword: str, own: dict[str, Any]) -> dict[str, Any]:
+    """BV=-1: the beam goes through the same fields with the other sign of charge or direction."""
+    return {k: tuple(-x for x in v) if isinstance(v, tuple) else -v
+            if k in _ODD else v for k, v in own.items()}  # fmt: skip
+
+
+def _constant(value: float) -> Evaluate:
+    return lambda names: value
+
+
+def _refer(given: Given) -> str:
+    word = unquoted(given.text).lower()
+    if word in ("centre", "center"):
+        return "centre"
+    if word not in ("entry", "exit"):
+        raise LatticeError(f"REFER is '{plain(word, 40)}'; it is ENTRY, CENTRE or EXIT")
+    return word
+
+
+def _names_in(items: Any) -> set[str]:
+    found: set[str] = set()
+    for _, _, what in items:
+        found |= _names_in(what) if isinstance(what, list) else {what}
+    return found
+
+
+def _with_matrix(own: dict[str, Any]) -> dict[str, Any]:
+    """MATRIX: RMij and KICKi as arrays; its second order TMijk is named as left out."""
+    rm, b = np.eye(6), np.zeros(6)
+    rest: dict[str, Any] = {}
+    for name, value in own.items():
+        entry = _ENTRY.fullmatch(name)
+        if entry:
+            rm[int(entry[1]) - 1, int(entry[2]) - 1] = float(value)
+        elif re.fullmatch(r"kick[1-6]", name):
+            b[int(name[-1]) - 1] = -float(value) if name == "kick5" else float(value)
+        elif re.fullmatch(r"tm[1-6]{3}", name):
+            rest["tm"] = rest.get("tm", 0.0) or float(value)
+        else:
+            rest[name] = value
+    return {**rest, "rm": rm, **({"b": b} if b.any() else {})}

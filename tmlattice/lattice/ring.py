@@ -144,6 +144,11 @@ class Element:
         """True for everything that is not a drift, a monitor, a marker or a cavity."""
         return self.kind not in PASSIVE
 
+    @property
+    def bending(self) -> float:
+        """The angle by which the design orbit turns here, rad; a corrector's kick is no such."""
+        return self.angle if self.kind in ("bend", "multipole") else 0.0
+
     def changed(self, **attributes: float) -> "Element":
         """A copy with other strengths; this one, and others of its family, stay as they are.
 

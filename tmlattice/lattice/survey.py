@@ -49,7 +49,7 @@ def survey(ring: Ring) -> Survey:
     its angle in it. What a corrector does to the orbit does not move the ring.
     """
     length = np.array([element.length for element in ring.elements])
-    angle = np.array([e.angle * np.cos(e.tilt) if e.kind == "bend" else 0.0 for e in ring.elements])
+    angle = np.array([e.bending * np.cos(e.tilt) for e in ring.elements])
     before = -np.concatenate([[0.0], np.cumsum(angle)])[:-1]
     half, whole = _chord(length / 2, angle / 2, before), _chord(length, angle, before)
     ends = np.concatenate([np.zeros((1, 2)), np.cumsum(whole, axis=0)])

@@ -1,0 +1,418 @@
+"""Elements in MAD-X's words, as OCELOT elements: what the readers of MAD-X, TWISS tables, elegant
+and Xsuite share.
+
+Every keyword and every attribute is in one of three lists: modelled, without effect on the optics,
+or neither. What is in neither is refused where it changes the linear optics, the geometry or the
+closed orbit, and named in one warning otherwise.
+"""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import LatticeError, first_of, plain
+from tmlattice.lattice.at_fields import straight_magnet
+from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
+from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
+from tmlattice.lattice.wigglers import merge_wigglers
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One element of a file.
+
+    Attributes:
+        name: without a number.
+        keyword: MAD-X's, in lower case; of bends only `sbend`, with the arc as its length and the
+            whole angles of its faces.
+        values: by MAD-X's attribute, in lower case and in MAD-X's units (m, rad, 1/m2, MV, MHz).
+            `k0` is the whole dipole field of a bend, where it differs from angle / l. A matrix has
+            `rmat`, [6, 6], in OCELOT's coordinates, or `rm` in MAD-X's, and `b`, [6], likewise in
+            OCELOT's.
+        where: file and line, for messages.
+    """
+
+    name: str
+    keyword: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+    where: str = ""
+
+    def number(self, attribute: str) -> float:
+        """An attribute's value; 0 where it has none."""
+        return float(self.values.get(attribute) or 0.0)
+
+    def list(self, attribute: str) -> Array:
+        """Values of an attribute that is a list."""
+        return np.atleast_1d(np.asarray(self.values.get(attribute, ()), dtype=float))
+
+
+_STRENGTHS = frozenset({"k0", "k0s", "k1", "k1s", "k2", "k2s", "k3", "k3s", "knl", "ksl"})
+_SHIFTS = frozenset({"dx", "dy", "ds", "dpsi"})
+_EDGES = frozenset({
+    "angle", "e1", "e2", "h1", "h2", "hgap", "fint", "fintx", "kill_ent_fringe", "kill_exi_fringe",
+})  # fmt: skip
+_KICKS = frozenset({"hkick", "vkick", "kick"})
+_PASSIVE = frozenset[str]()
+
+MODELLED: dict[str, frozenset[str]] = {
+    **dict.fromkeys(("drift", "marker", "instrument", "placeholder"), _PASSIVE),
+    **dict.fromkeys(("collimator", "ecollimator", "rcollimator"), _PASSIVE),
+    **dict.fromkeys(("monitor", "hmonitor", "vmonitor"), _PASSIVE),
+    **dict.fromkeys(("hkicker", "vkicker", "kicker", "tkicker"), _KICKS | {"tilt"}),
+    "sbend": _STRENGTHS | _SHIFTS | _EDGES | {"tilt"},
+    **dict.fromkeys(("quadrupole", "sextupole", "octupole"), _STRENGTHS | _SHIFTS | {"tilt"}),
+    "multipole": _STRENGTHS | _SHIFTS | {"tilt", "lrad", "angle"},
+    "solenoid": frozenset({"ks", "ksi"}),
+    "rfcavity": frozenset({"volt", "freq"}),
+    "matrix": frozenset({"rm", "rmat", "b", "tilt"}),
+    "dipedge": frozenset({"h", "e1", "hgap", "fint", "tilt"}),
+    "srotation": frozenset({"angle"}),
+}
+"""Attributes that the model has, by keyword; every keyword has a length."""
+
+STATIC: dict[str, str] = {
+    "crabcavity": "volt", "hacdipole": "volt", "vacdipole": "volt", "twcavity": "volt",
+}  # fmt: skip
+"""Drifts in the static optics: what their voltage does is named in a warning."""
+ACTING: dict[str, tuple[str, ...]] = {
+    "elseparator": ("ex", "ey", "ex_l", "ey_l"),
+    "beambeam": ("charge",),
+    "nllens": ("knll",),
+    "rfmultipole": ("knl", "ksl", "volt"),
+    "changeref": ("patch_ang", "patch_trans"),
+    "translation": ("dx", "dy", "ds"),
+    "xrotation": ("angle",),
+    "yrotation": ("angle",),
+}
+"""Elements that are not modelled; they are refused unless these attributes are zero."""
+
+NO_EFFECT = frozenset({
+    "l", "at", "from", "type", "name", "apertype", "aperture", "aper_offset", "aper_tol", "aper_vx",
+    "aper_vy", "xsize", "ysize", "slot_id", "assembly_id", "mech_sep", "v_pos", "calib", "polarity",
+    "comments", "comment", "kmax", "kmin", "nst", "method", "model", "exact", "fringe",
+    "bend_fringe", "thick", "magnet", "lrad", "lag", "harmon", "shunt", "tfill", "betrf", "pg",
+    "n_bessel", "no_cavity_totalpath", "add_angle", "f_factor", "slice", "sigx", "sigy",
+    "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq",
+})  # fmt: skip
+"""Attributes without effect on the optics, of any keyword."""
+NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl", "rad", "tm"})
+"""Attributes that act beyond the linear optics: named in a warning."""
+
+
+class _Report:
+    """What is left out: names by reason, warned of once."""
+
+    def __init__(self) -> None:
+        self.names: dict[str, dict[str, None]] = {}
+
+    def left_out(self, reason: str, name: str) -> None:
+        self.names.setdefault(reason, {})[name] = None
+
+    def warn(self, ring: str) -> None:
+        if not self.names:
+            return
+        what = "; ".join(
+            f"{reason} of {first_of(list(names), 3)} ({len(names)})"
+            for reason, names in self.names.items()
+        )
+        warnings.warn(f"'{ring}': left out of the model: {what}", stacklevel=4)
+
+
+def ring_of_parts(
+    parts: Sequence[Part],
+    name: str,
+    energy: float,
+    mass: float = ELECTRON_GEV,
+    charge: float = 1.0,
+) -> Ring:
+    """The ring of these elements in beam order; one `Part` may stand in many places.
+
+    Args:
+        parts: drifts included.
+        name: of the ring.
+        energy: of a particle, rest energy included, GeV.
+        mass: rest energy, GeV.
+        charge: of a particle, in elementary charges; a cavity acts by its voltage times the charge.
+
+    Raises:
+        LatticeError: no element, or one that the model lacks and the optics needs.
+
+    Warns:
+        Once, of what is left out.
+    """
+    if not parts:
+        raise LatticeError(f"'{name}' has no elements; name another sequence with sequence=")
+    mass = ELECTRON_GEV if mass < 2 * ELECTRON_GEV else mass
+    design = Ring(name, (), energy, mass=mass)
+    report = _Report()
+    known: dict[int, list[Place]] = {}
+    errors: dict[int, dict[str, float]] = {}
+    places: list[Place] = []
+    for part in parts:
+        if id(part) not in known:
+            own = known[id(part)] = _places(part, design, abs(charge), report)
+            if amounts := _errors(part):
+                errors |= {id(source): amounts for _, _, source in own}
+        places += known[id(part)]
+    report.warn(name)
+    families, kinds, sources = zip(*merge_wigglers(places, design.map_energy), strict=True)
+    elements = tuple(
+        e.with_errors(**errors[id(s)]) if id(s) in errors else e
+        for e, s in zip(place_elements(families, sources, kinds), sources, strict=True)
+    )
+    return Ring(name, elements, energy, mass=mass)
+
+
+def _acts(value: Any) -> bool:
+    """Whether an attribute has a value other than zero; a word has."""
+    try:
+        return bool(np.any(np.asarray(value, dtype=float)))
+    except (TypeError, ValueError):
+        return bool(value)
+
+
+def _check(part: Part, report: _Report) -> None:
+    """Attributes that the model lacks.
+
+    Raises:
+        LatticeError: one that the optics needs, or a keyword of no list.
+    """
+    keyword = part.keyword
+    where = f" ({part.where})" if part.where else ""
+    named = f"{keyword.upper()} '{plain(part.name, 60)}'{where}"
+    if keyword in ACTING:
+        for attribute in ACTING[keyword]:
+            if _acts(part.values.get(attribute)):
+                raise LatticeError(
+                    f"{named} acts on the beam by its {attribute.upper()}, which is not modelled; "
+                    "set it to 0 or take the element out"
+                )
+        return
+    if keyword in STATIC:
+        if _acts(part.values.get(STATIC[keyword])):
+            report.left_out(f"what the voltage does in the {keyword.upper()}", part.name)
+        return
+    if keyword not in MODELLED:
+        raise LatticeError(f"{named}: no element class {keyword.upper()} is known")
+    for attribute, value in part.values.items():
+        if attribute in MODELLED[keyword] or attribute in NO_EFFECT or not _acts(value):
+            continue
+        if attribute not in NONLINEAR:
+            raise LatticeError(
+                f"the attribute {attribute.upper()} of {named} is not modelled; set it to 0 or "
+                "take it out"
+            )
+        report.left_out(attribute.upper(), part.name)
+
+
+def _errors(part: Part) -> dict[str, float]:
+    """Misalignments, and the dipole field of a bend beyond its design curvature."""
+    amounts = {"dx": part.number("dx"), "dy": part.number("dy"), "ds": part.number("ds"),
+               "roll": part.number("dpsi")}  # fmt: skip
+    if part.keyword in ("translation", "changeref"):
+        amounts = {}
+    if part.keyword == "sbend":
+        length, angle = part.number("l"), part.number("angle")
+        knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
+        excess = length * part.number("k0") - angle if part.number("k0") else 0.0
+        x, y = -excess - knl[0], part.number("k0s") * length + ksl[0]
+        cos, sin = math.cos(part.number("tilt")), math.sin(part.number("tilt"))
+        amounts["kick_x"], amounts["kick_y"] = x * cos - y * sin, x * sin + y * cos
+        amounts["k1sl"] = part.number("k1s") * length + ksl[1]
+        if amounts["k1sl"] and part.number("tilt"):
+            raise LatticeError(
+                f"the tilted bend '{plain(part.name, 60)}' has a skew gradient, which is not "
+                "modelled; set its tilt or its K1S to 0"
+            )
+    return {k: v for k, v in amounts.items() if v}
+
+
+def _integrated(part: Part, attribute: str) -> Array:
+    """Four integrated strengths at least."""
+    given = part.list(attribute)
+    return np.concatenate([given, np.zeros(max(0, 4 - len(given)))])
+
+
+def strengths(part: Part) -> NDArray[np.complex128]:
+    """(k_n + i k_ns) / n! of each order, four at least; integrated where the element is thin."""
+    length = part.number("l")
+    normal, skew = _integrated(part, "knl"), _integrated(part, "ksl")
+    total = np.zeros(max(len(normal), len(skew)), dtype=complex)
+    total[: len(normal)] += normal
+    total[: len(skew)] += 1j * skew
+    if length:
+        total /= length
+        total[:4] += [complex(part.number(f"k{n}"), part.number(f"k{n}s")) for n in range(4)]
+    total /= np.array([math.factorial(n) for n in range(len(total))], dtype=float)
+    return total
+
+
+def _places(part: Part, ring: Ring, charge: float, report: _Report) -> list[Place]:
+    """What one element of a file is in the ring."""
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    _check(part, report)
+    name, length, tilt = part.name, part.number("l"), part.number("tilt")
+    keyword = part.keyword
+    match keyword:
+        case "hkicker" | "vkicker" | "kicker" | "tkicker":
+            return _corrector(part)
+        case "monitor" | "hmonitor" | "vmonitor":
+            return [(name, "monitor", ocelot.Monitor(l=length, eid=name))]
+        case "rfcavity":
+            voltage, frequency = 1e-3 * charge * part.number("volt"), 1e6 * part.number("freq")
+            source = ocelot.Cavity(l=length, v=voltage, freq=frequency, eid=name)
+            return [(name, "cavity", source)]
+        case "solenoid" if length:
+            return [
+                (name, "solenoid", ocelot.Solenoid(l=length, k=part.number("ks") / 2, eid=name))
+            ]
+        case "solenoid" | "dipedge" | "srotation" | "matrix":
+            return [_matrix(part, ring)]
+        case "sbend" if length:
+            return [(name, "bend", _bend(part, report))]
+        case "sbend":
+            raise LatticeError(f"the bend '{plain(name, 60)}' has no length; give it one")
+        case "multipole" if not length:
+            return [(name, "multipole", _thin(part, report))]
+        case "quadrupole" | "sextupole" | "octupole" | "multipole":
+            own = {"quadrupole": 1, "sextupole": 2, "octupole": 3}.get(keyword)
+            fields = strengths(part)
+            if not length:  # K L of a thin magnet is nothing; KNL acts
+                return [(name, "multipole", _thin(part, report))]
+
+            def left_out(reason: str) -> None:
+                report.left_out(reason, name)
+
+            kind, source = straight_magnet(fields, own, length, tilt, name, left_out)
+            return [(name, kind, source)]
+    if length:
+        return [(name, "drift", ocelot.Drift(l=length, eid=name))]
+    return [(name, "marker", ocelot.Marker(eid=name))]
+
+
+def _corrector(part: Part) -> list[Place]:
+    """A corrector of one plane by its keyword, turned by its tilt; else one of each plane."""
+    name, length, tilt = part.name, part.number("l"), part.number("tilt")
+    x, y = part.number("hkick"), part.number("vkick")
+    if part.keyword == "hkicker":
+        x = x or part.number("kick")
+    elif part.keyword == "vkicker":
+        y = y or part.number("kick")
+    cos, sin = math.cos(tilt), math.sin(tilt)
+    if part.keyword in ("hkicker", "vkicker"):
+        plane = "h" if part.keyword == "hkicker" else "v"
+        amount = x if plane == "h" else y
+        quarter = round(2 * tilt / math.pi)
+        if abs(tilt - quarter * math.pi / 2) < 1e-9:
+            if quarter % 2:
+                amount *= sin if plane == "h" else -sin
+                plane = "v" if plane == "h" else "h"
+            else:
+                amount *= cos
+            return [corrector(name, plane, length, amount)]  # type: ignore[arg-type]
+        x, y = (amount, 0.0) if plane == "h" else (0.0, amount)
+    return corrector_pair(name, length, x * cos - y * sin, x * sin + y * cos)
+
+
+def _thin(part: Part, report: _Report) -> Any:
+    """A thin multipole; its first normal component bends the design orbit, as in MAD-X.
+
+    `angle`, where it is given, is the design's bend, and the rest of KNL[0] a field error.
+    """
+    from tmlattice.lattice.combined import CombinedMultipole
+
+    fields = strengths(part)
+    if np.any(fields[3:]):
+        report.left_out("fields above the sextupole", part.name)
+    k = [complex(f) * math.factorial(n) for n, f in enumerate(fields[:3])]
+    given = part.values.get("angle")
+    angle = k[0].real if given is None else float(given)
+    if angle and (k[1] or k[2]):
+        report.left_out("products of curvature and gradient", part.name)
+    return CombinedMultipole(
+        k0=k[0].real - angle, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real,
+        k2s=k[2].imag, angle=angle, lrad=part.number("lrad"), tilt=part.number("tilt"),
+        eid=part.name,
+    )  # fmt: skip
+
+
+def _bend(part: Part, report: _Report) -> Any:
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    fields = strengths(part)
+    if np.any(fields[3:]) or fields[2].imag:
+        report.left_out("fields above the gradient, but for the normal sextupole,", part.name)
+    values: dict[str, float] = {
+        k: part.number(k) for k in ("e1", "e2", "h1", "h2", "fint", "fintx")
+    }
+    if part.values.get("fintx") is None or values["fintx"] < 0:
+        values["fintx"] = values["fint"]
+    if part.number("kill_ent_fringe"):
+        values |= {"e1": 0.0, "h1": 0.0, "fint": 0.0}
+    if part.number("kill_exi_fringe"):
+        values |= {"e2": 0.0, "h2": 0.0, "fintx": 0.0}
+    return ocelot.SBend(
+        l=part.number("l"),
+        angle=part.number("angle"),
+        k1=fields[1].real,
+        k2=2 * fields[2].real,
+        e1=values["e1"],
+        e2=values["e2"],
+        tilt=part.number("tilt"),
+        gap=2 * part.number("hgap"),
+        fint=values["fint"],
+        fintx=values["fintx"],
+        h_pole1=values["h1"],
+        h_pole2=values["h2"],
+        eid=part.name,
+    )
+
+
+def _matrix(part: Part, ring: Ring) -> Place:
+    """A matrix element; MAD-X's (t, pt) are (-tau, p)."""
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    r = np.eye(6)
+    turn = part.number("tilt")
+    match part.keyword:
+        case "matrix" if "rmat" in part.values:
+            r = np.asarray(part.values["rmat"], dtype=float).copy()
+        case "matrix":
+            sign = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
+            r = sign @ np.asarray(part.values.get("rm", np.eye(6)), dtype=float) @ sign
+        case "dipedge":
+            h, e1 = part.number("h"), part.number("e1")
+            fringe = 2 * part.number("hgap") * part.number("fint") * h
+            fringe *= (1 + math.sin(e1) ** 2) / math.cos(e1)
+            r[1, 0], r[3, 2] = h * math.tan(e1), -h * math.tan(e1 - fringe)
+        case "srotation":
+            r[:4, :4] = _rotation(part.number("angle"))
+        case "solenoid":
+            half, turn = part.number("ks") / 2, part.number("ksi") / 2
+            r[1, 0] = r[3, 2] = -half * turn
+            r[:4, :4] = _rotation(turn) @ r[:4, :4]
+            turn = 0.0
+    if turn:
+        rotation = np.eye(6)
+        rotation[:4, :4] = _rotation(turn)
+        r = rotation.T @ r @ rotation
+    source = ocelot.Matrix(l=part.number("l"), eid=part.name)
+    source.r = r
+    if "b" in part.values:
+        source.b = np.asarray(part.values["b"], dtype=float).reshape(6, 1)
+    kind: Kind = "solenoid" if part.keyword == "solenoid" else "matrix"
+    return part.name, "wiggler" if "wig" in part.name.casefold() else kind, source
+
+
+def _rotation(angle: float) -> Array:
+    """Of (x, px, y, py), as seen by axes turned by `angle` from x towards y, [4, 4]."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.asarray(np.kron([[cos, sin], [-sin, cos]], np.eye(2)))
