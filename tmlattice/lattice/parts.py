@@ -6,6 +6,7 @@ or neither. What is in neither is refused where it changes the linear optics, th
 closed orbit, and named in one warning otherwise.
 """
 
+import cmath
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -153,7 +154,7 @@ def ring_of_parts(
     design = Ring(name, (), energy, mass=mass)
     report = _Report()
     known: dict[int, list[Place]] = {}
-    errors: dict[int, dict[str, float]] = {}
+    errors: dict[int, dict[str, Any]] = {}
     places: list[Place] = []
     for part in parts:
         if id(part) not in known:
@@ -212,12 +213,13 @@ def _check(part: Part, report: _Report) -> None:
         report.left_out(attribute.upper(), part.name)
 
 
-def _errors(part: Part) -> dict[str, float]:
-    """Misalignments, and the dipole field of a bend beyond its design curvature."""
-    amounts = {"dx": part.number("dx"), "dy": part.number("dy"), "ds": part.number("ds"),
-               "roll": part.number("dpsi")}  # fmt: skip
-    if part.keyword in ("translation", "changeref"):
-        amounts = {}
+def _errors(part: Part) -> dict[str, Any]:
+    """Misalignments, and the dipole field of a bend beyond its design curvature.
+
+    In the curved frame a field of k0 focuses by h k0 in the plane of the bend.
+    """
+    own = {"dx": "dx", "dy": "dy", "ds": "ds", "roll": "dpsi"}
+    amounts: dict[str, Any] = {k: part.number(v) for k, v in own.items()}
     if part.keyword == "sbend":
         length, angle = part.number("l"), part.number("angle")
         knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
@@ -226,6 +228,9 @@ def _errors(part: Part) -> dict[str, float]:
         cos, sin = math.cos(part.number("tilt")), math.sin(part.number("tilt"))
         amounts["kick_x"], amounts["kick_y"] = x * cos - y * sin, x * sin + y * cos
         amounts["k1sl"] = part.number("k1s") * length + ksl[1]
+        more = -(excess + knl[0]) * angle / length  # of px, by x
+        if more:
+            amounts["middle"] = (more * cos**2, more * cos * sin, more * cos * sin, more * sin**2)
         if amounts["k1sl"] and part.number("tilt"):
             raise LatticeError(
                 f"the tilted bend '{plain(part.name, 60)}' has a skew gradient, which is not "
@@ -333,13 +338,18 @@ def _thin(part: Part, report: _Report) -> Any:
     if np.any(fields[3:]):
         report.left_out("fields above the sextupole", part.name)
     k = [complex(f) * math.factorial(n) for n, f in enumerate(fields[:3])]
-    given = part.values.get("angle")
+    given, turn = part.values.get("angle"), 0.0
+    if given is None and k[0].imag:  # it bends in a plane of its own
+        turn = -cmath.phase(k[0])
+        k = [field * cmath.exp(1j * (n + 1) * turn) for n, field in enumerate(k)]
+        k[0] = complex(k[0].real)
     angle = k[0].real if given is None else float(given)
     if angle and (k[1] or k[2]):
         report.left_out("products of curvature and gradient", part.name)
     return CombinedMultipole(
         k0=k[0].real - angle, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real,
-        k2s=k[2].imag, angle=angle, lrad=part.number("lrad"), tilt=part.number("tilt"),
+        k2s=k[2].imag, angle=angle, lrad=part.number("lrad"),
+        tilt=part.number("tilt") + turn,
         eid=part.name,
     )  # fmt: skip
 
