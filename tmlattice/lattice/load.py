@@ -99,7 +99,7 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
         from tmlattice.lattice.json_file import is_own, is_xsuite, read_json
 
         if is_xsuite(path):
-            from tmlattice.lattice.other_codes import read_xsuite
+            from tmlattice.lattice.xsuite_file import read_xsuite
 
             return read_xsuite(path, name, sequence, energy)
         if is_own(path):
