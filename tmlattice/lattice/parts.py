@@ -153,7 +153,7 @@ def ring_of_parts(
     design = Ring(name, (), energy, mass=mass)
     report = _Report()
     known: dict[int, list[Place]] = {}
-    errors: dict[int, dict[str, float]] = {}
+    errors: dict[int, dict[str, Any]] = {}
     places: list[Place] = []
     for part in parts:
         if id(part) not in known:
@@ -212,9 +212,10 @@ def _check(part: Part, report: _Report) -> None:
         report.left_out(attribute.upper(), part.name)
 
 
-def _errors(part: Part) -> dict[str, float]:
+def _errors(part: Part) -> dict[str, Any]:
     """Misalignments, and the dipole field of a bend beyond its design curvature."""
-    amounts = {"dx": part.number("dx"), "dy": part.number("dy"), "ds": part.number("ds"),
+    amounts: dict[str, Any] = {}
+    amounts |= {"dx": part.number("dx"), "dy": part.number("dy"), "ds": part.number("ds"),
                "roll": part.number("dpsi")}  # fmt: skip
     if part.keyword in ("translation", "changeref"):
         amounts = {}
@@ -223,15 +224,21 @@ def _errors(part: Part) -> dict[str, float]:
         knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
         excess = length * part.number("k0") - angle if part.number("k0") else 0.0
         x, y = -excess - knl[0], part.number("k0s") * length + ksl[0]
+        roll = amounts.pop("roll")  # of a field, which kicks; the design's orbit is not turned
+        x, y = x + roll**2 * angle / 2, y - roll * angle
         cos, sin = math.cos(part.number("tilt")), math.sin(part.number("tilt"))
-        amounts["kick_x"], amounts["kick_y"] = x * cos - y * sin, x * sin + y * cos
-        amounts["k1sl"] = part.number("k1s") * length + ksl[1]
+        x, y = x * cos - y * sin, x * sin + y * cos
+        amounts["kick_x"], amounts["kick_y"] = x, y
+        curvature = angle / length if length else 0.0  # the way through the field is 1 + h x
+        amounts["middle"] = tuple(curvature * k * c for k in (x, y) for c in (cos, sin))
+        gradient = part.number("k1") * length + knl[1]
+        amounts["k1sl"] = part.number("k1s") * length + ksl[1] - gradient * math.sin(2 * roll)
         if amounts["k1sl"] and part.number("tilt"):
             raise LatticeError(
                 f"the tilted bend '{plain(part.name, 60)}' has a skew gradient, which is not "
                 "modelled; set its tilt or its K1S to 0"
             )
-    return {k: v for k, v in amounts.items() if v}
+    return {k: v for k, v in amounts.items() if np.any(v)}
 
 
 def _integrated(part: Part, attribute: str) -> Array:

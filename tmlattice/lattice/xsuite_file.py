@@ -80,8 +80,8 @@ NO_EFFECT = frozenset({
 SLICE = re.compile(r"(Thick|Thin|Drift)Slice(\w*?)(Entry|Exit)?")
 MAIN = {"Bend": "k0", "RBend": "k0", "CombinedFunctionMagnet": "k0", "Quadrupole": "k1",
         "Sextupole": "k2", "Octupole": "k3"}  # fmt: skip
+MOST_KICKS = 1000
 EDGES = {-1: "suppressed", 0: "linear", 1: "full", 2: "dipole-only"}
-SOLENOID_SLICES = 20
 
 
 def read_xsuite(
@@ -613,16 +613,31 @@ class _Reader:
             if any(bend.face(k) or bend.fringe(k)[0] for k in (0, 1)) and bend.dipole:
                 return self._bend(fields, name, where)
         fields.used |= {"edge_entry_active", "edge_exit_active"}  # fringes of the third order
-        whole = self._thick(fields, name, where)
+        return self._in_kicks(fields, self._thick(fields, name, where))
+
+    def _in_kicks(self, fields: _Fields, whole: Part) -> list[Part]:
+        """A straight magnet whose gradients, but for K1 of a quadrupole, are in thin kicks.
+
+        Xsuite puts one kick in the middle where no number is given. What is finer than that is
+        taken for the whole magnet, and so is one whose kicks have no gradient.
+        """
+        length = whole.number("l")
+        model, rule = fields.word("model", "adaptive"), fields.word("integrator", "adaptive")
+        if model == "adaptive":
+            model = {"Quadrupole": "mat", "Magnet": "rot"}.get(fields.cls, "drift")
+        if rule == "adaptive":
+            rule = "yoshida-6" if fields.cls == "Magnet" else "uniform"
+        body = fields.number("k1") * length if model.startswith("mat") else 0.0
         count = int(fields.number("num_multipole_kicks"))
-        rule = fields.word("integrator", "adaptive")
-        if not fields.word("model", "adaptive").startswith("drift-kick") or not 0 < count < 1000:
+        knl, ksl = whole.list("knl").copy(), whole.list("ksl")
+        knl[1] -= body
+        if not (knl[1] or ksl[1]) or not 0 <= count < MOST_KICKS or not length:
             return [whole]
         if rule not in ("uniform", "teapot"):
-            self._leave("the finite number of kicks", name)
+            if rule in ("yoshida4", "yoshida-4") and count:
+                self._leave("the finite number of kicks", whole.name)
             return [whole]
-        return _kicks(whole, *self._strengths(fields, _way_of(fields), fields.number("k0")), count,
-                      rule == "teapot")  # fmt: skip
+        return _kicks(whole, knl, ksl, max(1, count), rule == "teapot", body / length)
 
     def _thick(self, fields: _Fields, name: str, where: str, weight: float = 1.0) -> Part:
         length = _way_of(fields)
@@ -645,7 +660,7 @@ class _Reader:
         if fields.acts("isthick") and _way_of(fields):
             if fields.number("hxl"):
                 raise LatticeError(f"{fields.named} is thick and has hxl; give it as a Bend")
-            return [self._thick(fields, name, where)]
+            return self._in_kicks(fields, self._thick(fields, name, where))
         knl, ksl = self._strengths(fields, 0.0, 0.0)
         values = {"knl": knl, "ksl": ksl, "angle": fields.number("hxl"),
                   "lrad": fields.number("length")}  # fmt: skip
@@ -693,12 +708,8 @@ class _Reader:
         if fields.cls != "VariableSolenoid":
             values = {"l": length, "ks": fields.number("ks"), "ksi": fields.number("ksi")}
             return [Part(name, "solenoid", values, where)]
-        first, last = fields.list("ks_profile", 2)[:2]
-        middles = (np.arange(SOLENOID_SLICES) + 0.5) / SOLENOID_SLICES
-        return [
-            Part(name, "solenoid", {"l": length / SOLENOID_SLICES, "ks": ks}, where)
-            for ks in first + (last - first) * middles
-        ]
+        mean = float(fields.list("ks_profile", 2)[:2].mean())  # in the body, as in Xsuite
+        return [Part(name, "solenoid", {"l": length, "ks": mean}, where)]
 
     def _dipole_edge(self, fields: _Fields, name: str, where: str) -> list[Part]:
         fields.used |= {"r21", "r43", "side"}
@@ -907,8 +918,10 @@ def _edge(name: str, where: str, edge: tuple[float, ...], tilt: float) -> list[P
     return [Part(name, "matrix", {"rmat": matrix, "tilt": tilt}, where)]
 
 
-def _kicks(whole: Part, knl: Array, ksl: Array, count: int, teapot: bool) -> list[Part]:
-    """A straight magnet that is integrated by `count` kicks, as so many thin ones."""
+def _kicks(
+    whole: Part, knl: Array, ksl: Array, count: int, teapot: bool, k1: float
+) -> list[Part]:
+    """A straight magnet as `count` thin kicks between ways, or between quadrupoles of `k1`."""
     length = whole.number("l")
     end = middle = length / count
     end /= 2
@@ -918,9 +931,8 @@ def _kicks(whole: Part, knl: Array, ksl: Array, count: int, teapot: bool) -> lis
     if whole.number("ds"):
         raise LatticeError(f"'{plain(whole.name, 60)}' is displaced along the beam; set it to 0")
     thin = {"knl": knl / count, "ksl": ksl / count, "angle": 0.0, "lrad": length / count, **moved}
-    kick = Part(whole.name, "multipole", thin, whole.where)
-    ends, way = (Part(f"{whole.name}_way", "drift", {"l": way}) for way in (end, middle))
-    parts = [ends, kick]
-    for _ in range(count - 1):
-        parts += [way, kick]
-    return [*parts, ends]
+    kick = Part(f"{whole.name}_kick" if k1 else whole.name, "multipole", thin, whole.where)
+    body: dict[str, Any] = {"k1": k1, **moved} if k1 else {}
+    name, keyword = (whole.name, "quadrupole") if k1 else (f"{whole.name}_way", "drift")
+    ends, way = (Part(name, keyword, {"l": own, **body}, whole.where) for own in (end, middle))
+    return [ends, kick, *[way, kick] * (count - 1), ends]
