@@ -105,7 +105,7 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
         if is_own(path):
             return read_json(path, name, energy)
     if suffix == ".lte":
-        from tmlattice.lattice.other_codes import read_madx as read_elegant
+        from tmlattice.lattice.elegant_file import read_elegant
 
         return read_elegant(path, name, sequence, energy)
     if suffix in MADX_SUFFIXES:

@@ -81,6 +81,11 @@ SLICE = re.compile(r"(Thick|Thin|Drift)Slice(\w*?)(Entry|Exit)?")
 MAIN = {"Bend": "k0", "RBend": "k0", "CombinedFunctionMagnet": "k0", "Quadrupole": "k1",
         "Sextupole": "k2", "Octupole": "k3"}  # fmt: skip
 MOST_KICKS = 1000
+LUMPED = 2e-5
+"""1/m; by so much a magnet's focusing may differ for its gradient's being spread over its length:
+1e-5 of a tune at a beta of 10 m."""
+SKEW_SHARE = 0.1
+"""Weight of skew gradients there: they act on the tunes in second order."""
 EDGES = {-1: "suppressed", 0: "linear", 1: "full", 2: "dipole-only"}
 
 
@@ -618,8 +623,8 @@ class _Reader:
     def _in_kicks(self, fields: _Fields, whole: Part) -> list[Part]:
         """A straight magnet whose gradients, but for K1 of a quadrupole, are in thin kicks.
 
-        Xsuite puts one kick in the middle where no number is given. What is finer than that is
-        taken for the whole magnet, and so is one whose kicks have no gradient.
+        Xsuite puts one kick in the middle where no number is given. A magnet whose kicks are fine,
+        or whose gradient in them is weak, is kept whole.
         """
         length = whole.number("l")
         model, rule = fields.word("model", "adaptive"), fields.word("integrator", "adaptive")
@@ -631,7 +636,9 @@ class _Reader:
         count = int(fields.number("num_multipole_kicks"))
         knl, ksl = whole.list("knl").copy(), whole.list("ksl")
         knl[1] -= body
-        if not (knl[1] or ksl[1]) or not 0 <= count < MOST_KICKS or not length:
+        gradient = abs(knl[1]) + SKEW_SHARE * abs(ksl[1])
+        lumped = gradient * abs(whole.list("knl")[1]) * length / 12  # what lumping adds to 1 / f
+        if lumped < LUMPED or not 0 <= count < MOST_KICKS or not length:
             return [whole]
         if rule not in ("uniform", "teapot"):
             if rule in ("yoshida4", "yoshida-4") and count:
@@ -676,7 +683,9 @@ class _Reader:
             frequency = harmonic * self.beta * LIGHT / self._length if self._length else 0.0
         if not frequency and volt:
             if abs(volt * math.sin(phase)) > 1e-6 * abs(volt):
-                raise LatticeError(f"{fields.named} of frequency 0 changes the energy in every turn")
+                raise LatticeError(
+                    f"{fields.named} of frequency 0 changes the energy in every turn"
+                )
             volt = 0.0
         values = {"l": weight * _way_of(fields), "volt": 1e-6 * weight * volt,
                   "freq": 1e-6 * frequency}  # fmt: skip
@@ -837,9 +846,9 @@ class _Bend:
         return Part(name, "sbend", {**values, **self.reader._alignment(self.fields)}, where)
 
     def _check_body(self, knl: Array, ksl: Array) -> None:
-        if self.fields.word("rbend_model", "adaptive", {2: "straight-body"}) == "straight-body" and (
-            knl[1:].any() or ksl[1:].any()
-        ):
+        if self.fields.word(
+            "rbend_model", "adaptive", {2: "straight-body"}
+        ) == "straight-body" and (knl[1:].any() or ksl[1:].any()):
             raise LatticeError(
                 f"{self.fields.named} has a straight body with a gradient, which is not modelled; "
                 "give it the rbend_model curved-body"
@@ -918,9 +927,7 @@ def _edge(name: str, where: str, edge: tuple[float, ...], tilt: float) -> list[P
     return [Part(name, "matrix", {"rmat": matrix, "tilt": tilt}, where)]
 
 
-def _kicks(
-    whole: Part, knl: Array, ksl: Array, count: int, teapot: bool, k1: float
-) -> list[Part]:
+def _kicks(whole: Part, knl: Array, ksl: Array, count: int, teapot: bool, k1: float) -> list[Part]:
     """A straight magnet as `count` thin kicks between ways, or between quadrupoles of `k1`."""
     length = whole.number("l")
     end = middle = length / count
