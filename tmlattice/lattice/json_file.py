@@ -105,7 +105,11 @@ def is_xsuite(path: Path) -> bool:
         LatticeError: it is no JSON.
     """
     content = _content(path)
-    return isinstance(content, dict) and "elements" in content and "xtrack_version" in content
+    if not isinstance(content, dict) or "format" in content or "atjson" in content:
+        return False
+    line = content.get("line")
+    ordered = {"element_names", "composer", "builder", "xtrack_version"} & content.keys()
+    return isinstance(content.get("lines") or line, dict) or bool("elements" in content and ordered)
 
 
 def read_json(path: Path, name: str, energy: float | None = None) -> Ring:

@@ -99,13 +99,13 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
         from tmlattice.lattice.json_file import is_own, is_xsuite, read_json
 
         if is_xsuite(path):
-            from tmlattice.lattice.other_codes import read_xsuite
+            from tmlattice.lattice.xsuite_file import read_xsuite
 
             return read_xsuite(path, name, sequence, energy)
         if is_own(path):
             return read_json(path, name, energy)
     if suffix == ".lte":
-        from tmlattice.lattice.other_codes import read_madx as read_elegant
+        from tmlattice.lattice.elegant_file import read_elegant
 
         return read_elegant(path, name, sequence, energy)
     if suffix in MADX_SUFFIXES:

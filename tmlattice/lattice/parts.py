@@ -225,18 +225,21 @@ def _errors(part: Part) -> dict[str, Any]:
         knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
         excess = length * part.number("k0") - angle if part.number("k0") else 0.0
         x, y = -excess - knl[0], part.number("k0s") * length + ksl[0]
+        roll = amounts.pop("roll")  # of a field, which kicks; the design's orbit is not turned
+        x, y = x + roll**2 * angle / 2, y - roll * angle
         cos, sin = math.cos(part.number("tilt")), math.sin(part.number("tilt"))
-        amounts["kick_x"], amounts["kick_y"] = x * cos - y * sin, x * sin + y * cos
-        amounts["k1sl"] = part.number("k1s") * length + ksl[1]
-        more = -(excess + knl[0]) * angle / length  # of px, by x
-        if more:
-            amounts["middle"] = (more * cos**2, more * cos * sin, more * cos * sin, more * sin**2)
+        x, y = x * cos - y * sin, x * sin + y * cos
+        amounts["kick_x"], amounts["kick_y"] = x, y
+        curvature = angle / length if length else 0.0  # the way through the field is 1 + h x
+        amounts["middle"] = tuple(curvature * k * c for k in (x, y) for c in (cos, sin))
+        gradient = part.number("k1") * length + knl[1]
+        amounts["k1sl"] = part.number("k1s") * length + ksl[1] - gradient * math.sin(2 * roll)
         if amounts["k1sl"] and part.number("tilt"):
             raise LatticeError(
                 f"the tilted bend '{plain(part.name, 60)}' has a skew gradient, which is not "
                 "modelled; set its tilt or its K1S to 0"
             )
-    return {k: v for k, v in amounts.items() if v}
+    return {k: v for k, v in amounts.items() if np.any(v)}
 
 
 def _integrated(part: Part, attribute: str) -> Array:

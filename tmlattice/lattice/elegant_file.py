@@ -1,0 +1,906 @@
+"""Reading elegant's lattices (`.lte`): RPN definitions, elements and lines.
+
+Every class and every attribute is in one of three lists: modelled; without effect on the static
+optics; or neither, and then the file is refused by its name. A class may be shortened or lengthened
+as in elegant (QUADRUPOLE, CSBEN), and an element may be defined by another one.
+
+Nothing of a file is run: RPN is worked out by `_Rpn`, which knows numbers, names and functions.
+"""
+
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.errors import LatticeError, first_of, plain, unknown_name
+from tmlattice.lattice.parts import Part, ring_of_parts
+from tmlattice.lattice.ring import ELECTRON_GEV, Ring
+
+MOST_FILES = 1000
+MOST_BYTES = 200_000_000
+MOST_WORK = 4_000_000
+"""Words of RPN, and elements of lines."""
+MOST_ELEMENTS = 1_000_000
+LONGEST_STATEMENT = 5000
+"""Lines."""
+DEEPEST = 50
+"""Lines in lines, and files in files."""
+LIGHT = 299792458.0
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+_DRIFTS = ("DRIF", "EDRIFT", "CSRDRIFT", "LSCDRIFT")
+_SILENT = (
+    "MARK", "WATCH", "MAXAMP", "RCOL", "ECOL", "SCRAPER", "APCONTOUR", "TAPERAPC", "TAPERAPE",
+    "TAPERAPR", "SPEEDBUMP", "PEPPOT", "CHARGE", "PFILTER", "HISTOGRAM", "MHISTOGRAM", "SLICE",
+    "CLEAN", "SAMPLE", "TRCOUNT", "RECIRC", "FLOOR", "REMCOR", "RIMULT", "POLAR", "TFBPICKUP",
+    "CPICKUP",
+)  # fmt: skip
+"""Apertures, collimators, and what looks at the beam."""
+_COLLECTIVE = (
+    "WAKE", "TRWAKE", "CWAKE", "LRWAKE", "ZLONGIT", "ZTRANSVERSE", "IMPEDANCE", "RFMODE", "FRFMODE",
+    "TRFMODE", "FTRFMODE", "CORGPIPE", "CORGPLATES", "IONEFFECTS", "SCMULT", "IBSCATTER",
+    "TSCATTER", "SCATTER", "DSCATTER", "MATTER", "SREFFECTS", "TFBDRIVER", "CKICKER", "EMITTANCE",
+    "TWISS", "CENTER", "BUMPER", "MBUMPER", "RFDF", "MRFDF", "SHRFDF", "RFTM110",
+)  # fmt: skip
+"""What acts with the beam's current, by chance, or in time: drifts in the static optics, named in a
+warning."""
+_REFUSED = (
+    "ELSE", "MATR", "ALPH", "RFTMEZ0", "RMDF", "TMCF", "CEPL", "TWPL", "TWLA", "TWMTA", "KPOLY",
+    "NISEPT", "RAMPP", "BMAPXY", "FMULT", "TUBEND", "MAPSOLENOID", "REFLECT", "SCRIPT", "LTHINLENS",
+    "LMIRROR", "LSRMDLTR", "POLYSERIES", "CWIGGLER", "ILMATRIX", "UKICKMAP", "FTABLE", "GFWIGGLER",
+    "BMXYZ", "BRAT", "BGGEXP", "BRANCH", "HKPOLY", "BOFFAXE", "GKICKMAP", "BEAMBEAM", "LGBEND",
+    "BEDGE",
+)  # fmt: skip
+"""What acts on the beam by a file, a field map or a program, and is not modelled."""
+_INERT: dict[str, dict[str, float]] = {
+    "ENERGY": {"CENTRAL_ENERGY": 0, "CENTRAL_MOMENTUM": 0, "MATCH_BEAMLINE": 0,
+               "MATCH_PARTICLES": 0},
+    "MALIGN": {"DXP": 0, "DYP": 0, "DX": 0, "DY": 0, "DZ": 0, "DT": 0, "DP": 0, "DE": 0},
+    "MAGNIFY": {"MX": 1, "MXP": 1, "MY": 1, "MYP": 1, "MS": 1, "MDP": 1},
+    "STRAY": {"LBX": 0, "LBY": 0, "GBX": 0, "GBY": 0, "GBZ": 0},
+}  # fmt: skip
+"""What changes the beam unless these attributes have these values."""
+
+_MOVED = {"DX", "DY", "DZ", "TILT"}
+_STEERED = {"HKICK", "VKICK", "HCALIBRATION", "VCALIBRATION"}
+_BEND = {
+    "L", "ANGLE", "K1", "K2", "E1", "E2", "TILT", "H1", "H2", "HGAP", "FINT", "FINT1", "FINT2",
+    "DX", "DY", "DZ", "FSE", "FSE_DIPOLE", "FSE_QUADRUPOLE", "ETILT", "ETILT_SIGN",
+    "EDGE1_EFFECTS", "EDGE2_EFFECTS", "USE_BN", "B1", "B2", "XKICK", "YKICK", "YAW",
+}  # fmt: skip
+_QUAD = {"L", "K1", "FSE", "BORE", "B", *_MOVED, *_STEERED}
+_SEXT = {"L", "K1", "K2", "J1", "FSE", "BORE", "B", *_MOVED, *_STEERED}
+MODELLED: dict[str, set[str]] = {
+    **dict.fromkeys(("QUAD", "KQUAD"), _QUAD),
+    "QUFRINGE": {"L", "K1", "FSE", "DIRECTION", *_MOVED},
+    "DQCOR": {"L", "K1", "J1", *_MOVED, *_STEERED, "FSE"},
+    **dict.fromkeys(("SEXT", "KSEXT"), _SEXT),
+    "KQUSE": {"L", "K1", "K2", "FSE1", "FSE2", *_MOVED},
+    **dict.fromkeys(("OCTU", "KOCT"), {"L", "K3", "FSE", "BORE", "B", *_MOVED}),
+    "MULT": {"L", "KNL", "ORDER", "FACTOR", "BORE", "BTIPL", *_MOVED},
+    **dict.fromkeys(("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND"), _BEND),
+    **dict.fromkeys(("HKICK", "VKICK", "EHKICK", "EVKICK"), {"L", "KICK", "TILT", "CALIBRATION"}),
+    **dict.fromkeys(("KICKER", "EKICKER"), {"L", "TILT", *_STEERED}),
+    **dict.fromkeys(("MONI", "HMON", "VMON"), {"L"}),
+    **dict.fromkeys(("RFCA", "RFCW", "MODRF", "RAMPRF"), {"L", "CELL_LENGTH", "VOLT", "FREQ"}),
+    "SOLE": {"L", "KS", "B", "DX", "DY", "DZ"},
+    "EMATRIX": {"L", "TILT", "DX", "DY", "DZ", *(f"C{i}" for i in range(1, 7)),
+                *(f"R{i}{j}" for i in range(1, 7) for j in range(1, 7))},
+    "ROTATE": {"TILT", "EXCLUDE_OPTICS"},
+    "WIGGLER": {"L", "RADIUS", "K", "B", "POLES", "DX", "DY", "DZ", "TILT"},
+    **{name: {"L"} for name in (*_DRIFTS, *_SILENT, *_COLLECTIVE)},
+    **{name: {"L", *values} for name, values in _INERT.items()},
+}  # fmt: skip
+"""Attributes that the model has, by class."""
+ALL_CLASSES = (*MODELLED, *_REFUSED)
+
+NO_EFFECT = frozenset({
+    "GROUP", "N_KICKS", "N_SLICES", "NSLICES", "INTEGRATION_ORDER", "ORDER", "MATRIX_ORDER",
+    "SQRT_ORDER", "SYNCH_RAD", "ISR", "ISR1PART", "USE_RAD_DIST", "ADD_OPENING_ANGLE", "NONLINEAR",
+    "EXPAND_HAMILTONIAN", "EXPANSION_ORDER", "TRACKING_MATRIX", "SR_IN_ORDINARY_MATRIX",
+    "REFERENCE_CORRECTION", "HSTEERING", "VSTEERING", "STEERING", "XSTEERING", "YSTEERING",
+    "EDGE_ORDER", "EDGE_EFFECTS", "TRANSPORT", "METHOD", "MODEL", "ACCURACY", "PARAXIAL", "LERAD",
+    "MALIGN_METHOD", "FSE_CORRECTION", "EDGE1_KICK_LIMIT", "EDGE2_KICK_LIMIT", "KICK_LIMIT_SCALING",
+    "PHOTON_OUTPUT_FILE", "PHOTON_LOW_ENERGY_CUTOFF", "FRINGE_TYPE", "FRINGE", "FRINGEMODEL",
+    "MIN_NORMAL_ORDER", "MIN_SKEW_ORDER", "MAX_NORMAL_ORDER", "MAX_SKEW_ORDER", "LINEARIZE",
+    "EDGE1_LINEAR", "EDGE2_LINEAR", "EDGE1_NONLINEAR_FACTOR", "EDGE2_NONLINEAR_FACTOR",
+    "STEERING_MULTIPOLES", "STEERING_MULTIPOLE_FACTOR", "SYSTEMATIC_MULTIPOLE_FACTOR",
+    "RANDOM_MULTIPOLE_FACTOR", "OPTIMIZE_FSE", "OPTIMIZE_FSE_ONCE", "OPTIMIZE_DX",
+    "OPTIMIZE_DX_ONCE", "COMPENSATE_KN", "VERBOSE", "XREFERENCE", "FP1", "FP2", "FP3", "FP4",
+    "ADJUST_BOUNDARY", "ADJUST_FIELD", "FUDGE_PATH_LENGTH", "FRINGE_POSITION", "FITPOINT",
+    "OPEN_SIDE", "X_MAX", "Y_MAX", "LIGHT_THROUGH",
+})  # fmt: skip
+"""Attributes without effect on the optics, of any class: of integrators, radiation, output."""
+NONLINEAR = frozenset({
+    "K4", "K5", "K6", "K7", "K8", "B3", "B4", "B5", "B6", "B7", "B8", "SYSTEMATIC_MULTIPOLES",
+    "EDGE_MULTIPOLES", "EDGE1_MULTIPOLES", "EDGE2_MULTIPOLES", "RANDOM_MULTIPOLES",
+})  # fmt: skip
+"""Attributes that act beyond the linear optics: named in a warning."""
+_DEFAULTS = {"CALIBRATION": 1.0, "HCALIBRATION": 1.0, "VCALIBRATION": 1.0, "FINT": 0.5,
+             "FINT1": -1.0, "FINT2": -1.0, "FACTOR": 1.0, "EDGE1_EFFECTS": 1.0,
+             "EDGE2_EFFECTS": 1.0, "ETILT_SIGN": 1.0, "FREQ": 500e6,
+             "LEFFECTIVE": -1.0, "DIRECTION": 1.0}  # fmt: skip
+
+
+def read_elegant(
+    path: Path, name: str, sequence: str | None = None, energy: float | None = None
+) -> Ring:
+    """The ring of an elegant lattice.
+
+    Args:
+        path: `.lte`; files that it includes are read too.
+        name: of the ring.
+        sequence: of the file's lines; else the one that USE names; else `ring`, else the only one
+            that stands in no other.
+        energy: of the electrons, GeV; elegant's lattices state none.
+
+    Raises:
+        LatticeError: a statement, a class or an attribute that is not understood or not modelled;
+            no line, several without a choice, or no energy.
+
+    Warns:
+        Of what the model lacks.
+    """
+    reader = _Reader()
+    try:
+        reader.read(path)
+    except LatticeError as error:
+        raise LatticeError(f"'{path}' cannot be read as elegant's lattice: {error}") from error
+    use = reader.chosen(path, sequence)
+    if energy is None:
+        raise LatticeError(f"'{path}' has no beam energy; say energy= (GeV)")
+    try:
+        parts = reader.parts(use, energy)
+        if reader.left_out:
+            what = "; ".join(
+                f"{reason} of {first_of(list(dict.fromkeys(names)), 3)} ({len(names)})"
+                for reason, names in reader.left_out.items()
+            )
+            warnings.warn(f"'{path}': left out of the model: {what}", stacklevel=4)
+        return ring_of_parts(parts, name, energy, charge=-1.0)
+    except LatticeError as error:
+        raise LatticeError(f"'{path}' cannot be read as elegant's lattice: {error}") from error
+
+
+# --- RPN ------------------------------------------------------------------------------------------
+def _unary(function: Callable[[float], float]) -> tuple[int, Callable[..., tuple[float, ...]]]:
+    return 1, lambda a: (function(a),)
+
+
+def _binary(
+    function: Callable[[float, float], float],
+) -> tuple[int, Callable[..., tuple[float, ...]]]:
+    return 2, lambda a, b: (function(a, b),)
+
+
+_OPERATORS: dict[str, tuple[int, Callable[..., tuple[float, ...]]]] = {
+    "+": _binary(lambda a, b: a + b),
+    "-": _binary(lambda a, b: a - b),
+    "*": _binary(lambda a, b: a * b),
+    "/": _binary(lambda a, b: a / b),
+    "pow": _binary(math.pow),
+    "mod": _binary(math.fmod),
+    "atan2": _binary(lambda a, b: math.atan2(b, a)),
+    "hypot": _binary(math.hypot),
+    "max2": _binary(max),
+    "min2": _binary(min),
+    "sqr": _unary(lambda a: a * a),
+    "sqrt": _unary(math.sqrt),
+    "exp": _unary(math.exp),
+    "ln": _unary(math.log),
+    "log": _unary(math.log10),
+    "abs": _unary(abs),
+    "int": _unary(math.trunc),
+    "floor": _unary(math.floor),
+    "ceil": _unary(math.ceil),
+    "chs": _unary(lambda a: -a),
+    "rec": _unary(lambda a: 1 / a),
+    "erf": _unary(math.erf),
+    "erfc": _unary(math.erfc),
+    "lngam": _unary(math.lgamma),
+    "dtor": _unary(math.radians),
+    "rtod": _unary(math.degrees),
+    "beta.p": _unary(lambda p: p / math.hypot(1, p)),
+    "gamma.p": _unary(lambda p: math.hypot(1, p)),
+    "p.gamma": _unary(lambda g: math.sqrt(g * g - 1)),
+    "gamma.beta": _unary(lambda b: 1 / math.sqrt(1 - b * b)),
+    "=": (1, lambda a: (a, a)),
+    "dup": (1, lambda a: (a, a)),
+    "swap": (2, lambda a, b: (b, a)),
+    "over": (2, lambda a, b: (a, b, a)),
+    "pop": (1, lambda a: ()),
+    **{n: _unary(getattr(math, n)) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh",
+                                             "cosh", "tanh", "asinh", "acosh", "atanh")},
+    **{f"d{n}": _unary(lambda a, f=getattr(math, n): f(math.radians(a)))  # type: ignore[misc]
+       for n in ("sin", "cos", "tan")},
+    **{f"d{n}": _unary(lambda a, f=getattr(math, n): math.degrees(f(a)))  # type: ignore[misc]
+       for n in ("asin", "acos", "atan")},
+}  # fmt: skip
+"""How many numbers an operator takes from the stack, the last on top, and what it leaves there."""
+_CONSTANTS = {"pi": math.pi, "log_10": math.log(10), "HUGE": 1e308, "on_div_by_zero": 0.0,
+              "c_mks": LIGHT, "c_cgs": 100 * LIGHT, "e_mks": 1.602176634e-19,
+              "me_mks": 9.1093837015e-31, "me_cgs": 9.1093837015e-28, "mev": 0.51099895,
+              "re_mks": 2.8179403262e-15, "re_cgs": 2.8179403262e-13, "kb_mks": 1.380649e-23,
+              "hbar_mks": 1.054571817e-34, "mu_o": 4e-7 * math.pi,
+              "eps_o": 8.8541878128e-12}  # fmt: skip
+
+
+class _Rpn:
+    """Values of expressions in reverse Polish notation, with the names that a file stores."""
+
+    def __init__(self) -> None:
+        self.memory = dict(_CONSTANTS)
+        self._work = 0
+
+    def work(self, steps: int = 1) -> None:
+        """Count work that a file asks for."""
+        self._work += steps
+        if self._work > MOST_WORK:
+            raise LatticeError("the file asks for more work than any ring; write the ring out")
+
+    def value(self, text: str) -> float | None:
+        """The number on top of the stack in the end; None of an empty one."""
+        stack: list[float] = []
+        words = iter(text.split())
+        for word in words:
+            self.work()
+            if len(stack) > 10_000:
+                raise LatticeError("an expression keeps too many numbers")
+            if word == "sto":
+                name = next(words, None)
+                if name is None or not stack:
+                    raise LatticeError("STO stores no number")
+                self.memory[name] = stack[-1]
+            elif _NUMBER.fullmatch(word):
+                stack.append(float(word))
+            elif word in self.memory:
+                stack.append(self.memory[word])
+            elif word.lower() in _OPERATORS:
+                self._operate(word.lower(), stack)
+            else:
+                stack.append(self._named(word))
+        return stack[-1] if stack else None
+
+    def _operate(self, word: str, stack: list[float]) -> None:
+        count, operate = _OPERATORS[word]
+        if len(stack) < count:
+            raise LatticeError(f"'{word}' needs {count} numbers before it")
+        taken = stack[-count:]
+        del stack[-count:]
+        try:
+            stack.extend(float(number) for number in operate(*taken))
+        except (ArithmeticError, ValueError) as error:
+            numbers = " ".join(f"{n:g}" for n in taken)
+            raise LatticeError(f"'{numbers} {word}' has no value") from error
+
+    def _named(self, word: str) -> float:
+        self.work(len(self.memory) // 10)
+        for name, value in self.memory.items():  # outside quotation marks elegant has capitals
+            if name.casefold() == word.casefold():
+                return value
+        raise LatticeError(
+            f"'{plain(word, 40)}' is no number, no stored name and no known operator"
+        )
+
+
+# --- statements -----------------------------------------------------------------------------------
+@dataclass
+class _Element:
+    """An element: its class, and its attributes as numbers, or as texts where they are no number."""
+
+    name: str
+    cls: str
+    values: dict[str, float | str]
+    where: str
+
+    def number(self, key: str) -> float:
+        """An attribute's value, else elegant's default."""
+        value = self.values.get(key, _DEFAULTS.get(key, 0.0))
+        if isinstance(value, str):
+            raise LatticeError(f"{key} of '{plain(self.name, 60)}' is '{plain(value, 40)}'")
+        return value
+
+
+Items = list[tuple[int, bool, Any]]
+"""Of a line: how often, reversed, and the name or the items."""
+
+
+class _Reader:
+    """What the statements of a file define."""
+
+    def __init__(self) -> None:
+        self.rpn = _Rpn()
+        self.elements: dict[str, _Element] = {}
+        self.lines: dict[str, Items] = {}
+        self.used: str | None = None
+        self.left_out: dict[str, list[str]] = {}
+        self._folded: dict[str, str] = {}
+        self._files = 0
+        self._rigidity = 0.0
+        self._slip = 0.0
+
+    def read(self, path: Path) -> None:
+        """Carry out the statements of a file."""
+        self._read_file(path, path.parent, 0)
+
+    def _read_file(self, path: Path, folder: Path, depth: int) -> None:
+        self._files += 1
+        if not path.is_file():
+            path = folder / path.name if (folder / path.name).is_file() else path
+        if not path.is_file():
+            raise LatticeError(f"it includes '{path}', which is no file")
+        if self._files > MOST_FILES or depth > DEEPEST or path.stat().st_size > MOST_BYTES:
+            raise LatticeError(f"it includes '{path}': too many files, or too large ones")
+        lines = path.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff").splitlines()
+        for text, number, after in _statements(lines):
+            self.rpn.work(10)
+            where = f"line {number} of {plain(path.name, 60)}"
+            try:
+                included = re.match(r"#include\s*:\s*(.*)", text, re.IGNORECASE)
+                if included:
+                    name = included[1].strip().strip("\"'")
+                    self._read_file(path.parent / name, folder, depth + 1)
+                elif self._carry_out(text, where, after):
+                    return
+            except LatticeError as error:
+                if "in the statement" in str(error):
+                    raise
+                raise LatticeError(
+                    f"{error} (in the statement '{plain(text, 100)}', {where})"
+                ) from error
+
+    def _carry_out(self, text: str, where: str, after: Iterator[str]) -> bool:
+        """Carry out a statement; whether it ends the file."""
+        if text[0] == "%":
+            self.rpn.value(text[1:])
+            return False
+        match = re.match(r'(?:"([^"]*)"|([^\s:,="]+))\s*([:,]|$)\s*', text)
+        if match is None:
+            raise LatticeError("this is no statement of elegant")
+        name, rest = match[1] or match[2], text[match.end() :]
+        if match[3] == ":" and (match[1] or match[2].upper() not in ("USE", "TITLE")):
+            self._define(name if match[1] else name.upper(), rest, where)
+            return False
+        word = name.upper()
+        if word == "USE":
+            self.used = _bare(_split(rest)[0]) if rest else None
+            return True
+        if word == "RETURN":
+            return True
+        if word == "TITLE":
+            if not rest:
+                next(after, None)  # the title is the next line
+            return False
+        raise LatticeError(f"no statement {plain(word, 40)} is known")
+
+    def _define(self, name: str, rest: str, where: str) -> None:
+        line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
+        known = self.lines if line else self.elements
+        if name in self.lines or name in self.elements:
+            raise LatticeError(f"'{plain(name, 60)}' is defined twice; give one another name")
+        if line:
+            known[name] = self._items(line[1].strip(), 0)  # type: ignore[assignment]
+            return
+        head, *given = _split(rest)
+        parent = self.elements.get(_bare(head))
+        cls = parent.cls if parent else _class_of(head)
+        values: dict[str, float | str] = dict(parent.values) if parent else {}
+        for item in given:
+            key, sign, value = item.partition("=")
+            key = _attribute(cls, key.strip().upper())
+            if not sign or not value.strip():
+                raise LatticeError(f"'{plain(item, 60)}' gives no value")
+            values[key] = self._value(cls, key, value.strip())
+        self.elements[name] = _Element(name, cls, values, where)
+
+    def _value(self, cls: str, key: str, text: str) -> float | str:
+        """The number that an attribute is; a text of those that are not modelled."""
+        quoted = len(text) > 1 and text[0] == text[-1] == '"'
+        expression = text[1:-1] if quoted else text
+        if not quoted and _NUMBER.fullmatch(text):
+            return float(text)
+        modelled = key in MODELLED.get(cls, ())
+        if not modelled and (key in NO_EFFECT or cls in (*_SILENT, *_COLLECTIVE, *_REFUSED)):
+            return expression
+        if not quoted and text[0] in "+-.0123456789":
+            raise LatticeError(
+                f"{key} is '{plain(text, 60)}', which is no number; write an expression in RPN, in "
+                "quotation marks"
+            )
+        try:
+            value = self.rpn.value(expression)
+        except LatticeError:
+            if modelled:
+                raise
+            return expression
+        if value is None:
+            raise LatticeError(f"{key} is an expression without a value")
+        return value
+
+    # --- lines ------------------------------------------------------------------------------------
+    def _items(self, text: str, depth: int) -> Items:
+        if depth > DEEPEST:
+            raise LatticeError("a line has too many nested brackets")
+        bare = text
+        if bare[:1] == "(":
+            if bare[-1:] != ")":
+                raise LatticeError("a bracket is left open; close it")
+            bare = bare[1:-1]
+        items: Items = []
+        for item in _split(bare):
+            match = re.fullmatch(
+                r'(-?)\s*(?:(\d+)\s*\*)?\s*(-?)\s*(\(.*\)|"[^"]*"|[^\s()*",=]+)', item, re.DOTALL
+            )
+            if match is None:
+                raise LatticeError(f"'{plain(item, 60)}' is no item of a line")
+            times, what = int(match[2] or 1), match[4]
+            if times > MOST_ELEMENTS:
+                raise LatticeError(f"a line is repeated {times} times: no ring is as long")
+            if "<<" in what:
+                raise LatticeError("names that are edited in a line (<<) are not read")
+            inner = self._items(what, depth + 1) if what[0] == "(" else _bare(what)
+            items.append((times, bool(match[1]) != bool(match[3]), inner))
+        return items
+
+    def _found(self, name: str) -> str:
+        """The name as it is defined; outside quotation marks elegant has capitals."""
+        if name in self.elements or name in self.lines:
+            return name
+        if not self._folded:
+            self._folded = {known.casefold(): known for known in (*self.elements, *self.lines)}
+        if name.casefold() in self._folded:
+            return self._folded[name.casefold()]
+        raise LatticeError(f"no element or line '{plain(name, 60)}' is defined")
+
+    def _count(self, items: Items, known: dict[str, int], depth: int = 0) -> int:
+        """Elements of a line, counted before it is laid out."""
+        if depth > 2 * DEEPEST:
+            raise LatticeError("a line contains itself")
+        total = 0
+        for times, _, what in items:
+            if isinstance(what, list):
+                own = self._count(what, known, depth + 1)
+            elif (name := self._found(what)) in self.lines:
+                if name not in known:
+                    known[name] = self._count(self.lines[name], known, depth + 1)
+                own = known[name]
+            else:
+                own = 1
+            total += times * own
+            if total > MOST_ELEMENTS:
+                raise LatticeError("its line has more elements than any ring")
+        return total
+
+    def _names(self, items: Items, backwards: bool = False) -> list[tuple[str, bool]]:
+        """Elements in beam order, each with whether it is reversed."""
+        names: list[tuple[str, bool]] = []
+        for times, turned, what in reversed(items) if backwards else items:
+            turned = turned != backwards
+            if isinstance(what, list):
+                own = self._names(what, turned)
+            elif (name := self._found(what)) in self.lines:
+                own = self._names(self.lines[name], turned)
+            else:
+                own = [(name, turned)]
+            names += times * own
+        return names
+
+    def chosen(self, path: Path, wanted: str | None) -> str:
+        """Of the lines the one that is the ring."""
+        if not self.lines:
+            raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
+        names = {name.casefold(): name for name in self.lines}
+        if wanted:
+            if wanted.casefold() not in names:
+                raise unknown_name(f"sequence in '{path}' named", wanted, list(self.lines))
+            return names[wanted.casefold()]
+        if self.used:
+            if self.used.casefold() not in names:
+                raise LatticeError(
+                    f"'{path}' says USE, {plain(self.used, 60)}, and has no such line"
+                )
+            return names[self.used.casefold()]
+        if "ring" in names:
+            return names["ring"]
+        inside = {name.casefold() for items in self.lines.values() for name in _inner(items)}
+        outermost = [name for name in self.lines if name.casefold() not in inside]
+        outermost = outermost or list(self.lines)
+        if len(outermost) > 1:
+            raise LatticeError(
+                f"'{path}' has the sequences {', '.join(outermost)}; name one with sequence="
+            )
+        return outermost[0]
+
+    # --- the ring ---------------------------------------------------------------------------------
+    def parts(self, use: str, energy: float) -> list[Part]:
+        """The elements of a line in beam order.
+
+        Args:
+            use: of the lines.
+            energy: of the electrons, GeV.
+        """
+        momentum = math.sqrt(max(energy**2 - ELECTRON_GEV**2, 0.0))
+        self._rigidity = 1e9 * momentum / LIGHT
+        self._slip = (ELECTRON_GEV / energy) ** 2
+        items = self.lines[use]
+        self.rpn.work(self._count(items, {}))
+        names = self._names(items)
+        made: dict[tuple[Any, ...], list[Part]] = {}
+        parts: list[Part] = []
+        for k, (name, turned) in enumerate(names):
+            element = self.elements[name]
+            inner = (False, False)
+            if element.cls in ("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND"):
+                inner = (self._same(names, k, -1), self._same(names, k, 1))
+            key = (name, turned, inner)
+            if key not in made:
+                made[key] = self._converted(element, turned, inner)
+            parts += made[key]
+        return parts
+
+    def _same(self, names: list[tuple[str, bool]], k: int, step: int) -> bool:
+        """Whether the same bend comes before or after, but for markers: elegant takes both for
+        pieces of one, without faces in between."""
+        j = k + step
+        while 0 <= j < len(names) and self.elements[names[j][0]].cls == "MARK":
+            j += step
+        return 0 <= j < len(names) and names[j][0] == names[k][0]
+
+    def _leave(self, reason: str, name: str) -> None:
+        self.left_out.setdefault(reason, []).append(name)
+
+    def _converted(self, element: _Element, turned: bool, inner: tuple[bool, bool]) -> list[Part]:
+        """What one element is in the ring."""
+        cls, name, where = element.cls, element.name.lower(), element.where
+        named = f"{cls} '{plain(element.name, 60)}' ({where})"
+        if cls in _REFUSED:
+            raise LatticeError(
+                f"{named} acts on the beam and is not modelled; take it out, or replace it"
+            )
+        if cls in _INERT and element.values.get("ON_PASS", -1.0) == -1.0:
+            for key, value in _INERT[cls].items():
+                if element.values.get(key, value) != value:
+                    raise LatticeError(
+                        f"{named} changes the beam by its {key}, which is not modelled; take it out"
+                    )
+        if cls in _COLLECTIVE:
+            self._leave(f"what {cls} does", name)
+        if cls in (*_DRIFTS, *_SILENT, *_COLLECTIVE, *_INERT):
+            length = element.number("L")
+            return [Part(name, "drift" if length else "marker", {"l": length}, where)]
+        for key, value in element.values.items():
+            if key in MODELLED[cls] or not value or value == _DEFAULTS.get(key):
+                continue
+            if key in NONLINEAR or (key == "K3" and cls in ("CSBEND", "CCBEND", "CSRCSBEND",
+                                                            "KSBEND")):  # fmt: skip
+                self._leave(key, name)
+            elif key not in NO_EFFECT and not self._harmless(cls, key, value):
+                raise LatticeError(
+                    f"the attribute {plain(key, 40)} of {named} is not modelled; set it to 0 or "
+                    "take it out"
+                )
+        made = getattr(self, f"_as_{_FAMILY[cls]}")(element, name, turned, inner)
+        return made if isinstance(made, list) else [made]
+
+    def _harmless(self, cls: str, key: str, value: float | str) -> bool:
+        """Whether an attribute of this class has no effect on the optics."""
+        return cls in _FAMILY_WITHOUT.get(key, ()) or _FAMILY[cls] in ("monitor", "cavity")
+
+    def _moved(self, element: _Element) -> dict[str, float]:
+        keys = {"dx": "DX", "dy": "DY", "ds": "DZ", "tilt": "TILT"}
+        return {key: element.number(own) for key, own in keys.items()}
+
+    def _steered(self, element: _Element) -> dict[str, Any]:
+        """Kicks of windings for steering, as integrated dipole fields of a magnet."""
+        x = element.number("HKICK") * element.number("HCALIBRATION")
+        y = element.number("VKICK") * element.number("VCALIBRATION")
+        return {"knl": [-x], "ksl": [y]} if x or y else {}
+
+    def _scaled(self, element: _Element, key: str, order: int) -> float:
+        """A strength, by its pole-tip field where the bore is given."""
+        bore = element.number("BORE")
+        value = element.number(key)
+        if bore:
+            value = math.factorial(order) * element.number("B") / bore**order / self._rigidity
+        return value * (1 + element.number("FSE"))
+
+    def _as_quadrupole(self, element: _Element, name: str, *_: Any) -> Any:
+        values = {"l": element.number("L"), "k1": self._scaled(element, "K1", 1),
+                  **self._moved(element), **self._steered(element)}  # fmt: skip
+        if element.cls == "DQCOR":
+            values["k1s"] = element.number("J1") * (1 + element.number("FSE"))
+        if element.cls != "QUFRINGE":
+            return Part(name, "quadrupole", values, element.where)
+        count, length = 10, element.number("L")
+        shares = (np.arange(count) + 0.5) / count
+        if element.number("DIRECTION") < 0:
+            shares = shares[::-1]
+        return [
+            Part(name, "quadrupole", {**values, "l": length / count, "k1": values["k1"] * share},
+                 element.where)
+            for share in shares
+        ]  # fmt: skip
+
+    def _as_sextupole(self, element: _Element, name: str, *_: Any) -> Part:
+        values = {"l": element.number("L"), "k2": self._scaled(element, "K2", 2),
+                  "k1": element.number("K1"), "k1s": element.number("J1"),
+                  **self._moved(element), **self._steered(element)}  # fmt: skip
+        if element.cls == "KQUSE":
+            values["k1"] *= 1 + element.number("FSE1")
+            values["k2"] *= 1 + element.number("FSE2")
+        keyword = "quadrupole" if element.cls == "KQUSE" else "sextupole"
+        return Part(name, keyword, values, element.where)
+
+    def _as_octupole(self, element: _Element, name: str, *_: Any) -> Part:
+        values = {"l": element.number("L"), "k3": self._scaled(element, "K3", 3)}
+        return Part(name, "octupole", {**values, **self._moved(element)}, element.where)
+
+    def _as_multipole(self, element: _Element, name: str, *_: Any) -> Part:
+        order = int(element.values.get("ORDER", 1.0))
+        if not 0 <= order <= 20:
+            raise LatticeError(f"MULT '{plain(element.name, 60)}' has the ORDER {order}")
+        strength, bore = element.number("KNL"), element.number("BORE")
+        if bore:
+            strength = math.factorial(order) * element.number("BTIPL") / bore**order
+            strength /= self._rigidity
+        knl = np.zeros(order + 1)
+        knl[order] = strength * element.number("FACTOR")
+        values = {"l": element.number("L"), "knl": knl, "angle": 0.0, **self._moved(element)}
+        return Part(name, "multipole", values, element.where)
+
+    def _as_bend(
+        self, element: _Element, name: str, turned: bool, inner: tuple[bool, bool]
+    ) -> Part:
+        number = element.number
+        length, angle = number("L"), number("ANGLE")
+        e1, e2 = number("E1"), number("E2")
+        straight = element.cls == "CCBEND" and not {"E1", "E2"} & element.values.keys()
+        if element.cls == "RBEN" or straight:  # faces parallel to each other
+            e1, e2 = e1 + angle / 2, e2 + angle / 2
+        if element.cls == "RBEN" and angle:
+            length *= (angle / 2) / math.sin(angle / 2)
+        yaw = number("YAW")
+        if yaw and element.cls != "CCBEND":
+            raise LatticeError(f"YAW of {element.cls} '{plain(element.name, 60)}' is not modelled")
+        e1, e2 = e1 - yaw, e2 + yaw
+        curvature = angle / length if length else 0.0
+        k1, k2 = number("K1"), number("K2")
+        if number("USE_BN"):
+            k1, k2 = number("B1") * curvature, number("B2") * curvature
+        fse = number("FSE")
+        k1 *= 1 + fse + number("FSE_QUADRUPOLE")
+        k2 *= 1 + fse
+        error = angle * (fse + number("FSE_DIPOLE")) - number("XKICK")
+        default = number("FINT") if element.cls != "CCBEND" else 0.0
+        fint = [default if number(key) < 0 else number(key) for key in ("FINT1", "FINT2")]
+        faces = [(e1, number("H1"), fint[0], number("EDGE1_EFFECTS")),
+                 (e2, number("H2"), fint[1], number("EDGE2_EFFECTS"))]  # fmt: skip
+        if turned:
+            faces.reverse()
+        faces = [
+            (0.0, 0.0, 0.0, 0.0) if off or not face[3] else face
+            for face, off in zip(faces, inner, strict=True)
+        ]
+        values = {
+            "l": length, "angle": angle, "k1": k1, "k2": k2, "knl": [error],
+            "ksl": [number("YKICK")], "e1": faces[0][0], "e2": faces[1][0], "h1": faces[0][1],
+            "h2": faces[1][1], "hgap": number("HGAP"), "fint": faces[0][2], "fintx": faces[1][2],
+            **self._moved(element), "dpsi": number("ETILT") * math.copysign(1, number("ETILT_SIGN")),
+        }  # fmt: skip
+        return Part(name, "sbend" if angle else "quadrupole", values if angle else {
+            "l": length, "k1": k1, "k2": k2, "knl": [error], **self._moved(element)
+        }, element.where)  # fmt: skip
+
+    def _as_corrector(self, element: _Element, name: str, *_: Any) -> Part:
+        values = {"l": element.number("L"), "tilt": element.number("TILT")}
+        if element.cls in ("KICKER", "EKICKER"):
+            values["hkick"] = element.number("HKICK") * element.number("HCALIBRATION")
+            values["vkick"] = element.number("VKICK") * element.number("VCALIBRATION")
+            return Part(name, "kicker", values, element.where)
+        values["kick"] = element.number("KICK") * element.number("CALIBRATION")
+        keyword = "hkicker" if "HK" in element.cls else "vkicker"
+        return Part(name, keyword, values, element.where)
+
+    def _as_monitor(self, element: _Element, name: str, *_: Any) -> Part:
+        keyword = {"HMON": "hmonitor", "VMON": "vmonitor"}.get(element.cls, "monitor")
+        return Part(name, keyword, {"l": element.number("L")}, element.where)
+
+    def _as_cavity(self, element: _Element, name: str, *_: Any) -> Part:
+        if element.number("CHANGE_P0") if "CHANGE_P0" in element.values else 0.0:
+            raise LatticeError(f"{element.cls} '{plain(element.name, 60)}' changes the momentum of "
+                               "the ring (CHANGE_P0); set it to 0")  # fmt: skip
+        values = {"l": element.number("L"), "volt": 1e-6 * element.number("VOLT"),
+                  "freq": 1e-6 * element.number("FREQ")}  # fmt: skip
+        return Part(name, "rfcavity", values, element.where)
+
+    def _as_solenoid(self, element: _Element, name: str, *_: Any) -> Part:
+        ks = -element.number("KS")  # elegant's is -B / (B rho)
+        if not ks and element.number("B"):
+            ks = element.number("B") / self._rigidity
+        moved = {"dx": element.number("DX"), "dy": element.number("DY"), "ds": element.number("DZ")}
+        return Part(name, "solenoid", {"l": element.number("L"), "ks": ks, **moved}, element.where)
+
+    def _as_matrix(self, element: _Element, name: str, *_: Any) -> Part:
+        """elegant's (s, delta) are OCELOT's (beta0 tau, p / beta0), but for the slip of a drift."""
+        r = np.array([[element.number(f"R{i}{j}") for j in range(1, 7)] for i in range(1, 7)])
+        b = np.array([element.number(f"C{i}") for i in range(1, 7)])
+        b[4] = 0.0  # the length
+        if abs(np.linalg.det(r[:4, :4])) < 1e-6:
+            raise LatticeError(
+                f"EMATRIX '{plain(element.name, 60)}' has no inverse: what it does not state is 0, "
+                "also on the diagonal; state R11 to R66"
+            )
+        if r[5, 5] == 0:
+            r[4, 4] = r[5, 5] = 1.0
+        length = element.number("L")
+        if any(element.number(key) for key in ("DX", "DY", "DZ")):
+            raise LatticeError(f"EMATRIX '{plain(element.name, 60)}' is displaced; set DX to 0")
+        beta = math.sqrt(1 - self._slip)
+        turn = np.diag([1.0, 1.0, 1.0, 1.0, 1 / beta, beta])
+        rmat = turn @ r @ np.linalg.inv(turn)
+        rmat[4, 5] -= length * self._slip / (1 - self._slip)
+        values: dict[str, Any] = {"l": length, "rmat": rmat, "tilt": element.number("TILT")}
+        if b.any():
+            values["b"] = turn @ b
+        return Part(name, "matrix", values, element.where)
+
+    def _as_rotation(self, element: _Element, name: str, *_: Any) -> Part:
+        angle = 0.0 if element.number("EXCLUDE_OPTICS") else element.number("TILT")
+        return Part(name, "srotation", {"angle": angle}, element.where)
+
+    def _as_wiggler(self, element: _Element, name: str, *_: Any) -> Part:
+        """A wiggler focuses like half its curvature squared, in the plane of its field."""
+        length, radius, poles = (element.number(key) for key in ("L", "RADIUS", "POLES"))
+        if not radius and element.number("B"):
+            radius = self._rigidity / element.number("B")
+        elif not radius and element.number("K") and poles:
+            radius = length / poles / (math.pi * element.number("K") * math.sqrt(self._slip))
+        r = np.eye(6)
+        r[0, 1] = r[2, 3] = length
+        r[4, 5] = -length * self._slip / (1 - self._slip)
+        if radius:
+            focus = 1 / (math.sqrt(2) * abs(radius))
+            cos, sin = math.cos(focus * length), math.sin(focus * length)
+            r[2:4, 2:4] = [[cos, sin / focus], [-focus * sin, cos]]
+        if any(element.number(key) for key in ("DX", "DY", "DZ")):
+            raise LatticeError(f"WIGGLER '{plain(element.name, 60)}' is displaced; set DX to 0")
+        self._leave("what it has beyond its first-order matrix", name)
+        values = {"l": length, "rmat": r, "tilt": element.number("TILT")}
+        return Part(name if "wig" in name else f"{name}_wiggler", "matrix", values, element.where)
+
+
+_FAMILY = {
+    **dict.fromkeys(("QUAD", "KQUAD", "QUFRINGE", "DQCOR"), "quadrupole"),
+    **dict.fromkeys(("SEXT", "KSEXT", "KQUSE"), "sextupole"),
+    **dict.fromkeys(("OCTU", "KOCT"), "octupole"),
+    "MULT": "multipole",
+    **dict.fromkeys(("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND"), "bend"),
+    **dict.fromkeys(("HKICK", "VKICK", "EHKICK", "EVKICK", "KICKER", "EKICKER"), "corrector"),
+    **dict.fromkeys(("MONI", "HMON", "VMON"), "monitor"),
+    **dict.fromkeys(("RFCA", "RFCW", "MODRF", "RAMPRF"), "cavity"),
+    "SOLE": "solenoid",
+    "EMATRIX": "matrix",
+    "ROTATE": "rotation",
+    "WIGGLER": "wiggler",
+}
+_FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
+    "EDGE1_EFFECTS": ("QUAD", "KQUAD"), "EDGE2_EFFECTS": ("QUAD", "KQUAD"),
+    "B2": ("HKICK", "VKICK", "KICKER"), "PITCH": ("QUAD", "KQUAD", "KSEXT", "KOCT"),
+    "YAW": ("QUAD", "KQUAD", "KSEXT", "KOCT"), "ANGLE": ("EMATRIX",),
+    **dict.fromkeys(("CSR", "BINS", "BIN_SIZE", "BIN_ONCE", "BIN_RANGE_FACTOR", "SG_HALFWIDTH",
+                     "SG_ORDER", "SGDERIV_HALFWIDTH", "SGDERIV_ORDER", "TRAPAZOID_INTEGRATION",
+                     "OUTPUT_FILE", "OUTPUT_INTERVAL", "OUTPUT_LAST_WAKE_ONLY", "STEADY_STATE",
+                     "IGF", "BLOCK_CSR", "DERBENEV_CRITERION_MODE", "PARTICLE_OUTPUT_FILE",
+                     "PARTICLE_OUTPUT_INTERVAL", "SLICE_ANALYSIS_INTERVAL", "CLIP_NEGATIVE_BINS",
+                     "LOW_FREQUENCY_CUTOFF0", "LOW_FREQUENCY_CUTOFF1", "HIGH_FREQUENCY_CUTOFF0",
+                     "HIGH_FREQUENCY_CUTOFF1", "WAKE_FILTER_FILE", "WFF_FREQ_COLUMN",
+                     "WFF_REAL_COLUMN", "WFF_IMAG_COLUMN"), ("CSRCSBEND",)),
+    **dict.fromkeys(("PERIODS", "ON_PASS", "EXCLUDE_FLOOR"), ("WIGGLER", "ROTATE")),
+}  # fmt: skip
+"""Attributes without effect on the optics of some classes: PITCH and YAW are ignored by elegant's
+default alignment, and fringes of quadrupoles act by their integrals."""
+
+
+def _statements(lines: list[str]) -> Iterator[tuple[str, int, Iterator[str]]]:
+    """Each statement without comments, its line, and the lines behind it."""
+    rest = iter(lines)
+    number = 0
+
+    def following() -> Iterator[str]:
+        nonlocal number
+        for line in rest:
+            number += 1
+            yield line
+
+    source = following()
+    text, first, joined = "", 0, 0
+    for line in source:
+        bare = _uncommented(line)
+        if not bare:
+            continue
+        first = first if text else number
+        joined += 1
+        if joined > LONGEST_STATEMENT:
+            raise LatticeError(f"line {first}: no end of a statement in {LONGEST_STATEMENT} lines")
+        text += bare
+        if text.endswith("&"):
+            text = text[:-1] + " "
+            continue
+        if text.strip():
+            yield text.strip(), first, source
+        text, joined = "", 0
+    if text.strip():
+        raise LatticeError(f"line {first}: the statement goes on (&) after the end of the file")
+
+
+def _uncommented(line: str) -> str:
+    """A line without what follows a `!` outside quotation marks."""
+    quoted = False
+    for k, sign in enumerate(line):
+        quoted ^= sign == '"'
+        if sign == "!" and not quoted:
+            line = line[:k]
+            break
+    return line.strip()
+
+
+def _split(text: str) -> list[str]:
+    """Items between commas outside brackets and quotation marks."""
+    items, depth, quoted, begin = list[str](), 0, False, 0
+    for k, sign in enumerate(text):
+        quoted ^= sign == '"'
+        if quoted:
+            continue
+        depth += {"(": 1, ")": -1}.get(sign, 0)
+        if depth < 0:
+            raise LatticeError("a bracket is closed that was not opened")
+        if sign == "," and not depth:
+            items.append(text[begin:k].strip())
+            begin = k + 1
+    if depth or quoted:
+        raise LatticeError("a bracket or a quotation mark is left open; close it")
+    items.append(text[begin:].strip())
+    return [item for item in items if item]
+
+
+def _bare(text: str) -> str:
+    """A name: as it is in quotation marks, else in capitals."""
+    text = text.strip()
+    return text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text.upper()
+
+
+def _inner(items: Items) -> set[str]:
+    names: set[str] = set()
+    for _, _, what in items:
+        names |= _inner(what) if isinstance(what, list) else {what}
+    return names
+
+
+def _class_of(word: str) -> str:
+    """The class that a word names: it may be shorter or longer than the class's name."""
+    word = _bare(word).upper()
+    if word in ALL_CLASSES:
+        return word
+    found = [cls for cls in ALL_CLASSES if cls.startswith(word) or word.startswith(cls)]
+    longest = [cls for cls in found if word.startswith(cls)]
+    if longest:
+        found = [max(longest, key=len)]
+    if len(found) != 1:
+        which = f"may be {', '.join(found[:5])}" if found else "is not known"
+        raise LatticeError(f"the element class '{plain(word, 40)}' {which}")
+    return found[0]
+
+
+def _attribute(cls: str, key: str) -> str:
+    """An attribute as elegant spells it: underscores may be missing."""
+    known = MODELLED.get(cls, set()) | NO_EFFECT | NONLINEAR | _FAMILY_WITHOUT.keys()
+    if key in known:
+        return key
+    same = [own for own in known if own.replace("_", "") == key.replace("_", "")]
+    return same[0] if same else key
