@@ -123,7 +123,12 @@ ELEMENTS = {
     "corrector of both planes": at.Corrector("hv", 0.3, [2e-4, -1e-4]),
     "matrix": at.M66("m", at.find_elem_m66(at.Dipole("b", 1.0, 0.3, 0.2))),
     "solenoid": at.Element("sol", Length=0.5, K=0.2, PassMethod="SolenoidLinearPass"),
+    "shifted quadrupole": at.Quadrupole("q", 0.5, 0.8, NumIntSteps=400),
+    "shifted sextupole": at.Sextupole("s", 0.3, 25.0, NumIntSteps=400),
 }  # fmt: skip
+offset = np.array([2e-4, 0, -3e-4, 0, 0, 0])
+for shifted in ("shifted quadrupole", "shifted sextupole"):
+    ELEMENTS[shifted].T1, ELEMENTS[shifted].T2 = -offset, offset
 psi = 0.3
 turn = np.eye(6)
 turn[:4, :4] = np.kron([[np.cos(psi), np.sin(psi)], [-np.sin(psi), np.cos(psi)]], np.eye(2))

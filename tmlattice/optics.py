@@ -78,6 +78,7 @@ class Twiss:
         alpha: [layer + 1, 2].
         phase: turns since the start, [layer + 1, 2].
         total_tunes: Qx, Qy with their integers, [2].
+        orbit: the closed orbit (x, y), m, [layer + 1, 2].
     """
 
     s: Array
@@ -85,6 +86,7 @@ class Twiss:
     alpha: Array
     phase: Array
     total_tunes: Array
+    orbit: Array
 
 
 @dataclass(frozen=True)
@@ -261,7 +263,7 @@ def twiss(network: LayerChain) -> Twiss:
     Raises:
         UnstableRingError: no closed orbit, or no tune.
     """
-    _, total = _on_closed_orbit(network)
+    path, total = _on_closed_orbit(network)
     values, modes = normal_modes(total[-1, :4, :4])
     vectors = total[:, :4, :4] @ modes
     position = np.stack([vectors[:, 0, 0], vectors[:, 2, 1]], axis=-1)
@@ -272,7 +274,14 @@ def twiss(network: LayerChain) -> Twiss:
     fraction = _fractions(values)
     whole = np.round(phase[-1] - fraction)
     s = np.concatenate([[0.0], network.maps.s])
-    return Twiss(s=s, beta=beta, alpha=alpha, phase=phase[:-1], total_tunes=whole + fraction)
+    return Twiss(
+        s=s,
+        beta=beta,
+        alpha=alpha,
+        phase=phase[:-1],
+        total_tunes=whole + fraction,
+        orbit=path[:-1, [0, 2]],
+    )
 
 
 def off_momentum(network: LayerChain, length: float, delta: float = 1e-4) -> OffMomentum:

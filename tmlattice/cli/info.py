@@ -58,6 +58,7 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "tunes": None,
         "chromaticity": None,
         "beta_max": None,
+        "closed_orbit_max": None,
         "dispersion_max": None,
         "momentum_compaction": None,
         "problem": None,
@@ -66,6 +67,7 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         functions = twiss(Chain.from_ring(ring))
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
+        facts["closed_orbit_max"] = abs(functions.orbit).max(axis=0).tolist()
         energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
         # per momentum, not per energy dE / (p0 c) = beta delta; and of the path, not of its time
         beta, lag = (1.0, 0.0) if ring.gamma > 1e3 else (ring.beta, ring.gamma**-2)
@@ -99,6 +101,8 @@ def _print(facts: dict[str, Any]) -> None:
             ("largest beta at a magnet's exit [m]", "beta_max", "{:.2f}"),
             ("largest dispersion there [m]", "dispersion_max", "{:.4f}"),
         ]
+        if max(facts["closed_orbit_max"]) > 1e-7:  # the lattice has kicks of its own
+            rows.append(("largest closed orbit there [m]", "closed_orbit_max", "{:.3e}"))
         for name, key, form in rows:
             value = facts[key]
             optics.add_row(name, *(("-", "-") if value is None else map(form.format, value)))

@@ -23,7 +23,6 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +35,9 @@ from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
 from tmlattice.lattice.madx_elements import ACTS
 from tmlattice.lattice.mat_file import check_mat
-from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
+from tmlattice.lattice.parts import assembled
+from tmlattice.lattice.places import Place, corrector, corrector_pair
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
-from tmlattice.lattice.wigglers import merge_wigglers
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +103,7 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         LatticeError: no elements.
 
     Warns:
-        Of misalignments, rotations that are no roll, dipole field errors and orders above the
+        Of misalignments that are no offset, rotations that are no roll, and orders above the
         second, which are left out.
     """
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
@@ -114,30 +113,44 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     left_out: Counter[str] = Counter()
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
+    errors: dict[int, dict[str, float]] = {}
     check_methods(lattice)
     energy_ev = design.map_energy * 1e9
     with Tracker(energy_ev) as tracker:
         for element in lattice:
             if id(element) not in known:
                 family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
-                known[id(element)] = _places(element, family, design.map_energy, left_out, tracker)
+                own = _places(element, family, design.map_energy, left_out, tracker)
+                known[id(element)] = own
+                if shift := _shift(element, left_out):
+                    errors |= {id(source): shift for _, _, source in own}
             converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     if left_out:
         what = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
         warnings.warn(f"'{name}': left out of the model: {what}", stacklevel=3)
-    merged = merge_wigglers(converted, design.map_energy) * max(1, int(lattice.periodicity))
-    families, kinds, sources = zip(*merged, strict=True)
-    return replace(design, elements=place_elements(families, sources, kinds))
+    return assembled(design, converted, errors, max(1, int(lattice.periodicity)))
+
+
+def _shift(element: Any, left_out: Counter[str]) -> dict[str, float]:
+    """Offset of the element's centre, m, from T1 and T2; what else they do is counted as left
+    out."""
+    entrance, exit_ = (
+        np.asarray(getattr(element, key, np.zeros(6)), dtype=float).ravel() for key in ("T1", "T2")
+    )
+    if not entrance.any() and not exit_.any():
+        return {}
+    bare = np.zeros(6)
+    bare[[0, 2]] = entrance[[0, 2]]
+    if entrance.shape != (6,) or np.any(entrance != bare) or np.any(exit_ != -bare):
+        left_out["misalignments T1, T2 that are no offset"] += 1
+        return {}
+    return {k: v for k, v in (("dx", -bare[0]), ("dy", -bare[2])) if v}
 
 
 def _roll(element: Any, left_out: Counter[str]) -> float:
-    """Tilt from R1, rad; anything else that moves the element is counted as left out."""
-    for key in ("T1", "T2"):
-        if np.any(np.asarray(getattr(element, key, (0.0,)), dtype=float)):
-            left_out["misalignments T1, T2"] += 1
-            break
+    """Tilt from R1, rad; any other rotation is counted as left out."""
     R1 = np.asarray(getattr(element, "R1", np.eye(6)), dtype=float)
     R2 = np.asarray(getattr(element, "R2", np.eye(6)), dtype=float)
     roll = math.atan2(R1[0, 2], R1[0, 0])

@@ -10,7 +10,7 @@ import cmath
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -163,12 +163,30 @@ def ring_of_parts(
                 errors |= {id(source): amounts for _, _, source in own}
         places += known[id(part)]
     report.warn(name)
-    families, kinds, sources = zip(*merge_wigglers(places, design.map_energy), strict=True)
+    return assembled(design, places, errors)
+
+
+def assembled(
+    design: Ring,
+    places: Sequence[Place],
+    errors: Mapping[int, Mapping[str, Any]],
+    periods: int = 1,
+) -> Ring:
+    """The ring with elements at these places.
+
+    Args:
+        design: name, energy and mass.
+        places: in beam order.
+        errors: of an element, by the `id` of its source, as `Element.with_errors` takes them.
+        periods: how often the places follow one another.
+    """
+    merged = merge_wigglers(list(places), design.map_energy) * periods
+    families, kinds, sources = zip(*merged, strict=True)
     elements = tuple(
         e.with_errors(**errors[id(s)]) if id(s) in errors else e
         for e, s in zip(place_elements(families, sources, kinds), sources, strict=True)
     )
-    return Ring(name, elements, energy, mass=mass)
+    return replace(design, elements=elements)
 
 
 def _acts(value: Any) -> bool:
