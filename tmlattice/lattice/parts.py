@@ -383,6 +383,35 @@ def _bend(part: Part, report: _Report) -> Any:
     )
 
 
+def face(
+    curvature: float, field: float, e: float, gap: float, integral: float, down: float = 0.0
+) -> tuple[float, float]:
+    """Angle (rad) and half gap times integral (m) of the face of a bend that, at the design's
+    curvature, focuses like one in another field.
+
+    Args:
+        curvature: of the design orbit, not 0, 1/m.
+        field: the dipole field behind the face, 1/m.
+        e: its angle, rad.
+        gap, integral: half gap (m) and fringe integral.
+        down: added to the angle in the vertical plane, rad.
+    """
+    x, y = edge_focusing(field, e, gap, integral, down)
+    angle = math.atan(x / curvature)
+    fringe = angle + math.atan(y / curvature)
+    scale = 2 * curvature * (1 + math.sin(angle) ** 2) / math.cos(angle)
+    return angle, fringe / scale
+
+
+def edge_focusing(
+    field: float, e: float, gap: float, integral: float, down: float = 0.0
+) -> tuple[float, float]:
+    """R21 and R43 of the face of a bend, 1/m, as of DIPEDGE; arguments as of `face`."""
+    y = e + down
+    fringe = 2 * gap * integral * field * (1 + math.sin(y) ** 2) / math.cos(y)
+    return field * math.tan(e), -field * math.tan(y - fringe)
+
+
 def _matrix(part: Part, ring: Ring) -> Place:
     """A matrix element; MAD-X's (t, pt) are (-tau, p)."""
     from tmlattice.lattice.ocelot import elements as ocelot
@@ -396,10 +425,7 @@ def _matrix(part: Part, ring: Ring) -> Place:
             sign = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
             r = sign @ np.asarray(part.values.get("rm", np.eye(6)), dtype=float) @ sign
         case "dipedge":
-            h, e1 = part.number("h"), part.number("e1")
-            fringe = 2 * part.number("hgap") * part.number("fint") * h
-            fringe *= (1 + math.sin(e1) ** 2) / math.cos(e1)
-            r[1, 0], r[3, 2] = h * math.tan(e1), -h * math.tan(e1 - fringe)
+            r[1, 0], r[3, 2] = edge_focusing(*map(part.number, ("h", "e1", "hgap", "fint")))
         case "srotation":
             r[:4, :4] = _rotation(part.number("angle"))
         case "solenoid":

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.lattice.expressions import Arithmetic
-from tmlattice.lattice.parts import Part, ring_of_parts
+from tmlattice.lattice.parts import Part, edge_focusing, face, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 Array = NDArray[np.float64]
@@ -286,8 +286,8 @@ class _Reader:
         parts: list[Part] = []
         for item in placed:
             if isinstance(item, float):
-                item = round(item, 12)
-                parts.append(drifts.setdefault(item, Part("drift", "drift", {"l": item})))
+                way = round(item, 12)
+                parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
                 continue
             if item not in self._made:
                 self._made[item] = self._converted(self._fields(item), item.lower())
@@ -393,9 +393,7 @@ class _Reader:
         """Where an element begins, m; None while what it refers to has no position."""
         at, origin = place.get("at"), place.get("from_")
         anchor = place.get("from_anchor")
-        if isinstance(at, str) and "@" in at:
-            at, origin = 0.0, at
-        elif isinstance(at, str) and at in self.elements:
+        if isinstance(at, str) and ("@" in at or at in self.elements):
             at, origin = 0.0, at
         if isinstance(origin, str) and "@" in origin:
             origin, _, anchor = origin.partition("@")
@@ -573,10 +571,10 @@ class _Reader:
             if parent.cls == "Magnet" and _Bend(parent, self).angle:
                 parts = [_Bend(parent, self).body(name, where, weight)]
             else:
-                parts = [self._thick(parent, name, where, weight)]
+                parts = self._in_kicks(parent, self._thick(parent, name, where, weight), weight)
         else:
             parent.cls = f"{fields.cls} of a {parent.cls}"
-            raise _not_modelled(parent) if _way_of(parent) == 0 else _not_modelled(parent)
+            raise _not_modelled(parent)
         if sliced[3] or sliced[1] == "Thick":
             _Bend(parent, self)  # its edges' fields are modelled, in other slices
         parent.used |= {"edge_entry_active", "edge_exit_active"}
@@ -620,7 +618,7 @@ class _Reader:
         fields.used |= {"edge_entry_active", "edge_exit_active"}  # fringes of the third order
         return self._in_kicks(fields, self._thick(fields, name, where))
 
-    def _in_kicks(self, fields: _Fields, whole: Part) -> list[Part]:
+    def _in_kicks(self, fields: _Fields, whole: Part, weight: float = 1.0) -> list[Part]:
         """A straight magnet whose gradients, but for K1 of a quadrupole, are in thin kicks.
 
         Xsuite puts one kick in the middle where no number is given. A magnet whose kicks are fine,
@@ -633,7 +631,7 @@ class _Reader:
         if rule == "adaptive":
             rule = "yoshida-6" if fields.cls == "Magnet" else "uniform"
         body = fields.number("k1") * length if model.startswith("mat") else 0.0
-        count = int(fields.number("num_multipole_kicks"))
+        count = math.ceil(weight * int(fields.number("num_multipole_kicks")))
         knl, ksl = whole.list("knl").copy(), whole.list("ksl")
         knl[1] -= body
         gradient = abs(knl[1]) + SKEW_SHARE * abs(ksl[1])
@@ -864,8 +862,19 @@ class _Bend:
         detuned = abs(self._field() - self.curvature) > 1e-12 * abs(self.curvature)
         focusing = any(faces) or first * gap or last * gap2
         if down or down2 or (detuned and focusing):
-            entry, exit_ = self.edges()
-            return [*entry(f"{name}_entry", where), body, *exit_(f"{name}_exit", where)]
+            if not self.curvature:
+                entry, exit_ = self.edges()
+                return [*entry(f"{name}_entry", where), body, *exit_(f"{name}_exit", where)]
+            field = self._field()
+            (first_angle, first), (last_angle, last) = (
+                face(self.curvature, field, *edge) if self.active(side) else (0.0, 0.0)
+                for side, edge in enumerate(
+                    [(faces[0], gap, first, down), (faces[1], gap2, last, down2)]
+                )
+            )
+            faces = [first_angle, last_angle]
+            gap = gap2 = math.copysign(1.0, last)  # MAD-X takes a negative FINTX for none
+            first, last = first * gap, last * gap
         if gap2 != gap:
             gap, first, last = 1.0, first * gap, last * gap2
         edges = {"e1": faces[0], "e2": faces[1], "hgap": gap, "fint": first, "fintx": last}
@@ -920,10 +929,8 @@ def _edge(name: str, where: str, edge: tuple[float, ...], tilt: float) -> list[P
     if not down:
         values: dict[str, Any] = {"h": field, "e1": e1, "hgap": gap, "fint": integral}
         return [Part(name, "dipedge", {**values, "tilt": tilt}, where)]
-    angle = e1 + down
-    fringe = 2 * field * gap * integral / math.cos(angle) * (1 + math.sin(angle) ** 2)
     matrix = np.eye(6)
-    matrix[1, 0], matrix[3, 2] = field * math.tan(e1), -field * math.tan(angle - fringe)
+    matrix[1, 0], matrix[3, 2] = edge_focusing(field, e1, gap, integral, down)
     return [Part(name, "matrix", {"rmat": matrix, "tilt": tilt}, where)]
 
 
