@@ -59,12 +59,16 @@ DECKS = {
     "bend_feed_down": bend(**EDGE, edge_entry_angle_fdown=0.05, edge_exit_angle_fdown=0.02),
     "bend_k0": bend(k0=PHI * 1.001),
     "bend_k0_edges": bend(k0=PHI * 1.001, **EDGE),
+    "bend_shift": bend(shift_x=1e-5, shift_y=2e-5, k1=-0.05),
+    "bend_roll": bend(rot_s_rad_no_frame=1e-3),
+    "bend_corrector": {"ch": xt.Bend(length=0.2, k0=1e-3)},
     "bend_knl": bend(knl=[1e-4, 0.02, 0.1], ksl=[2e-4, 0.01]),
     "bend_knl_rel": bend(knl_rel=[1e-4, 0.1], ksl_rel=[0, 0.01]),
     "bend_tilt": bend(rot_s_rad=0.01),
     "rbend": rbend(),
     "rbend_negative": rbend(angle=-PHI),
     "rbend_k1": rbend(k1=0.1, edge_entry_angle=0.02),
+    "rbend_k0": rbend(k0=2 * np.sin(PHI / 2) * 1.001),
     "rbend_straight": rbend(rbend_model="straight-body"),
     "rbend_angle_diff": rbend(rbend_angle_diff=0.1),
     "rbend_suppressed": rbend(edge_entry_model="suppressed", edge_exit_model="suppressed"),
@@ -86,6 +90,9 @@ DECKS = {
     "magnet_bend": {
         "bb": xt.Magnet(angle=PHI, length=1.0, k1=0.05, edge_entry_angle=0.1, edge_exit_angle=0.05)
     },
+    "magnet_straight_faces": {
+        "ch": xt.Magnet(length=0.2, k0=1e-3, k1=0.1, edge_entry_angle=0.1, edge_exit_angle=0.1)
+    },
     "magnet_corrector": {"ch": xt.Magnet(k0=1e-3, k0s=2e-3, length=0.1)},
     "sextupole": {"ch": xt.Sextupole(k2=2.0, length=0.2, shift_x=1e-3, knl=[1e-5])},
     "octupole": {"ch": xt.Octupole(k3=20.0, length=0.2, knl=[0, 0.01])},
@@ -95,6 +102,7 @@ DECKS = {
                 "cell": ["q2", *CELL[1:]]},
     "thin_bend": {"tb": xt.Multipole(knl=[PHI], hxl=PHI, length=1.0), "cell": THIN_BENDS},
     "thin_bend_error": {"tb": xt.Multipole(knl=[PHI + 1e-4], hxl=PHI), "cell": THIN_BENDS},
+    "thin_bend_k1": {"tb": xt.Multipole(knl=[PHI, 0.05], hxl=PHI), "cell": THIN_BENDS},
     "simple_thin_bend": {"tb": xt.SimpleThinBend(knl=[PHI], hxl=PHI), "cell": THIN_BENDS},
     "simple_thin_quadrupole": {"tq": xt.SimpleThinQuadrupole(knl=[0, 0.44]),
                                "cell": ["tq", *CELL[1:]]},

@@ -23,7 +23,7 @@ from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 MOST_FILES = 1000
 MOST_BYTES = 200_000_000
-MOST_WORK = 4_000_000
+MOST_WORK = 2_000_000
 """Words of RPN, and elements of lines."""
 MOST_ELEMENTS = 1_000_000
 LONGEST_STATEMENT = 5000
@@ -290,15 +290,13 @@ class _Rpn:
         for name, value in self.memory.items():  # outside quotation marks elegant has capitals
             if name.casefold() == word.casefold():
                 return value
-        raise LatticeError(
-            f"'{plain(word, 40)}' is no number, no stored name and no known operator"
-        )
+        raise LatticeError(f"'{plain(word, 40)}' is no number, stored name or known operator")
 
 
 # --- statements -----------------------------------------------------------------------------------
 @dataclass
 class _Element:
-    """An element: its class, and its attributes as numbers, or as texts where they are no number."""
+    """An element: its class, and its attributes as numbers, or as texts that are none."""
 
     name: str
     cls: str
@@ -570,8 +568,8 @@ class _Reader:
                 f"{named} acts on the beam and is not modelled; take it out, or replace it"
             )
         if cls in _INERT and element.values.get("ON_PASS", -1.0) == -1.0:
-            for key, value in _INERT[cls].items():
-                if element.values.get(key, value) != value:
+            for key, still in _INERT[cls].items():
+                if element.values.get(key, still) != still:
                     raise LatticeError(
                         f"{named} changes the beam by its {key}, which is not modelled; take it out"
                     )

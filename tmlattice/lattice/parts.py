@@ -224,8 +224,8 @@ def _errors(part: Part) -> dict[str, Any]:
         knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
         excess = length * part.number("k0") - angle if part.number("k0") else 0.0
         x, y = -excess - knl[0], part.number("k0s") * length + ksl[0]
-        roll = amounts.pop("roll")  # of a field, which kicks; the design's orbit is not turned
-        x, y = x + roll**2 * angle / 2, y - roll * angle
+        roll = amounts.pop("roll")  # about the entrance's axis: the field kicks, as it is turned
+        x, y = x + roll**2 * math.sin(angle) / 2, y - roll * math.sin(angle)
         cos, sin = math.cos(part.number("tilt")), math.sin(part.number("tilt"))
         x, y = x * cos - y * sin, x * sin + y * cos
         amounts["kick_x"], amounts["kick_y"] = x, y

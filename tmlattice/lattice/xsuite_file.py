@@ -36,14 +36,15 @@ PASSIVE = frozenset({
     "RandomRutherford", "RandomUniform", "RandomUniformAccurate", "MultipoleEdge", "ZetaShift",
     "TimeDelay", "BlackAbsorber", "BlackCrystal", "TransparentCollimator", "TransparentCrystal",
     "ScatterHelper", "EverestBlock", "EverestCollimator", "EverestCrystal", "FlukaCollimator",
-    "Geant4Collimator", "Geant4CollimatorTip", "ParticleStatsMonitor", "EmittanceMonitor",
+    "FlukaCrystal", "Geant4Collimator", "Geant4CollimatorTip", "Geant4Crystal", "TouschekMarker",
+    "ParticleStatsMonitor", "EmittanceMonitor",
 })  # fmt: skip
 """Drifts and markers in the optics: apertures, collimators, monitors of particles, delays, and
 fringes of the third order."""
 COLLECTIVE = frozenset({
     "ACDipole", "Exciter", "TransverseDamper", "CollectiveMonitor", "WakeTracker", "WakeField",
     "Wakefield", "ResistiveWallWake", "MultiWakefield", "IBSAnalyticalKick", "IBSKineticKick",
-    "ElectronCloud", "BunchMonitor", "SlicedParticles", "DampingElement",
+    "ElectronCloud", "BunchMonitor", "BlowUp", "RFSweep", "SlicedParticles", "DampingElement",
 })  # fmt: skip
 """What excites or damps the beam, or acts with the beam's current: named in a warning."""
 ACTING: dict[str, tuple[str, ...]] = {
@@ -551,7 +552,7 @@ class _Reader:
 
     def _slice(self, fields: _Fields, name: str, where: str, sliced: Any) -> list[Part]:
         parent, weight = self._parent(fields), self._weight(fields)
-        if sliced is None or sliced[1] == "Drift":
+        if sliced is None or sliced[1] == "Drift" or parent.cls in PASSIVE:
             return [_passive(name, weight * _way_of(parent))]
         if sliced[3]:
             if parent.cls not in ("Bend", "RBend", "CombinedFunctionMagnet", "Magnet"):
@@ -565,7 +566,7 @@ class _Reader:
             parts = [_Bend(parent, self).body(name, where, weight)]
         elif parent.cls in ("Cavity", "CrabCavity"):
             parts = self._cavity(parent, name, where, weight)
-        elif parent.cls == "UniformSolenoid":
+        elif parent.cls in ("UniformSolenoid", "Solenoid"):
             parts = self._solenoid(parent, name, where, weight)
         elif parent.cls in ("Quadrupole", "Sextupole", "Octupole", "Magnet", "Multipole"):
             if parent.cls == "Magnet" and _Bend(parent, self).angle:
