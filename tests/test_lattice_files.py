@@ -237,7 +237,7 @@ def test_madx_files_that_say_too_little(tmp_path):
     with pytest.raises(LatticeError, match=r"no sequence in .* named 'rong'; did you mean 'ring'"):
         load_ring(silent, sequence="rong", energy=2.0)
     bad = write(tmp_path, "bad.seq", "s: sequence, l=1; nothing, at=0.5; endsequence; beam, pc=1;")
-    with pytest.raises(LatticeError, match=r"cannot be read as MAD-X .*nothing"):
+    with pytest.raises(LatticeError, match=r"cannot be read as MAD-X: .*nothing"):
         load_ring(bad)
 
 

@@ -59,7 +59,7 @@ def table(ring, folder, centre=0.0, drop=(), **header):
             "ANGLE": e.angle if e.kind == "bend" else 0.0,
             "K1L": e.k1 * e.length,
             "K2L": e.k2 * e.length,
-            "TILT": e.tilt,
+            "TILT": 0.0 if e.kind == "vcorrector" else e.tilt,  # OCELOT's are turned
             "E1": getattr(source, "e1", 0.0),
             "E2": getattr(source, "e2", 0.0),
             "HGAP": getattr(source, "gap", 0.0) / 2,

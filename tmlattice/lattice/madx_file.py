@@ -168,6 +168,10 @@ def read_madx(
             reader.warnings.append(
                 f"{first_of(names)} ({len(names)}) have no value: taken for 0, as by MAD-X"
             )
+        for what, names in reader.passed_over.items():
+            reader.warnings.append(
+                f"{what} {first_of(names, 3)} ({len(names)}) is left out, as by MAD-X's TWISS"
+            )
         energy = beam.energy if energy is None else energy
         if reader.warnings:
             warnings.warn(f"'{path}': {'; '.join(reader.warnings)}", stacklevel=4)
@@ -197,6 +201,7 @@ class _Reader:
         self.used = ""
         self.undefined: set[str] = set()
         self.warnings: list[str] = []
+        self.passed_over: dict[str, list[str]] = {}
         self.rbarc = self.thin_focusing = True
         self._open: _Sequence | None = None
         self._edited: _Sequence | None = None
@@ -312,7 +317,8 @@ class _Reader:
             return self._assign(match[1].lower(), Given(match[3], match[2] == ":="))
         match = re.fullmatch(r"([\w.$%\"']+)\s*->\s*([\w.]+)\s*(:?=)\s*(.*)", text, re.DOTALL)
         if match:
-            owner, given = unquoted(match[1]).lower(), Given(match[4], match[3] == ":=")
+            # worked out at once even after `:=`, as MAD-X does
+            owner, given = unquoted(match[1]).lower(), Given(match[4])
             return self._set(owner, {match[2].lower(): given}, statement)
         match = re.fullmatch(r"([\w.$]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
                              re.DOTALL)  # fmt: skip
@@ -403,8 +409,8 @@ class _Reader:
     def _set(self, owner: str, given: dict[str, Given], statement: Statement) -> None:
         """`owner->attribute = value`, and an element that is named again with other values."""
         if owner == "beam" or owner.startswith("beam%"):
-            self._update_beam(owner.partition("%")[2], given)
-        elif owner in self.elements:
+            raise LatticeError("MAD-X leaves its beam as it is here; state it by BEAM")
+        if owner in self.elements:
             self._update(self.elements[owner], given)
         elif owner in self.sequences:
             if set(given) - {"l", "refer", "refpos"} - NO_EFFECT:
@@ -918,11 +924,21 @@ class _Reader:
                 own["l"] = 0.0
                 if not self.thin_focusing:
                     own["lrad"] = 0.0
+        for attribute in _NOT_IN_TWISS.get(keyword, ()):
+            if np.any(own.pop(attribute, 0.0)):
+                self.passed_over.setdefault(f"{attribute.upper()} of {keyword.upper()}", []).append(
+                    definition.name
+                )
         if float(beam.given.get("bv", 1.0)) == -1:
             own = _reversed_fields(keyword, own)
         return Part(definition.name, keyword, own, definition.where)
 
 
+_NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
+    "sbend": ("k0s", "k1s", "knl", "ksl"),
+    **dict.fromkeys(("quadrupole", "sextupole", "octupole", "solenoid"), ("knl", "ksl")),
+}
+"""What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
 _ODD = ("angle", "k0", "k1", "k2", "k3", "k0s", "k1s", "k2s", "k3s", "ks", "ksi", "hkick", "vkick",

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tmlattice.errors import LatticeError
+from tmlattice.lattice.ring import ELECTRON_GEV, PROTON_GEV
 
 LONGEST_STATEMENT = 5000
 """Lines, comments apart: a file without its semicolons is none of MAD-X."""
@@ -19,8 +20,8 @@ DEEPEST = 60
 
 CONSTANTS: dict[str, float] = {
     "pi": math.pi, "twopi": 2 * math.pi, "degrad": 180 / math.pi, "raddeg": math.pi / 180,
-    "e": math.e, "amu0": 4e-7 * math.pi, "emass": 0.51099895e-3, "mumass": 0.1056583755,
-    "nmass": 0.93956542052, "pmass": 0.93827208816, "umass": 0.93149410242, "clight": 299792458.0,
+    "e": math.e, "amu0": 4e-7 * math.pi, "emass": ELECTRON_GEV, "mumass": 0.1056583755,
+    "nmass": 0.93956542052, "pmass": PROTON_GEV, "umass": 0.93149410242, "clight": 299792458.0,
     "qelect": 1.602176634e-19, "hbar": 6.582119569e-25, "erad": 2.8179403262e-15,
     "prad": 1.5346982672e-18, "true": 1.0, "false": 0.0,
 }  # fmt: skip
@@ -77,7 +78,7 @@ def compiled(text: str) -> Evaluate:
 
 
 class _Parser:
-    """Operator precedence: sum, product, sign, power (from the right), atom."""
+    """Operator precedence: sum, product, sign, power, atom; each from the left, as in MAD-X."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -137,15 +138,12 @@ class _Parser:
 
     def _power(self) -> Evaluate:
         base = self._atom()
-        if not self._take("^"):
-            return base
-        minus = False
-        while sign := self._take("+", "-"):
-            minus ^= sign == "-"
-        exponent = self._power()
-        if minus:
-            return lambda names: math.pow(base(names), -exponent(names))
-        return lambda names: math.pow(base(names), exponent(names))
+        while self._take("^"):
+            minus = False
+            while sign := self._take("+", "-"):
+                minus ^= sign == "-"
+            base = _power(base, self._atom(), -1 if minus else 1)
+        return base
 
     def _atom(self) -> Evaluate:
         if self._at >= len(self._tokens):
@@ -154,6 +152,8 @@ class _Parser:
         self._at += 1
         if kind == "number":
             number = float(word.replace("d", "e"))
+            if not math.isfinite(number):
+                raise LatticeError(f"'{word[:20]}' is too large for a number")
             return lambda names: number
         if kind == "sign":
             if word != "(":
@@ -191,6 +191,10 @@ class _Parser:
             return float(function(*(argument(names) for argument in arguments)))
 
         return value
+
+
+def _power(base: Evaluate, exponent: Evaluate, sign: int) -> Evaluate:
+    return lambda names: math.pow(base(names), sign * exponent(names))
 
 
 def _binary(sign: str, left: Evaluate, right: Evaluate) -> Evaluate:
@@ -264,7 +268,7 @@ def statements(text: str) -> Iterator[Statement]:
         if text[at:stop].strip() and not buffer:
             begin = line
         if buffer or text[at:stop].strip():
-            buffer.append(text[at:stop])
+            buffer.append(text[at:stop] if buffer else text[at:stop].lstrip())
         if match is None:
             break
         sign, at = match[0], match.end()

@@ -6,6 +6,7 @@ or neither. What is in neither is refused where it changes the linear optics, th
 closed orbit, and named in one warning otherwise.
 """
 
+import cmath
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -213,12 +214,12 @@ def _check(part: Part, report: _Report) -> None:
 
 
 def _errors(part: Part) -> dict[str, Any]:
-    """Misalignments, and the dipole field of a bend beyond its design curvature."""
-    amounts: dict[str, Any] = {}
-    amounts |= {"dx": part.number("dx"), "dy": part.number("dy"), "ds": part.number("ds"),
-               "roll": part.number("dpsi")}  # fmt: skip
-    if part.keyword in ("translation", "changeref"):
-        amounts = {}
+    """Misalignments, and the dipole field of a bend beyond its design curvature.
+
+    In the curved frame a field of k0 focuses by h k0 in the plane of the bend.
+    """
+    own = {"dx": "dx", "dy": "dy", "ds": "ds", "roll": "dpsi"}
+    amounts: dict[str, Any] = {k: part.number(v) for k, v in own.items()}
     if part.keyword == "sbend":
         length, angle = part.number("l"), part.number("angle")
         knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
@@ -340,13 +341,18 @@ def _thin(part: Part, report: _Report) -> Any:
     if np.any(fields[3:]):
         report.left_out("fields above the sextupole", part.name)
     k = [complex(f) * math.factorial(n) for n, f in enumerate(fields[:3])]
-    given = part.values.get("angle")
+    given, turn = part.values.get("angle"), 0.0
+    if given is None and k[0].imag:  # it bends in a plane of its own
+        turn = -cmath.phase(k[0])
+        k = [field * cmath.exp(1j * (n + 1) * turn) for n, field in enumerate(k)]
+        k[0] = complex(k[0].real)
     angle = k[0].real if given is None else float(given)
     if angle and (k[1] or k[2]):
         report.left_out("products of curvature and gradient", part.name)
     return CombinedMultipole(
         k0=k[0].real - angle, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real,
-        k2s=k[2].imag, angle=angle, lrad=part.number("lrad"), tilt=part.number("tilt"),
+        k2s=k[2].imag, angle=angle, lrad=part.number("lrad"),
+        tilt=part.number("tilt") + turn,
         eid=part.name,
     )  # fmt: skip
 

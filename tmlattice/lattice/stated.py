@@ -1,0 +1,164 @@
+"""What a lattice file states of its own ring, and whether the ring that was read agrees.
+
+The linear optics here is the product of OCELOT's matrices: a check of a reader, without the maps
+and sweeps of the package.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.source import copied
+
+Array = NDArray[np.float64]
+
+TUNES = 1e-3
+"""Both codes multiply the same linear maps, from ten digits: a tune agrees to 1e-6. A magnet that
+is lost or misread changes it by more than this in all but the weakest."""
+COMPACTION = 1e-2
+CHROMATICITY = (0.5, 0.1)
+"""Absolute and relative; second-order maps of bends with gradients differ between codes by 7 %."""
+LENGTH = 1e-6
+"""Relative to the ring's length, beside 1 mm."""
+STEP = 1e-4
+"""Of the relative energy, for a difference."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What a header states; None where it does not.
+
+    Attributes:
+        length: m.
+        tunes: with or without integers, [2].
+        chromaticity: dQ / d pt, [2].
+        compaction: momentum compaction.
+    """
+
+    length: float | None = None
+    tunes: tuple[float, float] | None = None
+    chromaticity: tuple[float, float] | None = None
+    compaction: float | None = None
+
+    @classmethod
+    def of_header(cls, header: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> "Stated":
+        """Of a TWISS table. Its tunes are those of the design only where the orbit is straight."""
+
+        def number(key: str) -> float | None:
+            try:
+                value = float(header[key])
+            except (KeyError, TypeError, ValueError):
+                return None
+            return value if np.isfinite(value) else None
+
+        def pair(first: str, second: str) -> tuple[float, float] | None:
+            a, b = number(first), number(second)
+            return None if a is None or b is None or not (a or b) else (a, b)
+
+        bent = any(abs(float(row.get(k) or 0.0)) > 1e-6 for row in rows for k in ("X", "Y"))
+        if bent or number("XCOMAX") or number("YCOMAX") or number("DELTAP"):
+            return cls(number("LENGTH"))
+        return cls(number("LENGTH"), pair("Q1", "Q2"), pair("DQ1", "DQ2"), number("ALFA") or None)
+
+
+def contradiction(ring: Ring, stated: Stated) -> str | None:
+    """The first figure of the ring that differs from what its file states, with both numbers."""
+    if stated.length is not None and abs(ring.length - stated.length) > 1e-3 + LENGTH * ring.length:
+        return f"its elements are {ring.length:.6f} m long, the header states {stated.length:.6f} m"
+    if stated.tunes is None:
+        return None
+    chain = _maps(ring)
+    matrix = _turn(chain, np.zeros(6))
+    tunes = _tunes(matrix[:4, :4])
+    if tunes is None:
+        return f"its motion is unstable, the header states tunes of {_two(stated.tunes)}"
+    wanted = np.cos(2 * np.pi * np.array(stated.tunes))
+    found = np.cos(2 * np.pi * tunes)
+    if abs(found - wanted).max() > abs(found[::-1] - wanted).max():
+        found, tunes = found[::-1], tunes[::-1]
+    # by angles, so that a tune near 0 or 1/2 has the tolerance of any other
+    away = np.abs(np.arccos(np.clip(found, -1, 1)) - np.arccos(np.clip(wanted, -1, 1)))
+    if (away / (2 * np.pi)).max() > TUNES:
+        own = [q if np.sin(2 * np.pi * s) >= 0 else 1 - q
+               for q, s in zip(tunes, stated.tunes, strict=True)]  # fmt: skip
+        return f"its tunes are {_two(own)} (fractions), the header states {_two(stated.tunes)}"
+    dispersion = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5])
+    if stated.compaction is not None:
+        late = (matrix[4, :4] @ dispersion + matrix[4, 5]) / ring.length
+        compaction = ring.beta**2 * late + ring.gamma**-2
+        if abs(compaction - stated.compaction) > COMPACTION * abs(stated.compaction) + 1e-7:
+            return (
+                f"its momentum compaction is {compaction:.6g}, the header states "
+                f"{stated.compaction:.6g}"
+            )
+    if stated.chromaticity is None:
+        return None
+    shifted = []
+    for delta in (STEP, -STEP):
+        launch = np.concatenate([dispersion, [0.0, 1.0]]) * delta
+        off = _tunes(_turn(chain, launch)[:4, :4])
+        if off is None:
+            return None
+        shifted.append(off)
+    rising = np.where(np.sin(2 * np.pi * np.array(stated.tunes)) >= 0, 1.0, -1.0)
+    rank = np.argsort(np.argsort(tunes))  # modes are in the order of their tunes
+    by_plane = rising * ((shifted[0] - shifted[1]) / (2 * STEP))[rank]
+    allowed = CHROMATICITY[0] + CHROMATICITY[1] * np.abs(stated.chromaticity)
+    if (np.abs(by_plane - stated.chromaticity) > allowed).any():
+        return (
+            f"its chromaticities are {_two(by_plane)}, the header states "
+            f"{_two(stated.chromaticity)}"
+        )
+    return None
+
+
+def _two(values: Iterable[float]) -> str:
+    return " and ".join(f"{value:.6f}" for value in values)
+
+
+def _maps(ring: Ring) -> list[tuple[Array, Array, Array]]:
+    """B, R, T of every element's parts, in beam order."""
+    known: dict[int, list[tuple[Array, Array, Array]]] = {}
+    chain: list[tuple[Array, Array, Array]] = []
+    for element in ring.elements:
+        if id(element.source) not in known:
+            known[id(element.source)] = _parts(element.source, ring.map_energy)
+        chain += known[id(element.source)]
+    return chain
+
+
+def _parts(source: Any, energy: float) -> list[tuple[Array, Array, Array]]:
+    from tmlattice.lattice.ocelot import SecondTM
+
+    own = copied(source)
+    if own.supported_tms is None or SecondTM in own.supported_tms:
+        own.set_tm(SecondTM)
+    maps = zip(own.B(energy), own.R(energy), own.T(energy), strict=True)
+    return [(np.ravel(b), np.asarray(r, dtype=float), np.asarray(t)) for b, r, t in maps]
+
+
+def _turn(chain: list[tuple[Array, Array, Array]], launch: Array) -> Array:
+    """The matrix of a turn about the orbit from a launch, [6, 6]."""
+    matrix, state = np.eye(6), launch
+    bent = bool(np.any(launch))
+    for b, r, t in chain:
+        if not bent:
+            matrix = r @ matrix
+            continue
+        slope = t @ state
+        matrix = (r + 2 * slope) @ matrix
+        state = b + r @ state + slope @ state
+    return matrix
+
+
+def _tunes(matrix: Array) -> Array | None:
+    """Fractional tunes of the two modes, between 0 and 1/2; None: unstable."""
+    values = np.linalg.eigvals(matrix)
+    if np.abs(np.abs(values) - 1).max() > 1e-6:
+        return None
+    angles = np.sort(np.abs(np.angle(values)))[::2]
+    return np.asarray(angles / (2 * np.pi))
