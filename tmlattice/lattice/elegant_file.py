@@ -391,7 +391,7 @@ class _Reader:
         if line:
             known[name] = self._items(line[1].strip(), 0)  # type: ignore[assignment]
             return
-        head, *given = _split(rest)
+        head, *given = _split(rest) or [""]
         parent = self.elements.get(_bare(head))
         cls = parent.cls if parent else _class_of(head)
         values: dict[str, float | str] = dict(parent.values) if parent else {}
@@ -903,6 +903,8 @@ def _inner(items: Items) -> set[str]:
 def _class_of(word: str) -> str:
     """The class that a word names: it may be shorter or longer than the class's name."""
     word = _bare(word).upper()
+    if not word:
+        raise LatticeError("no element class is stated")
     if word in ALL_CLASSES:
         return word
     found = [cls for cls in ALL_CLASSES if cls.startswith(word) or word.startswith(cls)]

@@ -87,6 +87,8 @@ LUMPED = 2e-5
 1e-5 of a tune at a beta of 10 m."""
 SKEW_SHARE = 0.1
 """Weight of skew gradients there: they act on the tunes in second order."""
+ROUNDING = 1e-9
+"""Relative; a dipole field that differs by less from the design's is the design's."""
 EDGES = {-1: "suppressed", 0: "linear", 1: "full", 2: "dipole-only"}
 
 
@@ -374,15 +376,15 @@ class _Reader:
             gap = placed[k] - at
             if gap < -tolerance:
                 raise LatticeError(
-                    f"'{plain(str(items[k][0]), 60)}' begins at {placed[k]:.6f} m, before the end "
-                    f"of the element before it at {at:.6f} m"
+                    f"'{plain(str(items[k][0]), 60)}' begins at {placed[k]:.9g} m, before the end "
+                    f"of the element before it at {at:.9g} m"
                 )
             if gap > tolerance:
                 laid.append(gap)
             laid.append(items[k][0])
             at = placed[k] + ways[k]
         if total is not None and total < at - tolerance:
-            raise LatticeError(f"the elements end at {at:.6f} m, after the line's {total:.6f} m")
+            raise LatticeError(f"the elements end at {at:.9g} m, after the line's {total:.9g} m")
         if total is not None and total > at + tolerance:
             laid.append(total - at)
         return laid
@@ -837,7 +839,7 @@ class _Bend:
         """The bend between its faces, or a slice of it."""
         knl, ksl = self.reader._strengths(self.fields, self.length, self.dipole)
         knl[0] -= self.angle
-        if abs(knl[0]) < 1e-12 * abs(self.angle):
+        if abs(knl[0]) < ROUNDING * abs(self.angle):
             knl[0] = 0.0
         self._check_body(knl, ksl)
         values = {"l": weight * self.length, "angle": weight * self.angle, "knl": weight * knl,
@@ -860,7 +862,7 @@ class _Bend:
         (down, gap, first), (down2, gap2, last) = (
             self.fringe(side) if self.active(side) else (0.0, 0.0, 0.0) for side in (0, 1)
         )
-        detuned = abs(self._field() - self.curvature) > 1e-12 * abs(self.curvature)
+        detuned = abs(self._field() - self.curvature) > ROUNDING * abs(self.curvature)
         focusing = any(faces) or first * gap or last * gap2
         if down or down2 or (detuned and focusing):
             if not self.curvature:
