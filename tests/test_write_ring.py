@@ -1,6 +1,7 @@
 """Rings in the formats of other codes: what is read back is the ring that was written."""
 
 import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from tmlattice.effects import apply
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import write_ring
 from tmlattice.lattice.ring import PROTON_GEV
+from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import write_measurement
 from tmlattice.optics import ring_tunes
 
@@ -64,6 +66,45 @@ def test_at_itself_finds_the_tunes_in_the_file(uneven, tmp_path):
     write_ring(uneven, tmp_path / "ring.at.json")
     lattice = at.load_lattice(str(tmp_path / "ring.at.json"))
     assert at.get_tune(lattice) == pytest.approx(ring_tunes(uneven), abs=5e-5)
+
+
+@pytest.fixture(scope="module")
+def thin(tmp_path_factory):
+    """A ring of thin bends, upright and in the vertical plane, with gradients on them."""
+    path = tmp_path_factory.mktemp("thin") / "thin.madx"
+    cells = "".join(
+        f"qf, at={5 * k + 0.5}; bb, at={5 * k + 1.5}; mq, at={5 * k + 2}; qd, at={5 * k + 3};"
+        f" ch, at={5 * k + 3.5}; bb, at={5 * k + 4};\n"
+        for k in range(8)
+    )
+    path.write_text(
+        "beam, particle=proton, energy=3; mq: monitor; ch: hkicker; vv: multipole, ksl={1e-3};\n"
+        "qf: quadrupole, l=0.4, k1=1.1; qd: quadrupole, l=0.4, k1=-1.15;\n"
+        "bb: multipole, knl={twopi/16, 0.01}, lrad=1;\n"
+        f"ring: sequence, l=40, refer=centre;\n{cells}vv, at=39.5;\nendsequence;\n"
+    )
+    with pytest.warns(UserWarning, match="products of curvature and gradient of bb"):
+        return load_ring(path)
+
+
+@pytest.mark.parametrize("file", FORMATS)
+def test_thin_bends_are_written(thin, file, tmp_path):
+    write_ring(thin, tmp_path / file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        back = load_ring(tmp_path / file)
+    assert ring_tunes(back) == pytest.approx(ring_tunes(thin), abs=1e-9)
+    assert back.length == pytest.approx(thin.length)
+
+
+def test_at_engine_and_maps_bend_a_thin_ring_alike(thin):
+    """The response to a corrector, whose path length shifts the energy by a thin bend's R51."""
+    made = [
+        simulate_response(thin, correctors=["ch::0"], progress=False, noise=0.0, engine=engine)
+        for engine in ("at", "ocelot")
+    ]
+    first, second = (response.measured.response for response in made)
+    np.testing.assert_allclose(first, second, rtol=0, atol=1e-6 + 2e-3 * abs(first).max())
 
 
 @pytest.mark.parametrize("file", FOREIGN)

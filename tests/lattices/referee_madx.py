@@ -41,6 +41,15 @@ def quadrupoles(text):
     return ELEMENTS.replace("qf: quadrupole, l=0.4, k1=1.1;", f"qf: quadrupole, l=0.4, {text};")
 
 
+def direct(bend, after):
+    """A ring of one sequence; MAD-X keeps lengths of elements in nested ones."""
+    cells = "".join(
+        f"qf, at={5.2 * k + 0.3}; bb, at={5.2 * k + 1.5}; qd, at={5.2 * k + 2.9};"
+        f" bb, at={5.2 * k + 4.2};\n" for k in range(8)
+    )  # fmt: skip
+    return BEAM + bends(bend) + f"ring: sequence, l=41.6;\n{cells}endsequence;\n" + after
+
+
 DECKS = {
     "plain": deck(),
     # the beam
@@ -74,6 +83,20 @@ DECKS = {
                         elements=bends("bb: rbend, l=1, angle=twopi/16;")),
     "rbend chord flag": deck(beam="option, -rbarc;\n" + BEAM,
                              elements=bends("bb: rbend, l=1, angle=twopi/16;")),
+    "rbend k0": deck(elements=bends(
+        "bb: rbend, l=1, angle=twopi/16, k0:=twopi/16*sinc(twopi/32)*1.0002;")),
+    "rbend angle later": deck(elements=bends("bb: rbend, l=1; bb, angle=twopi/16;")),
+    "rbend angle deferred": deck(elements=bends("bb: rbend, l=1, angle:=ang; ang=twopi/16;")),
+    "rbend angle changed": deck(elements=bends("bb: rbend, l=1, angle=twopi/8;"),
+                                after="bb, angle=twopi/16;\n"),
+    "rbend of a class": deck(elements=bends("b0: rbend, l=0.9, angle=twopi/16; bb: b0, l=1;")),
+    "quadrupole l later": deck(before="q3: quadrupole, l=0.1, k1=0.3; q3, l=0.2;\n",
+                               extra="q3, at=4.95;"),
+    "rbend of the sequence, angle later": direct("bb: rbend, l=1;", "bb, angle=twopi/16;\n"),
+    "rbend of the sequence, l later": direct("bb: rbend, l=1, angle=twopi/16;", "bb, l=0.9;\n"),
+    "rbend of a line, angle later": BEAM + bends("bb: rbend, l=1;") +
+        "d1: drift, l=0.5; d2: drift, l=0.9;\nring: line=(8*(qf,d1,bb,d2,qd,d2,bb,d1));\n"
+        "bb, angle=twopi/16;\nuse, period=ring;\n",
     "sbend edges": deck(elements=bends(
         "bb: sbend, l=1, angle=twopi/16, e1=0.1, e2=0.2, hgap=0.03, fint=0.6, fintx=0.3;")),
     "sbend one fint": deck(elements=bends(

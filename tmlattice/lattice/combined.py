@@ -102,6 +102,13 @@ def body_map(
     return rows[:, 0], rows[:, 1:7], T
 
 
+def bend_matrix(source: Any, energy: float) -> Array:
+    """What a thin one does by bending the design orbit alone, [6, 6]; energy in GeV."""
+    design = dict.fromkeys(FIELDS, 0.0) | {k: float(getattr(source, k)) for k in DESIGN}
+    turn = rot_mtx(source.tilt)
+    return np.asarray(rot_mtx(-source.tilt) @ body_map(design, None, energy)[1] @ turn)
+
+
 class CombinedAtom(_Magnet):  # type: ignore[misc]
     """What OCELOT asks of an element's physics."""
 

@@ -19,8 +19,8 @@ ENERGIES = ("energy", "pc", "gamma", "beta", "brho")
 class Beam:
     """The beam of a sequence, or the default one, as BEAM statements build it up."""
 
-    def __init__(self) -> None:
-        self.given: dict[str, float | str] = {}
+    def __init__(self, given: Mapping[str, float | str] | None = None) -> None:
+        self.given: dict[str, float | str] = dict(given or {})
 
     def update(self, given: Mapping[str, float | str]) -> None:
         """What another BEAM statement says: a new energy replaces an earlier one."""

@@ -89,12 +89,17 @@ WORDS = frozenset({
 
 @dataclass
 class _Definition:
-    """An element: its base class and its attributes, those of its parents included."""
+    """An element: its base class and its attributes, those of its parents included.
+
+    `length` is along the arc and of the moment of the definition: in a sequence that stands in
+    another one MAD-X keeps it, whatever happens to L and ANGLE later.
+    """
 
     name: str
     keyword: str
     values: dict[str, Any]
     where: str
+    length: float = 0.0
 
 
 @dataclass
@@ -170,7 +175,7 @@ def read_madx(
             )
         for what, names in reader.passed_over.items():
             reader.warnings.append(
-                f"{what} {first_of(names, 3)} ({len(names)}) is left out, as by MAD-X's TWISS"
+                f"{what} {first_of(names, 3)} ({len(names)}) is left out, as by MAD-X"
             )
         energy = beam.energy if energy is None else energy
         if reader.warnings:
@@ -206,6 +211,7 @@ class _Reader:
         self._open: _Sequence | None = None
         self._edited: _Sequence | None = None
         self._selected: list[dict[str, str]] = []
+        self._made: dict[tuple[str, float], Part] = {}
         self._files: list[Path] = []
         self._count = 0
         self._work = 0
@@ -300,6 +306,7 @@ class _Reader:
 
     def _carry_out(self, statement: Statement) -> None:
         text = statement.text
+        text = re.sub(r"^else\s+if\b", "elseif", text, flags=re.IGNORECASE)
         block = re.match(r"(if|elseif|while)\s*\(|(else)\b", text, re.IGNORECASE)
         if block:
             return self._block(text, (block[1] or block[2]).lower())
@@ -311,7 +318,7 @@ class _Reader:
             self.macros[match[1].lower()] = (names, match[3])
             return None
         match = re.fullmatch(
-            r"(?:(?:shared|const|real|int)\s+)*([\w.$]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
+            r"(?:(?:real|int)\s+)?(?:const\s+)?([\w.$]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
         )
         if match:
             return self._assign(match[1].lower(), Given(match[3], match[2] == ":="))
@@ -380,6 +387,7 @@ class _Reader:
         definition = _Definition(name, keyword, own, self._where(statement))
         self.elements[name] = definition
         self._update(definition, given)
+        definition.length = self._element_length(definition)
         self._place(name, given)
         return None
 
@@ -521,7 +529,7 @@ class _Reader:
         return self.beams.get(sequence) or self.beams[""]
 
     def _update_beam(self, owner: str, given: dict[str, Given]) -> None:
-        beam = self.beams.setdefault(owner, Beam())
+        beam = self.beams.setdefault(owner, Beam(self.beams[""].given))
         own: dict[str, float | str] = {}
         for name, value in given.items():
             if name == "particle":
@@ -567,12 +575,13 @@ class _Reader:
         origin = unquoted(given["from"].text).lower() if "from" in given else ""
         self._open.nodes.append(_Node(name, self._evaluate(given["at"]), origin))
 
-    def _length(self, name: str) -> float:
-        """Of an element (along the arc), a sequence or a line, m."""
+    def _length(self, name: str, nested: bool = False) -> float:
+        """Of an element (along the arc) or a sequence, m."""
         if name in self.sequences:
             return self._valued(self.sequences[name].length, name)
         if name in self.elements:
-            return self._element_length(self.elements[name])
+            own = self.elements[name]
+            return own.length if nested else self._element_length(own)
         raise LatticeError(f"no element '{plain(name, 60)}' is defined")
 
     def _element_length(self, definition: _Definition) -> float:
@@ -580,11 +589,13 @@ class _Reader:
         if definition.keyword == "multipole":
             return 0.0
         if definition.keyword == "rbend" and self.rbarc:
+            unknown = set(self.undefined)
             half = float(self._value(definition, "angle")) / 2
+            self.undefined = unknown  # a value that comes later counts for the field
             return length * half / math.sin(half) if half else length
         return length
 
-    def slots(self, sequence: _Sequence) -> list[_Slot]:
+    def slots(self, sequence: _Sequence, nested: bool = False) -> list[_Slot]:
         """Its elements and sequences with the positions of their centres, in their order."""
         reference = {"entry": 0.5, "exit": -0.5}.get(sequence.refer, 0.0)
         nodes: dict[str, list[_Node]] = {}
@@ -599,7 +610,7 @@ class _Reader:
                 raise LatticeError(f"FROM of '{plain(node.name, 60)}' leads back to itself")
             at = self._valued(node.at, node.name)
             if not node.centred:
-                at += self._offset(node.name, reference)
+                at += self._offset(node.name, reference, nested)
             if node.origin:
                 name, _, k = node.origin.partition("[")
                 if name not in nodes:
@@ -612,24 +623,24 @@ class _Reader:
             return at
 
         self.work(len(sequence.nodes))
-        own = [_Slot(n.name, centre(n), self._length(n.name)) for n in sequence.nodes]
+        own = [_Slot(n.name, centre(n), self._length(n.name, nested)) for n in sequence.nodes]
         return sorted(own, key=lambda slot: slot.centre)
 
-    def _offset(self, name: str, reference: float) -> float:
+    def _offset(self, name: str, reference: float, nested: bool = False) -> float:
         """From the reference point of an element or a sequence to its centre, m."""
         sub = self.sequences.get(name)
         if sub is not None and sub.refpos:
-            found = [slot for slot in self.slots(sub) if slot.name == sub.refpos]
+            found = [slot for slot in self.slots(sub, True) if slot.name == sub.refpos]
             if not found:
                 raise LatticeError(f"REFPOS of '{name}' names '{sub.refpos}', which it has not")
             return self._length(name) / 2 - found[0].centre
-        return reference * self._length(name)
+        return reference * self._length(name, nested)
 
     def _flat(self, sequence: _Sequence, start: float = 0.0, depth: int = 0) -> list[_Slot]:
         if depth > 50:
             raise LatticeError(f"the sequence '{sequence.name}' contains itself")
         flat: list[_Slot] = []
-        for slot in self.slots(sequence):
+        for slot in self.slots(sequence, depth > 0):
             self.work()
             if slot.name in self.sequences:
                 begin = start + slot.centre - slot.length / 2
@@ -702,9 +713,10 @@ class _Reader:
             if parent not in self.elements and parent not in KEYWORDS:
                 raise LatticeError(f"no element class '{plain(parent, 60)}' is known")
             old = self.elements.get(parent)
-            self.elements.setdefault(name, _Definition(
-                name, old.keyword if old else parent, dict(old.values) if old else {}, "INSTALL"
-            ))  # fmt: skip
+            keyword, own, known = parent, dict[str, Any](), 0.0
+            if old is not None:
+                keyword, own, known = old.keyword, dict(old.values), old.length
+            self.elements.setdefault(name, _Definition(name, keyword, own, "INSTALL", known))
         reference = {"entry": 0.5, "exit": -0.5}.get(self._edited.refer, 0.0)
         length = self._length(name)
         at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
@@ -850,26 +862,23 @@ class _Reader:
 
     def parts(self, use: str) -> list[Part]:
         """The elements of the ring in beam order, drifts included."""
-        made: dict[str, Part] = {}
         beam = self.beam(use)
         if use in self.sequences:
-            return self._laid_out(self.sequences[use], beam, made)
+            sequence = self.sequences[use]
+            return self._laid_out(sequence, beam, self._length(use))
         items = self.lines[use].items
         self.work(self._line_length(items, {}))
         parts: list[Part] = []
         names = self._line_names(items)
-        length = sum(self._length(name) for name in names)
+        circumference = sum(self._length(name) for name in names)
         for name in names:
             if name in self.sequences:
-                parts += self._laid_out(self.sequences[name], beam, made, length)
+                parts += self._laid_out(self.sequences[name], beam, circumference)
             else:
-                parts.append(self._part(name, beam, made, length))
+                parts.append(self._part(name, self._length(name), beam, circumference))
         return parts
 
-    def _laid_out(
-        self, sequence: _Sequence, beam: Beam, made: dict[str, Part], length: float | None = None
-    ) -> list[Part]:
-        total = self._length(sequence.name)
+    def _laid_out(self, sequence: _Sequence, beam: Beam, circumference: float) -> list[Part]:
         parts: list[Part] = []
         at, last = 0.0, "the start"
         drifts: dict[float, Part] = {}
@@ -888,42 +897,41 @@ class _Reader:
         for slot in self._flat(sequence):
             start = slot.centre - slot.length / 2
             drift(start, f"'{plain(slot.name, 60)}'")
-            parts.append(self._part(slot.name, beam, made, length or total))
+            parts.append(self._part(slot.name, slot.length, beam, circumference))
             at, last = start + slot.length, f"'{plain(slot.name, 60)}'"
-        drift(total, "its end (L)")
+        drift(self._length(sequence.name), "its end (L)")
         return parts
 
-    def _part(self, name: str, beam: Beam, made: dict[str, Part], length: float) -> Part:
-        if name not in made:
-            if name not in self.elements:
-                raise LatticeError(f"no element '{plain(name, 60)}' is defined")
-            made[name] = self._new_part(self.elements[name], beam, length)
-        return made[name]
+    def _part(self, name: str, length: float, beam: Beam, circumference: float) -> Part:
+        if name not in self.elements:
+            raise LatticeError(f"no element '{plain(name, 60)}' is defined")
+        if (name, length) not in self._made:
+            definition = self.elements[name]
+            self._made[name, length] = self._new_part(definition, length, beam, circumference)
+            if abs(length - self._element_length(definition)) > 1e-12:
+                self.passed_over.setdefault("the later L or ANGLE of", []).append(name)
+        return self._made[name, length]
 
-    def _new_part(self, definition: _Definition, beam: Beam, ring_length: float) -> Part:
+    def _new_part(
+        self, definition: _Definition, length: float, beam: Beam, circumference: float
+    ) -> Part:
         """An element's attributes as numbers; rectangular bends as sector bends."""
         keyword = definition.keyword
-        own = {
-            k: self._value(definition, k)
-            for k in definition.values
-            if (k not in WORDS and k not in ("kick",)) or k == "kick"
-        }
+        own = {k: self._value(definition, k) for k in definition.values if k not in WORDS}
+        own["l"] = length
         match keyword:
             case "rbend":
                 keyword = "sbend"
-                own["l"] = self._element_length(definition)
                 half = float(own.get("angle", 0.0)) / 2
                 own |= {e: float(own.get(e, 0.0)) + half for e in ("e1", "e2")}
             case "rfcavity" if not own.get("freq") and own.get("harmon"):
                 gamma = beam.energy / beam.mass
                 speed = CONSTANTS["clight"] * math.sqrt(1 - 1 / gamma**2)
-                own["freq"] = 1e-6 * float(own["harmon"]) * speed / ring_length
+                own["freq"] = 1e-6 * float(own["harmon"]) * speed / circumference
             case "matrix":
                 own = _with_matrix(own)
-            case "multipole":
-                own["l"] = 0.0
-                if not self.thin_focusing:
-                    own["lrad"] = 0.0
+            case "multipole" if not self.thin_focusing:
+                own["lrad"] = 0.0
         for attribute in _NOT_IN_TWISS.get(keyword, ()):
             if np.any(own.pop(attribute, 0.0)):
                 self.passed_over.setdefault(f"{attribute.upper()} of {keyword.upper()}", []).append(

@@ -231,7 +231,15 @@ def _errors(part: Part) -> dict[str, Any]:
         x, y = x * cos - y * sin, x * sin + y * cos
         amounts["kick_x"], amounts["kick_y"] = x, y
         curvature = angle / length if length else 0.0  # the way through the field is 1 + h x
-        amounts["middle"] = tuple(curvature * k * c for k in (x, y) for c in (cos, sin))
+        # and its oblique faces focus by the field that is there
+        edge = (excess + knl[0]) / length * sum(math.tan(part.number(e)) for e in ("e1", "e2"))
+        along, across, mixed = cos**2 - sin**2, sin**2 - cos**2, 2 * cos * sin
+        amounts["middle"] = tuple(
+            curvature * k * c + edge * face
+            for k, c, face in zip(
+                (x, x, y, y), (cos, sin, cos, sin), (along, mixed, mixed, across), strict=True
+            )
+        )
         gradient = part.number("k1") * length + knl[1]
         amounts["k1sl"] = part.number("k1s") * length + ksl[1] - gradient * math.sin(2 * roll)
         if amounts["k1sl"] and part.number("tilt"):

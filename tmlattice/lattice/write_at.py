@@ -104,6 +104,8 @@ def _element(element: Element, ring: Ring, left_out: Counter[str]) -> Any:
             other = x if vertical else y
             mad = {} if other else {"MADType": "VKICKER" if vertical else "HKICKER"}
             return at.Corrector(name, length, [x, y], **mad)
+        case "CombinedMultipole" if element.bending:
+            left_out["thin bends are written as first-order matrices"] += 1
         case "CombinedMultipole":
             return _combined(element, turn)
         case "Multipole" if not length:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import first_of
-from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.ring import PROTON_GEV, Element, Ring
 from tmlattice.lattice.write_at import first_order, kicks, second_order
 
 KEYWORDS = (
@@ -58,6 +58,8 @@ def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
         some = first_of(sorted(several), 4)
         told.append(f"members of {some} differ, and have names of their own: NAME..k for NAME::k")
     particle = "ELECTRON" if ring.radiates else "PROTON"
+    if not ring.radiates and abs(ring.mass / PROTON_GEV - 1) > 1e-6:
+        particle = f"ION, MASS={_number(ring.mass)}, CHARGE=1"
     content = [
         f"! {Path(ring.name).name}, by tmlattice",
         f"BEAM, PARTICLE={particle}, ENERGY={_number(ring.energy)};",
@@ -139,8 +141,16 @@ def _combined(element: Element, left_out: Counter[str]) -> str:
     source, l = element.source, element.length  # noqa: E741
     normal, skew = ([float(getattr(source, f"k{n}{what}")) for n in range(3)] for what in ("", "s"))
     if not l:
+        kick_x, kick_y = -normal[0], skew[0]
+        if (kick_x or kick_y) and not any((element.angle, *normal[1:], *skew[1:])):
+            return _with("KICKER", hkick=kick_x, vkick=kick_y, tilt=element.tilt)
+        if kick_x or kick_y:  # MAD-X bends its design orbit by KNL[0] and KSL[0]
+            left_out["of thin magnets with several fields the dipole field is left out"] += 1
+        normal[0], skew[0] = element.angle, 0.0
         knl, ksl = (", ".join(map(_number, fields)) for fields in (normal, skew))
-        return _with("MULTIPOLE", tilt=element.tilt) + f", KNL={{{knl}}}, KSL={{{ksl}}}"
+        lrad = float(source.lrad)
+        text = _with("MULTIPOLE", lrad=lrad, tilt=element.tilt)
+        return f"{text}, KNL={{{knl}}}, KSL={{{ksl}}}"
     order = 2 if element.kind == "sextupole" else 1
     rest = [k for n in range(3) if n != order for k in (normal[n], skew[n])]
     if any(rest):

@@ -13,6 +13,7 @@ from scipy.linalg import sqrtm
 from tmlattice.effects.build import Build, Where
 from tmlattice.effects.radiation import expected_loss as loss_of
 from tmlattice.errors import LatticeError
+from tmlattice.lattice.combined import bend_matrix
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -281,7 +282,12 @@ class Builder:
     def _multipole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         if not hasattr(element.source, "kn"):
             body = self._straight(element, [0.0, element.k1, element.k2], wrong, False)
-            return self._with_middle(element, wrong, body)
+            made = self._with_middle(element, wrong, body)
+            if element.bending:
+                # AT's (delta, ct) are OCELOT's (p, tau) of a beam as fast as light
+                bend = bend_matrix(element.source, np.inf)[np.ix_(SWAPPED, SWAPPED)]
+                made.insert(0, at.M66(element.name, np.asfortranarray(bend)))
+            return made
         strengths = np.asarray(element.source.kn, dtype=float)
         if strengths[0]:
             raise LatticeError(f"AT cannot build '{element.name}', a thin multipole that bends")
