@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
-from tmlattice.lattice.parts import Part, face, ring_of_parts
+from tmlattice.lattice.parts import Part, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 MOST_FILES = 1000
@@ -699,19 +699,11 @@ class _Reader:
         }  # fmt: skip
         if not angle:
             return Part(name, "quadrupole", body, element.where)
-        gap, (first, second) = number("HGAP"), [one[:3] for one in faces]
-        if error and length:  # the faces are in the field that there is
-            field = (angle + error) / length
-            made = [(face(curvature, field, e, gap, f), h) for e, h, f in (first, second)]
-            gap = math.copysign(1.0, made[1][0][1])  # MAD-X takes a negative FINTX for none
-            first, second = ((e, h, gap * f) for (e, f), h in made)
-        sign = math.copysign(1, number("ETILT_SIGN"))
-        edges = {"e1": first[0], "e2": second[0], "h1": first[1], "h2": second[1], "hgap": gap,
-                 "fint": first[2], "fintx": second[2]}  # fmt: skip
-        return Part(
-            name, "sbend", {**body, **edges, "angle": angle, "dpsi": sign * number("ETILT")},
-            element.where,
-        )  # fmt: skip
+        (e1, h1, first, _), (e2, h2, second, _) = faces
+        edges = {"e1": e1, "e2": e2, "h1": h1, "h2": h2, "fint": first, "fintx": second}
+        roll = math.copysign(number("ETILT"), number("ETILT") * number("ETILT_SIGN"))
+        body |= {**edges, "angle": angle, "hgap": number("HGAP"), "dpsi": roll}
+        return Part(name, "sbend", body, element.where)
 
     def _as_corrector(self, element: _Element, name: str, *_: Any) -> Part:
         values = {"l": element.number("L"), "tilt": element.number("TILT")}

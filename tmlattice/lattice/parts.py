@@ -397,30 +397,27 @@ def _bend(part: Part, report: _Report) -> Any:
     )
 
 
-def face(
-    curvature: float, field: float, e: float, gap: float, integral: float, down: float = 0.0
-) -> tuple[float, float]:
-    """Angle (rad) and half gap times integral (m) of the face of a bend that, at the design's
-    curvature, focuses like one in another field.
+def fringe_of(curvature: float, e: float, gap: float, integral: float, down: float) -> float:
+    """Half gap times fringe integral (m) of a face that focuses as one with a feed-down angle.
 
-    Args:
-        curvature: of the design orbit, not 0, 1/m.
-        field: the dipole field behind the face, 1/m.
-        e: its angle, rad.
-        gap, integral: half gap (m) and fringe integral.
-        down: added to the angle in the vertical plane, rad.
+    Arguments as of `edge_focusing`, in the design's field.
     """
-    x, y = edge_focusing(field, e, gap, integral, down)
-    angle = math.atan(x / curvature)
-    fringe = angle + math.atan(y / curvature)
-    scale = 2 * curvature * (1 + math.sin(angle) ** 2) / math.cos(angle)
-    return angle, fringe / scale
+    y = edge_focusing(curvature, e, gap, integral, down)[1]
+    scale = 2 * curvature * (1 + math.sin(e) ** 2) / math.cos(e)
+    return (e + math.atan(y / curvature)) / scale
 
 
 def edge_focusing(
     field: float, e: float, gap: float, integral: float, down: float = 0.0
 ) -> tuple[float, float]:
-    """R21 and R43 of the face of a bend, 1/m, as of DIPEDGE; arguments as of `face`."""
+    """R21 and R43 of the face of a bend, 1/m, as of DIPEDGE.
+
+    Args:
+        field: the dipole field behind the face, 1/m.
+        e: its angle, rad.
+        gap, integral: half gap (m) and fringe integral.
+        down: added to the angle in the vertical plane, rad.
+    """
     y = e + down
     fringe = 2 * gap * integral * field * (1 + math.sin(y) ** 2) / math.cos(y)
     return field * math.tan(e), -field * math.tan(y - fringe)

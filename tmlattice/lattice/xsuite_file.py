@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.lattice.expressions import Arithmetic
-from tmlattice.lattice.parts import Part, edge_focusing, face, ring_of_parts
+from tmlattice.lattice.parts import Part, edge_focusing, fringe_of, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 Array = NDArray[np.float64]
@@ -862,20 +862,13 @@ class _Bend:
         (down, gap, first), (down2, gap2, last) = (
             self.fringe(side) if self.active(side) else (0.0, 0.0, 0.0) for side in (0, 1)
         )
-        detuned = abs(self._field() - self.curvature) > ROUNDING * abs(self.curvature)
-        focusing = any(faces) or first * gap or last * gap2
-        if down or down2 or (detuned and focusing):
-            if not self.curvature:
-                entry, exit_ = self.edges()
-                return [*entry(f"{name}_entry", where), body, *exit_(f"{name}_exit", where)]
-            field = self._field()
-            (first_angle, first), (last_angle, last) = (
-                face(self.curvature, field, *edge) if self.active(side) else (0.0, 0.0)
-                for side, edge in enumerate(
-                    [(faces[0], gap, first, down), (faces[1], gap2, last, down2)]
-                )
-            )
-            faces = [first_angle, last_angle]
+        focusing = any(faces) or first * gap or last * gap2 or down or down2
+        if focusing and not self.curvature and self.dipole:
+            entry, exit_ = self.edges()
+            return [*entry(f"{name}_entry", where), body, *exit_(f"{name}_exit", where)]
+        if self.curvature and (down or down2):
+            first = fringe_of(self.curvature, faces[0], gap, first, down)
+            last = fringe_of(self.curvature, faces[1], gap2, last, down2)
             gap = gap2 = math.copysign(1.0, last)  # MAD-X takes a negative FINTX for none
             first, last = first * gap, last * gap
         if gap2 != gap:
