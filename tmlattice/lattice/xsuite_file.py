@@ -214,8 +214,10 @@ class _Fields:
         """A field that is a number."""
         self.used.add(key)
         value = self.values.get(key)
+        if isinstance(value, float) or value is None:
+            return default if value is None else value
         try:
-            given = np.ravel(np.asarray(default if value is None else value, dtype=float))
+            given = np.ravel(np.asarray(value, dtype=float))
         except (TypeError, ValueError):
             raise LatticeError(
                 f"{key} of {self.named} is '{plain(str(value), 40)}' and no number"
