@@ -33,7 +33,6 @@ from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.at_child import Tracker, check_methods
 from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
-from tmlattice.lattice.madx_elements import ACTS
 from tmlattice.lattice.mat_file import check_mat
 from tmlattice.lattice.parts import assembled
 from tmlattice.lattice.places import Place, corrector, corrector_pair
@@ -42,6 +41,12 @@ from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+
+ACTS = frozenset({
+    "BEAMBEAM", "CHANGEREF", "NLLENS", "SROTATION", "TRANSLATION", "XROTATION", "YROTATION",
+    "CRABCAVITY", "ELSEPARATOR", "RFMULTIPOLE", "SOLENOID",
+})  # fmt: skip
+"""MAD-X's classes that AT's reader of MAD-X makes a drift of, although they act."""
 
 _VERTICAL = re.compile(r"^(f?v|c[hy]?v|pcv|pkv|c_?y|ky)|vcor|vkick|vcm|_v(_|\d|$)", re.IGNORECASE)
 _HORIZONTAL = re.compile(r"^(f?h|c[vx]?h|pch|pkh|c_?x|kx)|hcor|hkick|hcm|_h(_|\d|$)", re.IGNORECASE)

@@ -10,7 +10,7 @@ Nothing of a file is run: RPN is worked out by `_Rpn`, which knows numbers, name
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 MOST_FILES = 1000
 MOST_BYTES = 200_000_000
-MOST_WORK = 4_000_000
+MOST_WORK = 2_000_000
 """Words of RPN, and elements of lines."""
 MOST_ELEMENTS = 1_000_000
 LONGEST_STATEMENT = 5000
@@ -67,36 +67,36 @@ _INERT: dict[str, dict[str, float]] = {
 }  # fmt: skip
 """What changes the beam unless these attributes have these values."""
 
-_MOVED = {"DX", "DY", "DZ", "TILT"}
-_STEERED = {"HKICK", "VKICK", "HCALIBRATION", "VCALIBRATION"}
-_BEND = {
-    "L", "ANGLE", "K1", "K2", "E1", "E2", "TILT", "H1", "H2", "HGAP", "FINT", "FINT1", "FINT2",
-    "DX", "DY", "DZ", "FSE", "FSE_DIPOLE", "FSE_QUADRUPOLE", "ETILT", "ETILT_SIGN",
-    "EDGE1_EFFECTS", "EDGE2_EFFECTS", "USE_BN", "B1", "B2", "XKICK", "YKICK", "YAW",
+_MOVED = ("DX", "DY", "DZ", "TILT")
+_STEERED = ("HKICK", "VKICK", "HCALIBRATION", "VCALIBRATION")
+_BENDS = ("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND")
+_OWN: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("QUAD", "KQUAD"): ("L", "K1", "FSE", "BORE", "B", *_MOVED, *_STEERED),
+    ("QUFRINGE",): ("L", "K1", "FSE", "DIRECTION", *_MOVED),
+    ("DQCOR",): ("L", "K1", "J1", "FSE", *_MOVED, *_STEERED),
+    ("SEXT", "KSEXT"): ("L", "K1", "K2", "J1", "FSE", "BORE", "B", *_MOVED, *_STEERED),
+    ("KQUSE",): ("L", "K1", "K2", "FSE1", "FSE2", *_MOVED),
+    ("OCTU", "KOCT"): ("L", "K3", "FSE", "BORE", "B", *_MOVED),
+    ("MULT",): ("L", "KNL", "ORDER", "FACTOR", "BORE", "BTIPL", *_MOVED),
+    _BENDS: (
+        "L", "ANGLE", "K1", "K2", "E1", "E2", "H1", "H2", "HGAP", "FINT", "FINT1", "FINT2", "FSE",
+        "FSE_DIPOLE", "FSE_QUADRUPOLE", "ETILT", "ETILT_SIGN", "EDGE1_EFFECTS", "EDGE2_EFFECTS",
+        "USE_BN", "B1", "B2", "XKICK", "YKICK", "YAW", *_MOVED,
+    ),
+    ("HKICK", "VKICK", "EHKICK", "EVKICK"): ("L", "KICK", "TILT", "CALIBRATION"),
+    ("KICKER", "EKICKER"): ("L", "TILT", *_STEERED),
+    ("MONI", "HMON", "VMON"): ("L",),
+    ("RFCA", "RFCW", "MODRF", "RAMPRF"): ("L", "VOLT", "FREQ", "CHANGE_P0"),
+    ("SOLE",): ("L", "KS", "B", "DX", "DY", "DZ"),
+    ("EMATRIX",): ("L", "TILT", "DX", "DY", "DZ", "DELTAP", *(f"C{i}" for i in range(1, 7)),
+                   *(f"R{i}{j}" for i in range(1, 7) for j in range(1, 7))),
+    ("ROTATE",): ("TILT", "EXCLUDE_OPTICS"),
+    ("WIGGLER",): ("L", "RADIUS", "K", "B", "POLES", *_MOVED),
+    (*_DRIFTS, *_SILENT, *_COLLECTIVE): ("L",),
 }  # fmt: skip
-_QUAD = {"L", "K1", "FSE", "BORE", "B", *_MOVED, *_STEERED}
-_SEXT = {"L", "K1", "K2", "J1", "FSE", "BORE", "B", *_MOVED, *_STEERED}
-MODELLED: dict[str, set[str]] = {
-    **dict.fromkeys(("QUAD", "KQUAD"), _QUAD),
-    "QUFRINGE": {"L", "K1", "FSE", "DIRECTION", *_MOVED},
-    "DQCOR": {"L", "K1", "J1", *_MOVED, *_STEERED, "FSE"},
-    **dict.fromkeys(("SEXT", "KSEXT"), _SEXT),
-    "KQUSE": {"L", "K1", "K2", "FSE1", "FSE2", *_MOVED},
-    **dict.fromkeys(("OCTU", "KOCT"), {"L", "K3", "FSE", "BORE", "B", *_MOVED}),
-    "MULT": {"L", "KNL", "ORDER", "FACTOR", "BORE", "BTIPL", *_MOVED},
-    **dict.fromkeys(("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND"), _BEND),
-    **dict.fromkeys(("HKICK", "VKICK", "EHKICK", "EVKICK"), {"L", "KICK", "TILT", "CALIBRATION"}),
-    **dict.fromkeys(("KICKER", "EKICKER"), {"L", "TILT", *_STEERED}),
-    **dict.fromkeys(("MONI", "HMON", "VMON"), {"L"}),
-    **dict.fromkeys(("RFCA", "RFCW", "MODRF", "RAMPRF"), {"L", "CELL_LENGTH", "VOLT", "FREQ"}),
-    "SOLE": {"L", "KS", "B", "DX", "DY", "DZ"},
-    "EMATRIX": {"L", "TILT", "DX", "DY", "DZ", *(f"C{i}" for i in range(1, 7)),
-                *(f"R{i}{j}" for i in range(1, 7) for j in range(1, 7))},
-    "ROTATE": {"TILT", "EXCLUDE_OPTICS"},
-    "WIGGLER": {"L", "RADIUS", "K", "B", "POLES", "DX", "DY", "DZ", "TILT"},
-    **{name: {"L"} for name in (*_DRIFTS, *_SILENT, *_COLLECTIVE)},
-    **{name: {"L", *values} for name, values in _INERT.items()},
-}  # fmt: skip
+MODELLED: dict[str, frozenset[str]] = {
+    cls: frozenset(own) for classes, own in _OWN.items() for cls in classes
+} | {cls: frozenset({"L", "ON_PASS", *values}) for cls, values in _INERT.items()}
 """Attributes that the model has, by class."""
 ALL_CLASSES = (*MODELLED, *_REFUSED)
 
@@ -179,6 +179,14 @@ def _binary(
     return 2, lambda a, b: (function(a, b),)
 
 
+def _of_degrees(function: Callable[[float], float]) -> Callable[[float], float]:
+    return lambda angle: function(math.radians(angle))
+
+
+def _to_degrees(function: Callable[[float], float]) -> Callable[[float], float]:
+    return lambda value: math.degrees(function(value))
+
+
 _OPERATORS: dict[str, tuple[int, Callable[..., tuple[float, ...]]]] = {
     "+": _binary(lambda a, b: a + b),
     "-": _binary(lambda a, b: a - b),
@@ -217,10 +225,8 @@ _OPERATORS: dict[str, tuple[int, Callable[..., tuple[float, ...]]]] = {
     "pop": (1, lambda a: ()),
     **{n: _unary(getattr(math, n)) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh",
                                              "cosh", "tanh", "asinh", "acosh", "atanh")},
-    **{f"d{n}": _unary(lambda a, f=getattr(math, n): f(math.radians(a)))  # type: ignore[misc]
-       for n in ("sin", "cos", "tan")},
-    **{f"d{n}": _unary(lambda a, f=getattr(math, n): math.degrees(f(a)))  # type: ignore[misc]
-       for n in ("asin", "acos", "atan")},
+    **{f"d{n}": _unary(_of_degrees(getattr(math, n))) for n in ("sin", "cos", "tan")},
+    **{f"d{n}": _unary(_to_degrees(getattr(math, n))) for n in ("asin", "acos", "atan")},
 }  # fmt: skip
 """How many numbers an operator takes from the stack, the last on top, and what it leaves there."""
 _CONSTANTS = {"pi": math.pi, "log_10": math.log(10), "HUGE": 1e308, "on_div_by_zero": 0.0,
@@ -284,15 +290,13 @@ class _Rpn:
         for name, value in self.memory.items():  # outside quotation marks elegant has capitals
             if name.casefold() == word.casefold():
                 return value
-        raise LatticeError(
-            f"'{plain(word, 40)}' is no number, no stored name and no known operator"
-        )
+        raise LatticeError(f"'{plain(word, 40)}' is no number, stored name or known operator")
 
 
 # --- statements -----------------------------------------------------------------------------------
 @dataclass
 class _Element:
-    """An element: its class, and its attributes as numbers, or as texts where they are no number."""
+    """An element: its class, and its attributes as numbers, or as texts that are none."""
 
     name: str
     cls: str
@@ -387,7 +391,7 @@ class _Reader:
         if line:
             known[name] = self._items(line[1].strip(), 0)  # type: ignore[assignment]
             return
-        head, *given = _split(rest)
+        head, *given = _split(rest) or [""]
         parent = self.elements.get(_bare(head))
         cls = parent.cls if parent else _class_of(head)
         values: dict[str, float | str] = dict(parent.values) if parent else {}
@@ -481,13 +485,13 @@ class _Reader:
         """Elements in beam order, each with whether it is reversed."""
         names: list[tuple[str, bool]] = []
         for times, turned, what in reversed(items) if backwards else items:
-            turned = turned != backwards
+            way = turned != backwards
             if isinstance(what, list):
-                own = self._names(what, turned)
+                own = self._names(what, way)
             elif (name := self._found(what)) in self.lines:
-                own = self._names(self.lines[name], turned)
+                own = self._names(self.lines[name], way)
             else:
-                own = [(name, turned)]
+                own = [(name, way)]
             names += times * own
         return names
 
@@ -536,7 +540,7 @@ class _Reader:
         for k, (name, turned) in enumerate(names):
             element = self.elements[name]
             inner = (False, False)
-            if element.cls in ("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND"):
+            if element.cls in _BENDS and element.cls != "CCBEND":
                 inner = (self._same(names, k, -1), self._same(names, k, 1))
             key = (name, turned, inner)
             if key not in made:
@@ -564,8 +568,8 @@ class _Reader:
                 f"{named} acts on the beam and is not modelled; take it out, or replace it"
             )
         if cls in _INERT and element.values.get("ON_PASS", -1.0) == -1.0:
-            for key, value in _INERT[cls].items():
-                if element.values.get(key, value) != value:
+            for key, still in _INERT[cls].items():
+                if element.values.get(key, still) != still:
                     raise LatticeError(
                         f"{named} changes the beam by its {key}, which is not modelled; take it out"
                     )
@@ -679,23 +683,27 @@ class _Reader:
         error = angle * (fse + number("FSE_DIPOLE")) - number("XKICK")
         default = number("FINT") if element.cls != "CCBEND" else 0.0
         fint = [default if number(key) < 0 else number(key) for key in ("FINT1", "FINT2")]
-        faces = [(e1, number("H1"), fint[0], number("EDGE1_EFFECTS")),
-                 (e2, number("H2"), fint[1], number("EDGE2_EFFECTS"))]  # fmt: skip
+        faces = [
+            (e1, number("H1"), fint[0], number("EDGE1_EFFECTS")),
+            (e2, number("H2"), fint[1], number("EDGE2_EFFECTS")),
+        ]
         if turned:
             faces.reverse()
         faces = [
-            (0.0, 0.0, 0.0, 0.0) if off or not face[3] else face
-            for face, off in zip(faces, inner, strict=True)
+            (0.0, 0.0, 0.0, 0.0) if off or not one[3] else one
+            for one, off in zip(faces, inner, strict=True)
         ]
-        values = {
-            "l": length, "angle": angle, "k1": k1, "k2": k2, "knl": [error],
-            "ksl": [number("YKICK")], "e1": faces[0][0], "e2": faces[1][0], "h1": faces[0][1],
-            "h2": faces[1][1], "hgap": number("HGAP"), "fint": faces[0][2], "fintx": faces[1][2],
-            **self._moved(element), "dpsi": number("ETILT") * math.copysign(1, number("ETILT_SIGN")),
+        body: dict[str, Any] = {
+            "l": length, "k1": k1, "k2": k2, "knl": [error], "ksl": [number("YKICK")],
+            **self._moved(element),
         }  # fmt: skip
-        return Part(name, "sbend" if angle else "quadrupole", values if angle else {
-            "l": length, "k1": k1, "k2": k2, "knl": [error], **self._moved(element)
-        }, element.where)  # fmt: skip
+        if not angle:
+            return Part(name, "quadrupole", body, element.where)
+        (e1, h1, first, _), (e2, h2, second, _) = faces
+        edges = {"e1": e1, "e2": e2, "h1": h1, "h2": h2, "fint": first, "fintx": second}
+        roll = math.copysign(number("ETILT"), number("ETILT") * number("ETILT_SIGN"))
+        body |= {**edges, "angle": angle, "hgap": number("HGAP"), "dpsi": roll}
+        return Part(name, "sbend", body, element.where)
 
     def _as_corrector(self, element: _Element, name: str, *_: Any) -> Part:
         values = {"l": element.number("L"), "tilt": element.number("TILT")}
@@ -712,7 +720,7 @@ class _Reader:
         return Part(name, keyword, {"l": element.number("L")}, element.where)
 
     def _as_cavity(self, element: _Element, name: str, *_: Any) -> Part:
-        if element.number("CHANGE_P0") if "CHANGE_P0" in element.values else 0.0:
+        if element.number("CHANGE_P0"):
             raise LatticeError(f"{element.cls} '{plain(element.name, 60)}' changes the momentum of "
                                "the ring (CHANGE_P0); set it to 0")  # fmt: skip
         values = {"l": element.number("L"), "volt": 1e-6 * element.number("VOLT"),
@@ -731,6 +739,8 @@ class _Reader:
         r = np.array([[element.number(f"R{i}{j}") for j in range(1, 7)] for i in range(1, 7)])
         b = np.array([element.number(f"C{i}") for i in range(1, 7)])
         b[4] = 0.0  # the length
+        if element.number("DELTAP"):
+            raise LatticeError(f"EMATRIX '{plain(element.name, 60)}' changes the momentum (DELTAP)")
         if abs(np.linalg.det(r[:4, :4])) < 1e-6:
             raise LatticeError(
                 f"EMATRIX '{plain(element.name, 60)}' has no inverse: what it does not state is 0, "
@@ -780,7 +790,7 @@ _FAMILY = {
     **dict.fromkeys(("SEXT", "KSEXT", "KQUSE"), "sextupole"),
     **dict.fromkeys(("OCTU", "KOCT"), "octupole"),
     "MULT": "multipole",
-    **dict.fromkeys(("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND"), "bend"),
+    **dict.fromkeys(_BENDS, "bend"),
     **dict.fromkeys(("HKICK", "VKICK", "EHKICK", "EVKICK", "KICKER", "EKICKER"), "corrector"),
     **dict.fromkeys(("MONI", "HMON", "VMON"), "monitor"),
     **dict.fromkeys(("RFCA", "RFCW", "MODRF", "RAMPRF"), "cavity"),
@@ -885,6 +895,8 @@ def _inner(items: Items) -> set[str]:
 def _class_of(word: str) -> str:
     """The class that a word names: it may be shorter or longer than the class's name."""
     word = _bare(word).upper()
+    if not word:
+        raise LatticeError("no element class is stated")
     if word in ALL_CLASSES:
         return word
     found = [cls for cls in ALL_CLASSES if cls.startswith(word) or word.startswith(cls)]

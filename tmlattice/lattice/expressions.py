@@ -2,7 +2,7 @@
 
 AT's readers hand expressions to Python's `eval`, from which a file reaches the whole interpreter.
 An `Arithmetic` stands in its place. It knows numbers, texts, lists, names, the four operations and
-powers, fields of elements, and calls of the functions that it is given; there is nothing else.
+powers, and calls of the functions that it is given; there is nothing else.
 """
 
 import ast
@@ -101,14 +101,12 @@ class Arithmetic:
                 values = [self._of(value, names) for value in node.values]
                 return dict(zip(keys, values, strict=True))
             case ast.UnaryOp(op=ast.USub()):
-                return -_plain(self._of(node.operand, names))
+                return -self._of(node.operand, names)
             case ast.UnaryOp(op=ast.UAdd()):
-                return +_plain(self._of(node.operand, names))
+                return +self._of(node.operand, names)
             case ast.BinOp() if type(node.op) in _OPERATIONS:
                 left, right = self._of(node.left, names), self._of(node.right, names)
-                return self._operate(type(node.op), _plain(left), _plain(right))
-            case ast.Attribute():
-                return _field(self._of(node.value, names), node.attr)
+                return self._operate(type(node.op), left, right)
             case ast.Call(func=ast.Name(id=name)):
                 return self._call(name, node, names)
             case ast.Call(func=ast.Attribute(value=ast.Name(id="np"), attr=name)):
@@ -138,8 +136,8 @@ class Arithmetic:
             raise ValueError(f"'{name}' is no function that a lattice may call")
         if any(keyword.arg is None or keyword.arg.startswith("_") for keyword in node.keywords):
             raise ValueError(f"'{name}' is called in a way that is not read")
-        given = [_plain(self._of(argument, names)) for argument in node.args]
-        named = {str(k.arg): _plain(self._of(k.value, names)) for k in node.keywords}
+        given = [self._of(argument, names) for argument in node.args]
+        named = {str(k.arg): self._of(k.value, names) for k in node.keywords}
         return function(*given, **named)
 
 
@@ -152,23 +150,6 @@ def _named(name: str, names: tuple[Mapping[str, Any], ...]) -> Any:
         except KeyError:
             continue
     raise NameError(f"name '{name}' is not defined")  # in Python's words: AT looks for the name
-
-
-def _field(owner: Any, name: str) -> Any:
-    """A field of an element that a file describes; never what Python keeps of it."""
-    from at.load.file_input import AnyDescr
-
-    for fields in (owner, vars(owner)) if isinstance(owner, AnyDescr) else ():
-        if isinstance(fields, dict) and name in fields:
-            return fields[name]
-    raise AttributeError(f"no field '{name}'")
-
-
-def _plain(value: Any) -> Any:
-    """A number for what stands for one: a deferred expression of AT's."""
-    from at.load.parser import StrParameter
-
-    return value.value if isinstance(value, StrParameter) else value
 
 
 def _bounded(value: Any) -> Any:

@@ -243,8 +243,8 @@ def _errors(part: Part) -> dict[str, Any]:
         knl, ksl = _integrated(part, "knl"), _integrated(part, "ksl")
         excess = length * part.number("k0") - angle if part.number("k0") else 0.0
         x, y = -excess - knl[0], part.number("k0s") * length + ksl[0]
-        roll = amounts.pop("roll")  # of a field, which kicks; the design's orbit is not turned
-        x, y = x + roll**2 * angle / 2, y - roll * angle
+        roll = amounts.pop("roll")  # about the entrance's axis: the field kicks, as it is turned
+        x, y = x + roll**2 * math.sin(angle) / 2, y - roll * math.sin(angle)
         cos, sin = math.cos(part.number("tilt")), math.sin(part.number("tilt"))
         x, y = x * cos - y * sin, x * sin + y * cos
         amounts["kick_x"], amounts["kick_y"] = x, y
@@ -415,6 +415,32 @@ def _bend(part: Part, report: _Report) -> Any:
     )
 
 
+def fringe_of(curvature: float, e: float, gap: float, integral: float, down: float) -> float:
+    """Half gap times fringe integral (m) of a face that focuses as one with a feed-down angle.
+
+    Arguments as of `edge_focusing`, in the design's field.
+    """
+    y = edge_focusing(curvature, e, gap, integral, down)[1]
+    scale = 2 * curvature * (1 + math.sin(e) ** 2) / math.cos(e)
+    return (e + math.atan(y / curvature)) / scale
+
+
+def edge_focusing(
+    field: float, e: float, gap: float, integral: float, down: float = 0.0
+) -> tuple[float, float]:
+    """R21 and R43 of the face of a bend, 1/m, as of DIPEDGE.
+
+    Args:
+        field: the dipole field behind the face, 1/m.
+        e: its angle, rad.
+        gap, integral: half gap (m) and fringe integral.
+        down: added to the angle in the vertical plane, rad.
+    """
+    y = e + down
+    fringe = 2 * gap * integral * field * (1 + math.sin(y) ** 2) / math.cos(y)
+    return field * math.tan(e), -field * math.tan(y - fringe)
+
+
 def _matrix(part: Part, ring: Ring) -> Place:
     """A matrix element; MAD-X's (t, pt) are (-tau, p)."""
     from tmlattice.lattice.ocelot import elements as ocelot
@@ -428,10 +454,7 @@ def _matrix(part: Part, ring: Ring) -> Place:
             sign = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
             r = sign @ np.asarray(part.values.get("rm", np.eye(6)), dtype=float) @ sign
         case "dipedge":
-            h, e1 = part.number("h"), part.number("e1")
-            fringe = 2 * part.number("hgap") * part.number("fint") * h
-            fringe *= (1 + math.sin(e1) ** 2) / math.cos(e1)
-            r[1, 0], r[3, 2] = h * math.tan(e1), -h * math.tan(e1 - fringe)
+            r[1, 0], r[3, 2] = edge_focusing(*map(part.number, ("h", "e1", "hgap", "fint")))
         case "srotation":
             r[:4, :4] = _rotation(part.number("angle"))
         case "solenoid":

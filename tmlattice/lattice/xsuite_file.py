@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.lattice.expressions import Arithmetic
-from tmlattice.lattice.parts import Part, ring_of_parts
+from tmlattice.lattice.parts import Part, edge_focusing, fringe_of, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 Array = NDArray[np.float64]
@@ -36,14 +36,15 @@ PASSIVE = frozenset({
     "RandomRutherford", "RandomUniform", "RandomUniformAccurate", "MultipoleEdge", "ZetaShift",
     "TimeDelay", "BlackAbsorber", "BlackCrystal", "TransparentCollimator", "TransparentCrystal",
     "ScatterHelper", "EverestBlock", "EverestCollimator", "EverestCrystal", "FlukaCollimator",
-    "Geant4Collimator", "Geant4CollimatorTip", "ParticleStatsMonitor", "EmittanceMonitor",
+    "FlukaCrystal", "Geant4Collimator", "Geant4CollimatorTip", "Geant4Crystal", "TouschekMarker",
+    "ParticleStatsMonitor", "EmittanceMonitor",
 })  # fmt: skip
 """Drifts and markers in the optics: apertures, collimators, monitors of particles, delays, and
 fringes of the third order."""
 COLLECTIVE = frozenset({
     "ACDipole", "Exciter", "TransverseDamper", "CollectiveMonitor", "WakeTracker", "WakeField",
     "Wakefield", "ResistiveWallWake", "MultiWakefield", "IBSAnalyticalKick", "IBSKineticKick",
-    "ElectronCloud", "BunchMonitor", "SlicedParticles", "DampingElement",
+    "ElectronCloud", "BunchMonitor", "BlowUp", "RFSweep", "SlicedParticles", "DampingElement",
 })  # fmt: skip
 """What excites or damps the beam, or acts with the beam's current: named in a warning."""
 ACTING: dict[str, tuple[str, ...]] = {
@@ -86,6 +87,8 @@ LUMPED = 2e-5
 1e-5 of a tune at a beta of 10 m."""
 SKEW_SHARE = 0.1
 """Weight of skew gradients there: they act on the tunes in second order."""
+ROUNDING = 1e-9
+"""Relative; a dipole field that differs by less from the design's is the design's."""
 EDGES = {-1: "suppressed", 0: "linear", 1: "full", 2: "dipole-only"}
 
 
@@ -211,8 +214,10 @@ class _Fields:
         """A field that is a number."""
         self.used.add(key)
         value = self.values.get(key)
+        if isinstance(value, float) or value is None:
+            return default if value is None else value
         try:
-            given = np.ravel(np.asarray(default if value is None else value, dtype=float))
+            given = np.ravel(np.asarray(value, dtype=float))
         except (TypeError, ValueError):
             raise LatticeError(
                 f"{key} of {self.named} is '{plain(str(value), 40)}' and no number"
@@ -286,8 +291,8 @@ class _Reader:
         parts: list[Part] = []
         for item in placed:
             if isinstance(item, float):
-                item = round(item, 12)
-                parts.append(drifts.setdefault(item, Part("drift", "drift", {"l": item})))
+                way = round(item, 12)
+                parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
                 continue
             if item not in self._made:
                 self._made[item] = self._converted(self._fields(item), item.lower())
@@ -373,15 +378,15 @@ class _Reader:
             gap = placed[k] - at
             if gap < -tolerance:
                 raise LatticeError(
-                    f"'{plain(str(items[k][0]), 60)}' begins at {placed[k]:.6f} m, before the end "
-                    f"of the element before it at {at:.6f} m"
+                    f"'{plain(str(items[k][0]), 60)}' begins at {placed[k]:.9g} m, before the end "
+                    f"of the element before it at {at:.9g} m"
                 )
             if gap > tolerance:
                 laid.append(gap)
             laid.append(items[k][0])
             at = placed[k] + ways[k]
         if total is not None and total < at - tolerance:
-            raise LatticeError(f"the elements end at {at:.6f} m, after the line's {total:.6f} m")
+            raise LatticeError(f"the elements end at {at:.9g} m, after the line's {total:.9g} m")
         if total is not None and total > at + tolerance:
             laid.append(total - at)
         return laid
@@ -393,9 +398,7 @@ class _Reader:
         """Where an element begins, m; None while what it refers to has no position."""
         at, origin = place.get("at"), place.get("from_")
         anchor = place.get("from_anchor")
-        if isinstance(at, str) and "@" in at:
-            at, origin = 0.0, at
-        elif isinstance(at, str) and at in self.elements:
+        if isinstance(at, str) and ("@" in at or at in self.elements):
             at, origin = 0.0, at
         if isinstance(origin, str) and "@" in origin:
             origin, _, anchor = origin.partition("@")
@@ -553,7 +556,7 @@ class _Reader:
 
     def _slice(self, fields: _Fields, name: str, where: str, sliced: Any) -> list[Part]:
         parent, weight = self._parent(fields), self._weight(fields)
-        if sliced is None or sliced[1] == "Drift":
+        if sliced is None or sliced[1] == "Drift" or parent.cls in PASSIVE:
             return [_passive(name, weight * _way_of(parent))]
         if sliced[3]:
             if parent.cls not in ("Bend", "RBend", "CombinedFunctionMagnet", "Magnet"):
@@ -567,16 +570,16 @@ class _Reader:
             parts = [_Bend(parent, self).body(name, where, weight)]
         elif parent.cls in ("Cavity", "CrabCavity"):
             parts = self._cavity(parent, name, where, weight)
-        elif parent.cls == "UniformSolenoid":
+        elif parent.cls in ("UniformSolenoid", "Solenoid"):
             parts = self._solenoid(parent, name, where, weight)
         elif parent.cls in ("Quadrupole", "Sextupole", "Octupole", "Magnet", "Multipole"):
             if parent.cls == "Magnet" and _Bend(parent, self).angle:
                 parts = [_Bend(parent, self).body(name, where, weight)]
             else:
-                parts = [self._thick(parent, name, where, weight)]
+                parts = self._in_kicks(parent, self._thick(parent, name, where, weight), weight)
         else:
             parent.cls = f"{fields.cls} of a {parent.cls}"
-            raise _not_modelled(parent) if _way_of(parent) == 0 else _not_modelled(parent)
+            raise _not_modelled(parent)
         if sliced[3] or sliced[1] == "Thick":
             _Bend(parent, self)  # its edges' fields are modelled, in other slices
         parent.used |= {"edge_entry_active", "edge_exit_active"}
@@ -620,7 +623,7 @@ class _Reader:
         fields.used |= {"edge_entry_active", "edge_exit_active"}  # fringes of the third order
         return self._in_kicks(fields, self._thick(fields, name, where))
 
-    def _in_kicks(self, fields: _Fields, whole: Part) -> list[Part]:
+    def _in_kicks(self, fields: _Fields, whole: Part, weight: float = 1.0) -> list[Part]:
         """A straight magnet whose gradients, but for K1 of a quadrupole, are in thin kicks.
 
         Xsuite puts one kick in the middle where no number is given. A magnet whose kicks are fine,
@@ -633,7 +636,7 @@ class _Reader:
         if rule == "adaptive":
             rule = "yoshida-6" if fields.cls == "Magnet" else "uniform"
         body = fields.number("k1") * length if model.startswith("mat") else 0.0
-        count = int(fields.number("num_multipole_kicks"))
+        count = math.ceil(weight * int(fields.number("num_multipole_kicks")))
         knl, ksl = whole.list("knl").copy(), whole.list("ksl")
         knl[1] -= body
         gradient = abs(knl[1]) + SKEW_SHARE * abs(ksl[1])
@@ -838,7 +841,7 @@ class _Bend:
         """The bend between its faces, or a slice of it."""
         knl, ksl = self.reader._strengths(self.fields, self.length, self.dipole)
         knl[0] -= self.angle
-        if abs(knl[0]) < 1e-12 * abs(self.angle):
+        if abs(knl[0]) < ROUNDING * abs(self.angle):
             knl[0] = 0.0
         self._check_body(knl, ksl)
         values = {"l": weight * self.length, "angle": weight * self.angle, "knl": weight * knl,
@@ -861,11 +864,15 @@ class _Bend:
         (down, gap, first), (down2, gap2, last) = (
             self.fringe(side) if self.active(side) else (0.0, 0.0, 0.0) for side in (0, 1)
         )
-        detuned = abs(self._field() - self.curvature) > 1e-12 * abs(self.curvature)
-        focusing = any(faces) or first * gap or last * gap2
-        if down or down2 or (detuned and focusing):
+        focusing = any(faces) or first * gap or last * gap2 or down or down2
+        if focusing and not self.curvature and self.dipole:
             entry, exit_ = self.edges()
             return [*entry(f"{name}_entry", where), body, *exit_(f"{name}_exit", where)]
+        if self.curvature and (down or down2):
+            first = fringe_of(self.curvature, faces[0], gap, first, down)
+            last = fringe_of(self.curvature, faces[1], gap2, last, down2)
+            gap = gap2 = math.copysign(1.0, last)  # MAD-X takes a negative FINTX for none
+            first, last = first * gap, last * gap
         if gap2 != gap:
             gap, first, last = 1.0, first * gap, last * gap2
         edges = {"e1": faces[0], "e2": faces[1], "hgap": gap, "fint": first, "fintx": last}
@@ -920,10 +927,8 @@ def _edge(name: str, where: str, edge: tuple[float, ...], tilt: float) -> list[P
     if not down:
         values: dict[str, Any] = {"h": field, "e1": e1, "hgap": gap, "fint": integral}
         return [Part(name, "dipedge", {**values, "tilt": tilt}, where)]
-    angle = e1 + down
-    fringe = 2 * field * gap * integral / math.cos(angle) * (1 + math.sin(angle) ** 2)
     matrix = np.eye(6)
-    matrix[1, 0], matrix[3, 2] = field * math.tan(e1), -field * math.tan(angle - fringe)
+    matrix[1, 0], matrix[3, 2] = edge_focusing(field, e1, gap, integral, down)
     return [Part(name, "matrix", {"rmat": matrix, "tilt": tilt}, where)]
 
 
