@@ -104,14 +104,15 @@ def need_monitors(ring: Ring) -> None:
 
 
 def no_whole_turn(ring: Ring) -> str | None:
-    """What to say of a ring whose bends do not sum to a turn; None where they do, or are none."""
-    bends = [e for e in ring.elements if e.bending]
-    total = sum(e.bending * math.cos(e.tilt) for e in bends)
-    if not bends or abs(abs(total) / (2 * math.pi) - 1) < CLOSED:
+    """A sentence about a ring whose bends do not sum to whole turns; None where they do."""
+    total = abs(sum(e.bending * math.cos(e.tilt) for e in ring.elements))
+    share = total / (2 * math.pi)
+    if round(share) and abs(share - round(share)) < CLOSED:
         return None
-    share = abs(total) / (2 * math.pi)
-    said = f"'{ring.name}' bends by {math.degrees(abs(total)):.4g} degrees in all"
-    cells = round(1 / share) if share else 0
+    if share < CLOSED:
+        return f"the bends of '{ring.name}' sum to 0: it is taken for a ring all the same"
+    said = f"'{ring.name}' bends by {math.degrees(total):.4g} degrees in all"
+    cells = round(1 / share)
     if cells > 1 and abs(cells * share - 1) < CLOSED:
         return f"{said}, 1/{cells} of a turn: it is taken for a ring of one such cell"
     return f"{said} and not by 360: it is taken for a ring all the same"
