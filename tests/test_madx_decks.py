@@ -9,7 +9,8 @@ import pytest
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
-from tmlattice.optics import closed_orbit, twiss
+from tmlattice.errors import LatticeError
+from tmlattice.optics import closed_orbit, off_momentum, twiss
 
 DECKS = json.loads((Path(__file__).parent / "lattices" / "madx_decks.json").read_text())["decks"]
 
@@ -39,3 +40,82 @@ def test_deck_is_the_ring_that_madx_tracks(tmp_path, name):
     np.testing.assert_allclose(
         twiss(chain).total_tunes % 1, [deck["q1"] % 1, deck["q2"] % 1], rtol=0, atol=tolerance
     )
+
+
+PLAIN = DECKS["plain"]["text"]
+
+
+def with_element(element):
+    return PLAIN.replace("bb, at=4.2;", f"bb, at=4.2; {element}")
+
+
+REFUSED = {
+    "match": (PLAIN + "match, sequence=ring; vary, name=kq; endmatch;", "MATCH changes strengths"),
+    "ealign": (PLAIN + "use, sequence=ring; ealign, dx=1e-4;", "EALIGN moves elements"),
+    "efcomp": (PLAIN + "efcomp, order=0, dkn={1e-4};", "EFCOMP gives elements field errors"),
+    "correct": (PLAIN + "correct, flag=ring;", "CORRECT sets correctors"),
+    "random": (PLAIN + "qf, k1=1.1 + 1e-3*gauss();", r"GAUSS\(\) is random"),
+    "result": (PLAIN + "qf, k1=table(twiss, qf, k1l);", r"TABLE\(\) reads a result"),
+    "range": (PLAIN + "use, sequence=ring, range=qf/qd;", "USE with a RANGE takes a part"),
+    "beam-beam": (with_element("b: beambeam, charge=1, at=4.95;"), "BEAMBEAM 'b' .* by its CHARGE"),
+    "rotation": (
+        with_element("y: yrotation, angle=1e-3, at=4.95;"), "YROTATION 'y' .* by its ANGLE"
+    ),
+    "class": (with_element("w: wigglerx, at=4.95;"), "no element or command 'wigglerx' is known"),
+    "attribute": (PLAIN + "qf, k1x=1;", "attribute K1X of QUADRUPOLE 'qf'"),
+    "taper": (PLAIN + "qf, ktap=0.01;", "attribute KTAP of QUADRUPOLE 'qf'"),
+    "pitch": (PLAIN + "qf, dtheta=1e-3;", "attribute DTHETA of QUADRUPOLE 'qf'"),
+    "overlap": (
+        with_element("q: quadrupole, l=0.4, at=2.9;"),
+        "'q' begins at 2.700000 m, before the end of 'qd' at 3.100000 m",
+    ),
+    "beyond": (
+        with_element("q: quadrupole, l=0.4, at=5.1;"), "L ends at 41.600000 m, before"
+    ),
+    "particle": (
+        PLAIN.replace("particle=electron", "particle=pb54"), "particle 'pb54' without a MASS"
+    ),
+    "word": (PLAIN + "frobnicate, x=1;", "no element or command 'frobnicate' is known"),
+    "line": (PLAIN + "qf, k1=1..2;", r"in the statement 'qf, k1=1..2', line \d+ of ring.madx"),
+}  # fmt: skip
+WARNED = {
+    "makethin": (PLAIN + "makethin, sequence=ring;", "MAKETHIN is not carried out"),
+    "system": (PLAIN + 'system, "touch x";', "SYSTEM is not run"),
+    "thick knl": (PLAIN + "qf, knl={0,0.01};", r"KNL of QUADRUPOLE qf \(1\) is left out"),
+    "crab cavity": (
+        with_element("c: crabcavity, volt=1, at=4.95;"),
+        "voltage does in the CRABCAVITY",
+    ),
+    "decapole": (
+        with_element("d: multipole, knl={0,0,0,0,9}, at=4.95;"),
+        "above the sextupole of d",
+    ),
+    "later length": (PLAIN + "qf, l=0.5;", r"the later L or ANGLE of qf \(1\) is left out"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_would_change_the_ring_is_refused_by_name(tmp_path, what):
+    text, message = REFUSED[what]
+    with pytest.raises(LatticeError, match=message):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize("what", WARNED)
+def test_what_is_passed_over_is_named_in_a_warning(tmp_path, what):
+    text, message = WARNED[what]
+    path = tmp_path / "ring.madx"
+    path.write_text(text)
+    with pytest.warns(UserWarning, match=message):
+        load_ring(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["plain", "rbend", "sbend poles", "thin bends", "beam beta", "arrow"]
+)
+def test_chromaticity_is_that_of_madx(tmp_path, name):
+    """Per energy, as MAD-X has it; both from maps of second order."""
+    deck = DECKS[name]
+    ring = read(tmp_path, deck["text"])
+    found = off_momentum(Chain.from_ring(ring, 6), ring.length).chromaticity
+    np.testing.assert_allclose(found, [deck["dq1"], deck["dq2"]], rtol=0, atol=1e-3)

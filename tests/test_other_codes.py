@@ -100,6 +100,53 @@ def test_rectangular_bends_have_their_edges(madx, tmp_path):
     )  # pi / 16 is half the angle
 
 
+def stated(ring):
+    """What MAD-X's header would state of a ring."""
+    q1, q2 = twiss(Chain.from_ring(ring)).total_tunes
+    effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
+    dq1, dq2 = effects.chromaticity
+    alfa = ring.beta**2 * effects.momentum_compaction + ring.gamma**-2
+    own = {"Q1": q1, "Q2": q2, "DQ1": dq1, "DQ2": dq2, "ALFA": alfa}
+    return {key: float(value) for key, value in own.items()}
+
+
+def test_header_decides_whether_rbend_edges_hold_half_the_angle(madx, tmp_path):
+    """MAD-X 5.09 writes whole angles, earlier versions what the RBEND's E1 was."""
+    header = stated(madx)
+    path = table(madx, tmp_path, **header)
+    path.write_text(path.read_text().replace('"SBEND"', '"RBEND"'))
+    np.testing.assert_allclose(ring_matrix(load_ring(path)), ring_matrix(madx), rtol=0, atol=1e-9)
+    half = str(np.pi / 16)
+    path.write_text(path.read_text().replace(half, "0.0"))
+    np.testing.assert_allclose(ring_matrix(load_ring(path)), ring_matrix(madx), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gone", "message"),
+    [
+        ("QF", "its tunes are .* the header states|its motion is unstable"),
+        ("SD", "its chromaticities are .* the header states"),
+        ("B", "its tunes are .* the header states|its motion is unstable"),
+    ],
+)
+def test_table_without_a_row_contradicts_its_header(madx, tmp_path, gone, message):
+    path = table(madx, tmp_path, **stated(madx))
+    rows = path.read_text().splitlines()
+    first = next(i for i, row in enumerate(rows) if row.startswith(f'"{gone}"'))
+    path.write_text("\n".join([*rows[:first], *rows[first + 1 :]]) + "\n")
+    with pytest.raises(LatticeError, match=f"contradicts its header: (?:{message})"):
+        load_ring(path)
+
+
+def test_header_that_states_other_figures_is_a_contradiction(madx, tmp_path):
+    right = stated(madx)
+    load_ring(table(madx, tmp_path, **right))
+    for key, by in (("Q1", 0.01), ("DQ2", 3.0), ("ALFA", 0.01), ("LENGTH", 0.1)):
+        header = {**right, "LENGTH": madx.length}
+        with pytest.raises(LatticeError, match="contradicts its header"):
+            load_ring(table(madx, tmp_path, **{**header, key: header[key] + by}))
+
+
 def test_tables_that_say_too_little(madx, tmp_path):
     with pytest.raises(LatticeError, match=r"no column L; write the table with .*k1l"):
         load_ring(table(madx, tmp_path, drop=("L",)))

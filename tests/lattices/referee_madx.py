@@ -198,6 +198,54 @@ DECKS = {
     "macro": deck(before="setq(qq,kk): macro = { qq->k1 = kk; }\nexec, setq(qf, 1.14);\n"),
     "macro number": deck(before="setk(nn): macro = { k.nn = 1.14; }\nn=3; exec, setk($n);\n"
                                 "qf->k1 := k.3;\n"),
+    # spellings
+    "signs and exponents": deck(elements=quadrupoles("k1=+.11e1 + 11.e-1 - 1.1E+00")),
+    "minus minus": deck(elements=quadrupoles("k1=-(-1.1)")),
+    "no blanks": deck().replace(", ", ",").replace("; ", ";").replace(": ", ":"),
+    "many blanks": deck().replace("=", " = ").replace(",", " ,\n\t").replace(";", " ;"),
+    "beam without a comma": deck(beam="beam particle=electron, energy=3;\n"),
+    "quoted particle": deck(beam="BEAM, PARTICLE = \"electron\" , ENERGY = 3.0D0 ;\n"),
+    "use without a comma": deck(after="two: line=(qf,bb);\nuse period=ring;\n"),
+    "refer left out": deck().replace(", refer=centre", ""),
+    "at deferred": deck().replace("at=1.5", "at:=ab+0.5").replace("beam", "ab = 1; beam", 1),
+    "output statements": deck(after=(
+        "value, qf->k1, kk; show, qf; print, text=\"a;b\"; printf, text=\"%e\", value=qf->k1;\n"
+        "set, format=\"22.14e\"; use, sequence=ring; select, flag=twiss, clear;\n"
+        "select, flag=twiss, column=name,s,betx,bety; savebeta, label=b0, place=#s;\n")),
+    "save": deck(after="save, sequence=ring, file=\"ring.seq\";\n"),
+    "stop": deck(after="use, sequence=ring;\n"),
+    "two comments": deck(before="/* one ! two // three\n more */ qf, k1=1.12; // ! and */\n"),
+    "semicolon in a text": deck(elements=quadrupoles("type=\"a;b\", k1=1.1")),
+    "table that nothing asks for": deck(before="kt := table(twiss, qf, k1l);\n"),
+    "variable l": deck(beam=BEAM + "l = 0.4; k1 = 1.1;\n", elements=quadrupoles("k1=k1, l=l")),
+    "variable of an element's name": deck(beam=BEAM + "qf = 1.12;\n",
+                                          elements=quadrupoles("k1:=qf")),
+    "flags": deck(extra="rf: rfcavity, l=0.1, volt=0, lag=0.5, harmon=31, at=4.95,"
+                        " no_cavity_totalpath;"),
+    "macro without arguments": deck(before="tune: macro = { qf->k1 = 1.14; }\nexec, tune;\n"),
+    "if without blanks": deck(before="kk=1;\nif(kk==1){qf->k1=1.12;}\n"),
+    "if within if": deck(before="kk=1;\nif (kk==1) { if (kk<2) { qf->k1=1.12; } "
+                                "if (kk>2) { qf->k1=3; } }\n"),
+    "if or": deck(before="kk=1;\nif (kk==3 || kk<>2) { qf->k1=1.12; }\n"),
+    "class changed in the sequence": deck(extra="sf, k2=2, at=4.95;"),
+    "several on a line": deck(before="a=1;b=0.12;qf,k1=a+b;\n"),
+    "underscores and digits": deck(before="k_1.a2b=1.12; qf, k1=k_1.a2b;\n"),
+    "percent in names": deck(before="k%1 = 1.12; qf, k1 = k%1;\n"),
+    "dollar in names": deck(before="k$1 = 1.12; qf, k1 = k$1;\n"),
+    "integer division": deck(elements=quadrupoles("k1=11/10")),
+    "apertures": deck(
+        extra="c1: collimator, l=0.1, apertype=ellipse, aperture={0.1,0.2}, at=4.95;"),
+    "monitors": deck(extra="h1: hmonitor, l=0.1, at=4.85; v1: vmonitor, l=0.1, at=5.05;"),
+    "elseparator at rest": deck(extra="es: elseparator, l=0.1, ex=0, at=4.95;"),
+    "beambeam at rest": deck(extra="bm: beambeam, charge=0, at=4.95;"),
+    "yrotation at rest": deck(extra="yr: yrotation, angle=0, at=4.95;"),
+    "translation at rest": deck(extra="tr: translation, dx=0, at=4.95;"),
+    "quadrupole kmax": deck(elements=quadrupoles("k1=1.1, kmax=kx, kmin=0, calib=1")),
+    "lrad of a straight multipole": deck(extra="mm: multipole, lrad=0.2, knl={0,0.01}, at=4.95;"),
+    "sextupole tilt": deck(extra="s2: sextupole, l=0.1, k2=4, tilt=0.3, at=4.95;"),
+    "bend k1 edges": deck(elements=bends(
+        "bb: sbend, l=1, angle=twopi/16, k1=-0.1, e1=twopi/32, e2=twopi/32, tilt=0;")),
+    "rbend k1": deck(elements=bends("bb: rbend, l=1, angle=twopi/16, k1=-0.05;")),
     # layout
     "refer entry": BEAM + ELEMENTS + "ring: sequence, l=41.6, refer=entry;\n" + "".join(
         f"qf, at={5.2 * k + 0.1}; bb, at={5.2 * k + 1}; qd, at={5.2 * k + 2.7};"

@@ -318,7 +318,7 @@ class _Reader:
             self.macros[match[1].lower()] = (names, match[3])
             return None
         match = re.fullmatch(
-            r"(?:(?:real|int)\s+)?(?:const\s+)?([\w.$]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
+            r"(?:(?:real|int)\s+)?(?:const\s+)?([\w.$%]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
         )
         if match:
             return self._assign(match[1].lower(), Given(match[3], match[2] == ":="))
@@ -327,7 +327,7 @@ class _Reader:
             # worked out at once even after `:=`, as MAD-X does
             owner, given = unquoted(match[1]).lower(), Given(match[4])
             return self._set(owner, {match[2].lower(): given}, statement)
-        match = re.fullmatch(r"([\w.$]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
+        match = re.fullmatch(r"([\w.$%]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
                              re.DOTALL)  # fmt: skip
         if match:
             if match[2]:
@@ -439,7 +439,7 @@ class _Reader:
 
     # --- commands -------------------------------------------------------------------------------
     def _command(self, text: str, statement: Statement) -> None:
-        match = re.match(r"\"[^\"]*\"|[\w.$]+", text)
+        match = re.match(r"\"[^\"]*\"|[\w.$%]+", text)
         if match is None:
             raise LatticeError("no element or command begins so")
         word = unquoted(match[0]).lower()
@@ -793,7 +793,7 @@ class _Reader:
             if not item:
                 continue
             match = re.fullmatch(
-                r"(-?)\s*(?:(\d+)\s*\*)?\s*(-?)\s*(\(.*\)|\"[^\"]*\"|'[^']*'|[\w.$]+)",
+                r"(-?)\s*(?:(\d+)\s*\*)?\s*(-?)\s*(\(.*\)|\"[^\"]*\"|'[^']*'|[\w.$%]+)",
                 item,
                 re.DOTALL,
             )
@@ -887,7 +887,7 @@ class _Reader:
             way = to - at
             if way < -ROUNDING:
                 raise LatticeError(
-                    f"in the sequence '{sequence.name}' {name} begins at {to:.6f} m, before the "
+                    f"in the sequence '{sequence.name}' {name} at {to:.6f} m, before the "
                     f"end of {last} at {at:.6f} m; correct the positions or lengths"
                 )
             if abs(way) > 1e-9:
@@ -896,10 +896,10 @@ class _Reader:
 
         for slot in self._flat(sequence):
             start = slot.centre - slot.length / 2
-            drift(start, f"'{plain(slot.name, 60)}'")
+            drift(start, f"'{plain(slot.name, 60)}' begins")
             parts.append(self._part(slot.name, slot.length, beam, circumference))
             at, last = start + slot.length, f"'{plain(slot.name, 60)}'"
-        drift(self._length(sequence.name), "its end (L)")
+        drift(self._length(sequence.name), "L ends")
         return parts
 
     def _part(self, name: str, length: float, beam: Beam, circumference: float) -> Part:

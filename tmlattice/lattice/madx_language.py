@@ -178,16 +178,16 @@ class _Parser:
                 if not self._take(")"):
                     raise self._error()
                 break
-        if word in RANDOM:
-            raise LatticeError(
-                f"{word.upper()}() is random: MAD-X draws another value each time; write the value"
-            )
-        if word not in FUNCTIONS:
-            raise LatticeError(f"no function {word.upper()}() is known here")
-        function = FUNCTIONS[word]
 
-        def value(names: Names) -> float:
+        def value(names: Names) -> float:  # what nothing asks for may be anything
             names.work()
+            if word in RANDOM:
+                raise LatticeError(f"{word.upper()}() is random; write its value")
+            if word == "table":
+                raise LatticeError("TABLE() reads a result of MAD-X; write its value")
+            if word not in FUNCTIONS:
+                raise LatticeError(f"no function {word.upper()}() is known")
+            function = FUNCTIONS[word]
             return float(function(*(argument(names) for argument in arguments)))
 
         return value

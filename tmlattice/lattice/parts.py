@@ -191,6 +191,8 @@ def assembled(
 
 def _acts(value: Any) -> bool:
     """Whether an attribute has a value other than zero; a word has."""
+    if value is None:
+        return False
     try:
         return bool(np.any(np.asarray(value, dtype=float)))
     except (TypeError, ValueError):

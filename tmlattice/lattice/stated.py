@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.ring import Element, Ring
 from tmlattice.lattice.source import copied
 
 Array = NDArray[np.float64]
@@ -24,8 +24,8 @@ CHROMATICITY = (0.5, 0.1)
 """Absolute and relative; second-order maps of bends with gradients differ between codes by 7 %."""
 LENGTH = 1e-6
 """Relative to the ring's length, beside 1 mm."""
-STEP = 1e-4
-"""Of the relative energy, for a difference."""
+STEP = 1e-6
+"""Of the relative energy, for a difference: a tune near an integer must not cross it."""
 
 
 @dataclass(frozen=True)
@@ -126,15 +126,17 @@ def _maps(ring: Ring) -> list[tuple[Array, Array, Array]]:
     chain: list[tuple[Array, Array, Array]] = []
     for element in ring.elements:
         if id(element.source) not in known:
-            known[id(element.source)] = _parts(element.source, ring.map_energy)
+            known[id(element.source)] = _parts(element, ring.map_energy)
         chain += known[id(element.source)]
     return chain
 
 
-def _parts(source: Any, energy: float) -> list[tuple[Array, Array, Array]]:
-    from tmlattice.lattice.ocelot import SecondTM
+def _parts(element: Element, energy: float) -> list[tuple[Array, Array, Array]]:
+    """Of one element; a cavity is a drift in the static optics."""
+    from tmlattice.lattice.ocelot import SecondTM, elements
 
-    own = copied(source)
+    cavity = element.kind == "cavity"
+    own = elements.Drift(l=element.length) if cavity else copied(element.source)
     if own.supported_tms is None or SecondTM in own.supported_tms:
         own.set_tm(SecondTM)
     maps = zip(own.B(energy), own.R(energy), own.T(energy), strict=True)
