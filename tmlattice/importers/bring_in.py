@@ -44,7 +44,7 @@ class Options:
         noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
-    iteration: Iteration = "last"
+    iteration: Iteration = "first"
     keep_bad: bool = False
     sequence: str | None = None
     lattice: str | None = None
