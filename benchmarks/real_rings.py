@@ -5,9 +5,10 @@ default options, one after another; PETRA III's folder is diagnosed as it is. To
 held-out correctors, in plane (with a position jump of their own), in the other plane (with a roll
 of their own where that was weighed) and of the RF's orbit, in micrometres: of the lattice and of
 the result; beside them what the experts' own LOCO fit leaves of all the data that it was fitted to
-(its last model, in the file). Then the steps, kept and refused. `--iteration first` takes the
-model as it was before that fit; `--seed N` another split, `--seeds N` that many of them;
-`--families` seeks no single faults among small errors, which takes most of the time;
+(its last model, in the file). Then the steps, kept and refused. The lattice of a LOCO file is the
+model before its fit; `--iteration last` takes the fitted one; `--seed N` another split, `--seeds N`
+that many of them; `--families` seeks no single faults among small errors, which takes most of the
+time;
 `--missing` weighs what the result still lacks, and tells a table of that; `--pictures FOLDER` makes
 a picture a ring: what is left before and after, and the gradients. `--into FOLDER` writes a file of
 each ring and seed as it comes; what stands there already, of the same options and code, is told and
@@ -337,7 +338,7 @@ def steps(row):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*")
-    parser.add_argument("--iteration", default="last", choices=["first", "last"])
+    parser.add_argument("--iteration", default="first", choices=["first", "last"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--families", action="store_true")

@@ -129,7 +129,7 @@ def main():
         print(f"{name:42}{1e3 * slow:10.2f}   {other:26}{1e3 * fast:9.3f}{ratio:>9}")
     print(f"maps of the whole ring: {median_time(lambda: ring_maps(ring), 5):.3f} s")
     measurement = tmlattice.Measurement(launch.numpy(), target.numpy()[:, None], network.monitors)
-    fit = tmlattice.fine_tune(network, measurement, patience=None, progress=False)
+    fit = tmlattice.fine_tune(network, measurement, launch_sigma=0.0, patience=None, progress=False)
     print(f"fit of {len(fit.loss)} epochs with the symplectic penalty: {fit.seconds:.2f} s")
     print(f"at {at.__version__}, torch {torch.__version__}, numpy {np.__version__}")
 

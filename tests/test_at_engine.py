@@ -165,8 +165,11 @@ def test_thin_gradients_sit_at_the_middle(tmp_path, element, half):
     np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)
 
 
-def test_insertion_device_focuses_at_its_entrance(tmp_path):
-    engine = engine_of(tmp_path, WIGGLER, ("insertion_device_focusing", 0.01))
+@pytest.mark.parametrize("name", ["wig", "it"])
+def test_insertion_device_focuses_at_its_entrance(tmp_path, name):
+    """A matrix element does, whatever its name."""
+    element = WIGGLER.replace("'wig'", f"'{name}'")
+    engine = engine_of(tmp_path, element, ("insertion_device_focusing", 0.01))
     whole = block(quadrupole(0, 4.0), quadrupole(0.0027, 4.0))
     expected = whole @ thin(0.01) @ LAUNCH[:4]
     np.testing.assert_allclose(exit_state(engine), expected, atol=1e-13)

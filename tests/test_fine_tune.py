@@ -11,13 +11,14 @@ from tmlattice.fitting.experiment import perturbed_ring
 from tmlattice.network import symplectic_penalty
 
 LAUNCH = np.array([[1e-4, 0, 1e-4, 0], [-1e-4, 1e-5, 5e-5, 0]])
+EXACT = np.zeros_like(LAUNCH)
 
 
 @pytest.fixture(scope="module")
 def weakened(small_ring):
     network = TaylorNetwork.from_ring(perturbed_ring(small_ring, "QD::5", -0.02))
     readings = network(LAUNCH).detach().numpy()
-    return Measurement(LAUNCH, readings[:, None], network.monitors)
+    return Measurement(LAUNCH, readings[:, None], network.monitors, launch_sigma=EXACT)
 
 
 def fit(network, measurement, **options):
@@ -65,8 +66,9 @@ def test_weights_kept_are_those_of_least_loss(small_network, weakened):
 
 def test_early_stop_ends_a_fit_that_has_settled(small_network):
     settled = Measurement(
-        LAUNCH, small_network(LAUNCH).detach().numpy()[:, None], small_network.monitors
-    )
+        LAUNCH, small_network(LAUNCH).detach().numpy()[:, None], small_network.monitors,
+        launch_sigma=EXACT,
+    )  # fmt: skip
     result = fit(small_network, settled, epochs=500, patience=20)
     assert result.stopped_early
     assert len(result.loss) <= 40
@@ -77,7 +79,7 @@ def test_missing_readings_are_left_out(small_network, weakened):
     readings = weakened.readings.copy()
     readings[0, 0, 3:9, 0] = np.nan
     readings[1, 0, 20] = np.nan
-    holes = Measurement(LAUNCH, readings, weakened.monitors)
+    holes = Measurement(LAUNCH, readings, weakened.monitors, launch_sigma=EXACT)
     left = small_network(LAUNCH).detach().numpy() - readings[:, 0]
     result = fit(small_network, holes)
     np.testing.assert_allclose(result.loss[0], np.nansum(left**2) / 2, rtol=1e-12)
@@ -88,8 +90,9 @@ def test_missing_readings_are_left_out(small_network, weakened):
 def test_monitors_are_matched_by_name_not_by_place(small_network, weakened):
     order = np.random.default_rng(1).permutation(len(weakened.monitors))
     shuffled = Measurement(
-        LAUNCH, weakened.readings[:, :, order], tuple(weakened.monitors[i].upper() for i in order)
-    )
+        LAUNCH, weakened.readings[:, :, order], tuple(weakened.monitors[i].upper() for i in order),
+        launch_sigma=EXACT,
+    )  # fmt: skip
     assert (
         fit(small_network, shuffled, epochs=5).loss == fit(small_network, weakened, epochs=5).loss
     )

@@ -1,5 +1,10 @@
 """`map` and `sparse`: against faults that are known, dense algebra, and their own stated errors."""
 
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -33,7 +38,8 @@ def measured(ring, names, change, launches=LAUNCH, noise=1e-6, seed=0):
     readings = network(launches).detach().numpy()
     readings = readings + noise * np.random.default_rng(seed).standard_normal(readings.shape)
     stated = (noise, noise) if noise else None
-    return machine, Measurement(launches, readings[:, None], network.monitors, stated)
+    exact = np.zeros_like(launches)
+    return machine, Measurement(launches, readings[:, None], network.monitors, stated, exact)
 
 
 # --- sparse ---
@@ -71,13 +77,47 @@ def test_sparse_with_a_launch_that_is_off(small_ring, small_network):
     """The launch is refitted within its own error."""
     off = LAUNCH + np.array([5e-6, 1e-6, -5e-6, 1e-6])
     machine, shifted = measured(small_ring, ["QD::5"], -0.05, launches=off)
-    stated = Measurement(LAUNCH, shifted.readings, shifted.monitors, shifted.noise)
-    fit = fine_tune(
-        small_network, stated, method="sparse", launch_sigma=[5e-6, 1e-6] * 2, refined=3
-    )
+    sigma = np.tile([5e-6, 1e-6], (2, 2))
+    stated = Measurement(LAUNCH, shifted.readings, shifted.monitors, shifted.noise, sigma)
+    fit = fine_tune(small_network, stated, method="sparse", refined=3)
     assert set(fit.changes) == {"QD::5"}
+    assert fit.chi2 < 1.3
     away = fit.tunes - matrix_tunes(ring_matrix(machine))
     assert (np.abs(away) < 4 * fit.tune_sigma).all()
+
+
+@pytest.mark.parametrize("method", ["adam", "map", "sparse"])
+def test_launches_are_as_exact_as_the_measurement_states(small_ring, small_network, method):
+    """What is wrong with a launch beyond its error is reported, not fitted by magnets."""
+    off = LAUNCH + np.array([5e-5, 1e-5, -5e-5, 1e-5])
+    machine, shifted = measured(small_ring, ["QD::5"], -0.05, launches=off)
+    options = {"method": method, "progress": False} | ({"epochs": 5} if method == "adam" else {})
+    sigma = np.tile([5e-5, 1e-5], (2, 2))
+    honest = Measurement(LAUNCH, shifted.readings, shifted.monitors, shifted.noise, sigma)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit = fine_tune(small_network, honest, **options)
+    if method != "adam":
+        true = matrix_tunes(ring_matrix(machine))
+        assert (np.abs(fit.tunes - true) < 4 * fit.tune_sigma).all()
+        np.testing.assert_allclose(fit.launches, off, atol=2e-6)
+    with pytest.warns(UserWarning, match="the launches are not those stated.*give launch_sigma"):
+        fine_tune(small_network, replace(honest, launch_sigma=0.1 * sigma), **options)
+
+
+def test_the_tutorial_names_its_magnet_and_the_tunes(petra3):
+    page = Path(__file__).parent.parent / "docs" / "tutorials" / "machine_learning.md"
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S))
+    names = {}
+    exec(code, names)
+    fit, weak = names["fit"], names["weak"]
+    assert set(fit.changes) == {weak.element}
+    amount, error = fit.changes[weak.element]
+    assert abs(amount - weak.amount) < 4 * error < 0.02
+    assert f"{weak.element}: {100 * amount:.1f} ± {100 * error:.1f} %" in code
+    true = matrix_tunes(ring_matrix(perturbed_ring(petra3, weak.element, weak.amount)))
+    assert (np.abs(fit.tunes - true) < 4 * fit.tune_sigma).all()
+    assert fit.chi2 < 1.3
 
 
 def test_sparse_states_how_far_explanations_are_apart(small_ring, small_network):
@@ -85,7 +125,8 @@ def test_sparse_states_how_far_explanations_are_apart(small_ring, small_network)
     _, whole = measured(small_ring, ["QD::5"], -0.02, LAUNCH[:1], noise=2e-8)
     readings = np.full_like(whole.readings, np.nan)
     readings[0, 0, -4, 0] = whole.readings[0, 0, -4, 0]
-    one = Measurement(LAUNCH[:1], readings, whole.monitors, whole.noise)
+    exact = np.zeros_like(LAUNCH[:1])
+    one = Measurement(LAUNCH[:1], readings, whole.monitors, whole.noise, exact)
     options = {"method": "sparse", "kinds": ("quadrupole",), "largest_number": 1}
     first, second, both = (
         fine_tune(small_network, one, candidates=names, **options)
@@ -261,7 +302,8 @@ def test_map_states_its_error_where_its_prior_is_true(small_ring, small_network)
                     parameter[strength.layer] = torch.from_numpy(weight)
         readings = network(LAUNCH).detach().numpy()
         readings = readings + 1e-6 * rng.standard_normal(readings.shape)
-        measurement = Measurement(LAUNCH, readings[:, None], network.monitors, (1e-6, 1e-6))
+        exact = np.zeros_like(LAUNCH)
+        measurement = Measurement(LAUNCH, readings[:, None], network.monitors, (1e-6, 1e-6), exact)
         fit = fine_tune(
             small_network,
             measurement,

@@ -14,16 +14,18 @@ from at.load.utils import element_from_dict
 from command import tmlattice
 from numpy.testing import assert_allclose
 
+import tmlattice as package
 from tmlattice import load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import LatticeError, MeasurementError, TmlatticeError
 from tmlattice.harmonics import frequency
-from tmlattice.importers import Options, bring_in
+from tmlattice.importers import Options, bring_in, write_imported
 from tmlattice.importers.hdf5 import read_hdf5
 from tmlattice.lattice import mat_file, save_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import Measurement, TurnByTurn
 from tmlattice.observe.spectra import lines
+from tmlattice.report.plain import report_text
 
 DATA = Path(os.environ.get("TMLATTICE_DATA", ""), "real_rings")
 real = pytest.mark.skipif(
@@ -261,7 +263,7 @@ def test_frequency_or_momentum_is_told_by_the_data(simulated, brought):
     assert any("the momentum stood still" in sentence for sentence in found.doubts)
 
 
-def test_lattice_before_the_fit(simulated, brought):
+def test_lattice_before_the_fit(simulated, brought, tmp_path):
     """FitParameters hold the values of every iteration; the lattice has the last ones'."""
     first = next(i for i, f in enumerate(elements()) if f["FamName"] == "QF")
     parameter = {
@@ -272,14 +274,25 @@ def test_lattice_before_the_fit(simulated, brought):
     steps = [{"Params": np.array([parameter], dtype=object), "Values": np.array([value])}
              for value in (0.9, 1.0)]  # fmt: skip
     variables = {**simulated, "FitParameters": np.array(steps, dtype=object)}
-    assert brought(variables).ring["qf::0"].k1 == pytest.approx(1.0)
-    found = brought(variables, iteration="first")
+    fitted = brought(variables, iteration="last").ring
+    assert (fitted["qf::0"].k1, fitted.model) == (pytest.approx(1.0), "fitted lattice")
+    found = brought(variables)
     assert found.ring["qf::0"].k1 == pytest.approx(0.9)
     assert found.ring["qf::1"].k1 == pytest.approx(1.0)
+    assert found.ring.model == "model before the fit"
+    write_imported(found, tmp_path / "day")
+    for _ in range(2):  # the second time from the cache
+        ring = load_ring(tmp_path / "day" / "lattice.json")
+        assert (ring["qf::0"].k1, ring.model) == (pytest.approx(0.9), found.ring.model)
+    told = package.diagnose(ring, tmp_path / "day")
+    assert told.as_json()["model"] == ring.model
+    heads = [line for line in report_text(told).splitlines() if ring.model in line]
+    assert {line.split(ring.model)[0].strip() for line in heads} >= {"readings less model, rms"}
+    assert not any("design " in line and "found" in line for line in report_text(told).splitlines())
     steps[1]["Values"] = np.array([1.1])  # not what the lattice has
     variables["FitParameters"] = np.array(steps, dtype=object)
-    found = brought(variables, iteration="first")
-    assert found.ring["qf::0"].k1 == pytest.approx(1.0)
+    found = brought(variables)
+    assert (found.ring["qf::0"].k1, found.ring.model) == (pytest.approx(1.0), "lattice of the file")
     assert any("not those of the fit's last iteration" in s for s in found.assumed)
 
 
@@ -759,7 +772,7 @@ def test_figures_of_a_real_ring_are_those_of_its_readme(name):
     assert len(data.monitors) == x == y
     assert [data.planes.count(plane) for plane in "xy"] == [horizontal, vertical]
     assert 1e6 * np.nanmedian(data.noise) == pytest.approx(noise, rel=0.03, abs=0.005)
-    found = bring_in([path])
+    found = bring_in([path], Options(iteration="last"))
     data, (columns, _) = found.measurement, design(found)
     assert rms(in_plane(data.response, data.planes)) == pytest.approx(measured, abs=0.51)
     gap = rms(in_plane(data.response - columns, data.planes))

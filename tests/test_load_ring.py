@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tmlattice import TaylorNetwork, load_ring, one_turn_optics
+from tmlattice.effects import find
 from tmlattice.errors import LatticeError, UnknownNameError
 from tmlattice.lattice import middle_of_first_arc
 
@@ -58,6 +59,21 @@ def test_places_and_strengths(small_ring):
     assert small_ring.energy == 3.0
     assert small_ring["wig_1"].kind == "wiggler"
     assert small_ring.counts()["monitor"] == 35
+
+
+def test_a_matrix_without_an_id_is_of_the_kind_that_its_variable_names(tmp_path):
+    entries = "l=0.5, r11=1.0, r12=0.5, r22=1.0, r33=0.99, r34=0.5, r43=-0.02, r44=1.0"
+    text = (
+        f"from ocelot import *\nenergy = 3.0\nwiggler = Matrix({entries})\n"
+        f"snake = Matrix({entries})\n"
+        f"ring = [wiggler, Drift(l=1.0), wiggler, snake, Matrix({entries}), Monitor(eid='m')]\n"
+    )
+    ring = load_ring(write(tmp_path, text))
+    kinds = {e.name: e.kind for e in ring.elements if e.is_magnet}
+    assert kinds == {"wiggler::0": "wiggler", "wiggler::1": "wiggler", "snake": "matrix",
+                     "matrix": "matrix"}  # fmt: skip
+    assert find("insertion_device_focusing").places(ring) == list(kinds)
+    assert len(find("radiation_loss_wigglers").members(ring, None)) == 2
 
 
 def test_changing_one_place_leaves_the_others_and_the_given_ring(small_ring):

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from command import tmlattice
 from conftest import SMALL
 
-from tmlattice import Cause, simulate
+from tmlattice import Cause, read_measurement, simulate
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.importers import Options, bring_in
 from tmlattice.importers.readings import place_of
@@ -66,6 +68,48 @@ def test_a_row_a_shot_and_a_column_a_monitor_and_plane(
     assert any(told in sentence for sentence in brought.assumed), brought.assumed
     assert brought.measurement.noise is None
     assert any("estimates it" in sentence for sentence in brought.assumed)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_read_measurement_reads_what_diagnose_reads(small_ring, data, tmp_path, encoding):
+    """With the ring, with its names, and with the names of the file."""
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p} (µm)", 1e6)
+    path.write_bytes(path.read_text().encode(encoding))
+    names = [monitor.name for monitor in small_ring.monitors]
+    for options in ({"ring": small_ring}, {"monitors": names}, {}):
+        own = read_measurement(path, **options)
+        readings = own.select(monitors=data.monitors).readings
+        np.testing.assert_allclose(readings, data.readings, rtol=1e-6, atol=1e-12)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for plane in range(2):
+            file["xy"[plane]] = 1e3 * data.readings[:, 0, :, plane]
+            file["xy"[plane]].attrs["unit"] = "mm"
+        file["monitors"] = list(data.monitors)
+    own = read_measurement(tmp_path / "a.h5")
+    np.testing.assert_allclose(
+        own.select(monitors=data.monitors).readings, data.readings, rtol=1e-6, atol=1e-12
+    )
+
+
+def test_read_measurement_reads_the_table_of_the_tutorial(tmp_path):
+    page = Path(__file__).parent.parent / "docs" / "tutorials" / "physicist.md"
+    text = page.read_text(encoding="utf-8")
+    assert 'read_measurement("readings.csv")' in text
+    (tmp_path / "readings.csv").write_text(re.search(r"```text\n(.*?)```", text, re.S)[1])
+    own = read_measurement(tmp_path / "readings.csv")
+    assert own.monitors == ("bpm_1", "bpm_2")
+    np.testing.assert_allclose(own.readings[0, 0], [[1.23e-3, -0.45e-3], [0.98e-3, 0.12e-3]])
+
+
+@pytest.mark.parametrize("name", ["day.xlsx", "day.csv"])
+def test_a_spreadsheet_is_refused_in_a_sentence(small_ring, tmp_path, name):
+    (tmp_path / name).write_bytes(b"PK\x03\x04\x14\x00\x06\x00" + bytes(100))
+    for options in ({"ring": small_ring}, {}):
+        with pytest.raises(MeasurementError, match=f"{name}' is a spreadsheet.*save it as CSV"):
+            read_measurement(tmp_path / name, **options)
+    done = tmlattice("diagnose", SMALL, tmp_path / name, cwd=tmp_path, check=2)
+    assert "save it as CSV" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_semicolons_and_decimal_commas(small_ring, data, tmp_path):

@@ -78,6 +78,7 @@ if TYPE_CHECKING:
     from tmlattice.fitting import tune_fit as tune_fit
     from tmlattice.harmonics import Tunes as Tunes
     from tmlattice.harmonics import tunes as tunes
+    from tmlattice.importers import read_measurement as read_measurement
     from tmlattice.lattice import Element as Element
     from tmlattice.lattice import Ring as Ring
     from tmlattice.lattice import load_ring as load_ring
@@ -88,7 +89,6 @@ if TYPE_CHECKING:
     from tmlattice.maps import ring_maps as ring_maps
     from tmlattice.measurement import Measurement as Measurement
     from tmlattice.measurement import OrbitResponse as OrbitResponse
-    from tmlattice.measurement import read_measurement as read_measurement
     from tmlattice.measurement import write_measurement as write_measurement
     from tmlattice.network import TaylorNetwork as TaylorNetwork
     from tmlattice.network import symplectic_penalty as symplectic_penalty
@@ -103,10 +103,11 @@ _HOME = {
     "errors": ["TmlatticeError"],
     "harmonics": ["Tunes", "tunes"],
     "fitting": ["FitResult", "TuneFit", "fine_tune", "tune_fit"],
+    "importers": ["read_measurement"],
     "lattice": ["Element", "Ring", "load_ring"],
     "machine": ["Machine", "simulate"],
     "maps": ["TaylorMap", "element_map", "ring_maps"],
-    "measurement": ["Measurement", "OrbitResponse", "read_measurement", "write_measurement"],
+    "measurement": ["Measurement", "OrbitResponse", "write_measurement"],
     "network": ["TaylorNetwork", "symplectic_penalty"],
     "optics": ["Optics", "off_momentum", "one_turn_optics", "twiss"],
 }

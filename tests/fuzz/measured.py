@@ -116,7 +116,7 @@ def write_loco(folder):
     scipy.io.savemat(folder / "loco.mat", variables)
     words = ["import", "loco.mat", "--out", "loco"]
     tmlattice(*words, "-q", cwd=folder, check=0)
-    first = [*words, "--force", "--iteration", "first"]
+    first = [*words, "--force", "--iteration", "last"]
     return {
         "LOCO .mat": ([*words, "--force"], "loco.mat"), "LOCO .mat, first": (first, "loco.mat")
     }  # fmt: skip

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 @click.option(
     "--iteration",
     type=click.Choice(["first", "last"]),
-    default="last",
+    default="first",
     show_default=True,
-    help="Of a LOCO fit: its lattice as the file has it, with the parameters of the last "
-    "iteration; or with those of the first, the model before the fit.",
+    help="Of a LOCO fit: the model before the fit, with the parameters of the first iteration; or "
+    "the fitted lattice, with those of the last.",
 )
 @click.option("--lattice", metavar="LATTICE", help="Of a table or of turns.")
 @click.option("--sequence", metavar="NAME", help="The lattice file's variable that holds the ring.")

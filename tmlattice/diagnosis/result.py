@@ -345,6 +345,7 @@ class Diagnosis(ShownDiagnosis):
             "version": 1,
             "package": __version__,
             "kind": self.kind,
+            "model": self.ring.model,
             "verdict": self.verdict,
             "findings": [finding.as_json() for finding in self.findings],
             "steps": [step.as_json() for step in self.steps],

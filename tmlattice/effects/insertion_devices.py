@@ -7,7 +7,7 @@ from tmlattice.lattice import Element
 
 @register
 class InsertionDeviceFocusing(ErrorEffect):
-    """A wiggler focuses otherwise than its matrix says."""
+    """A wiggler, or another element that is given by its matrix, has another focusing."""
 
     name = "insertion_device_focusing"
     words = "unmodelled focusing of an insertion device"
@@ -24,15 +24,15 @@ class InsertionDeviceFocusing(ErrorEffect):
         "measured, and make it good with the quadrupoles beside it."
     )
     largest = 0.03
-    sits_on_text = "wigglers"
+    sits_on_text = "wigglers, matrix elements"
 
     def build(self, it: Build, amount: float) -> None:
         """A thin quadrupole."""
         it.add_gradient("entrance", normal=amount)
 
     def sits_on(self, element: Element) -> bool:
-        """Wigglers."""
-        return element.kind == "wiggler"
+        """Wigglers, and elements that are a matrix, whatever their name."""
+        return element.kind in ("wiggler", "matrix")
 
 
 @register

@@ -17,6 +17,7 @@ from tmlattice.fitting.launches import FreeLaunches
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork, symplectic_penalty
 from tmlattice.network.symplectic import symplectic_coefficients
+from tmlattice.observe.data import launch_errors
 from tmlattice.speaks import Speaks
 
 
@@ -46,7 +47,8 @@ class FitResult(Speaks):
         tune_sigma: their standard error, [2]; None where the method states none (Adam).
         changes: relative changes of strengths, by magnet, with their standard errors: the causes
             that `sparse` found, or all that `map` moved.
-        launches: as fitted beside them, [shot, n]; None where they were taken as known.
+        launches: as fitted with them, [shot, n]; None where they were taken as exact.
+        chi2: mean square of what is left of a reading over its noise; None if no noise is stated.
     """
 
     network: TaylorNetwork | SymplecticNetwork
@@ -60,6 +62,7 @@ class FitResult(Speaks):
     tune_sigma: NDArray[np.float64] | None = None
     changes: dict[str, tuple[float, float]] = field(default_factory=dict)
     launches: NDArray[np.float64] | None = None
+    chi2: float | None = None
 
     def _told(self) -> tuple[str, dict[str, str]]:
         largest = sorted(self.changes.items(), key=lambda own: -abs(own[1][0]))[:3]
@@ -69,6 +72,7 @@ class FitResult(Speaks):
             "layers": str(len(self.network.layers)),
             "steps": str(len(self.loss)),
             "loss": f"{self.loss[0]:.3g} to {min(self.loss):.3g} m²",
+            "chi-square": "" if self.chi2 is None else f"{self.chi2:.3g} a reading",
             "tunes": tunes,
             "changes": ", ".join(changed),
             "seconds": f"{self.seconds:.2f}",
@@ -119,9 +123,10 @@ def fit_adam(
             symplectic network, whose penalty is zero whatever they are. None: all but W0.
         clip: largest norm of the gradient, before Adam.
         patience: stop after this many epochs without a loss lower by 0.1 %; None: never.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; inf:
-            unknown; None: known. Launches that are not follow the weights: after every epoch each
-            goes half the way to where the design's slopes have it.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
+            exact; inf: unknown; None: the measurement's own. Launches that are not exact follow
+            the weights: after every epoch each goes half the way to where the design's slopes
+            have it.
         progress: show a bar where there is a terminal.
 
     Raises:
@@ -233,10 +238,9 @@ def _beam(
     launch_sigma: ArrayLike | None,
 ) -> _Beam:
     launches = measurement.states(network.dimension)
-    sigma = np.zeros_like(launches)
-    if launch_sigma is None or not np.any(launch_sigma):
+    sigma = launch_errors(measurement, network.dimension, launch_sigma)
+    if not sigma.any():
         return _Beam(launches)
-    sigma[:] = launch_sigma
     ordered = measurement.in_order_of(network.monitors)
     if ordered.noise is None and np.isfinite(sigma[sigma > 0]).any():
         raise MeasurementError(

@@ -20,7 +20,7 @@ from tmlattice.errors import (
     UnstableRingError,
     unknown_choice,
 )
-from tmlattice.fitting.launches import FreeLaunches, launch_errors, with_noise
+from tmlattice.fitting.launches import FreeLaunches, with_noise
 from tmlattice.fitting.method_fit import METHODS, MethodFit
 from tmlattice.fitting.methods import fine_tune
 from tmlattice.fitting.outcome import TuneFit
@@ -30,7 +30,7 @@ from tmlattice.maps import element_map, ring_matrix
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.network.base import NetworkChain
-from tmlattice.observe.data import NOISE_FLOOR
+from tmlattice.observe.data import NOISE_FLOOR, launch_errors
 from tmlattice.optics import matrix_tunes, one_turn_optics
 
 Array = NDArray[np.float64]
@@ -154,7 +154,8 @@ def tune_fit(
     readings = truth(start[None]).detach().numpy()
     readings = readings + noise * np.random.default_rng(seed).standard_normal(readings.shape)
     rms = np.full((len(network.monitors), 2), max(noise, NOISE_FLOOR))
-    measurement = Measurement(start[None], readings[:, None], network.monitors, rms)
+    exact = np.zeros_like(start[None])
+    measurement = Measurement(start[None], readings[:, None], network.monitors, rms, exact)
     found = _fit_and_track(network, measurement, np.zeros((1, 4)), work)
     return TuneFit(
         ring=ring,
@@ -320,8 +321,7 @@ def _column(
     begun = time.perf_counter()
     alone = "method" in work.options
     options = {k: v for k, v in work.options.items() if k != "method" and (alone or name == "adam")}
-    if sigma.any():
-        options["launch_sigma"] = sigma
+    options = {"launch_sigma": sigma} | options
     tune, signal, growth, problem = None, None, None, None
     fit = None
     try:
@@ -383,5 +383,5 @@ def compile_kernels(network: TaylorNetwork, methods: Sequence[str]) -> None:
     readings = np.zeros((1, 1, len(network.monitors), 2))
     still = Measurement(np.zeros((1, 5)), readings, network.monitors)
     if "adam" in methods:
-        fine_tune(network, still, epochs=1, progress=False)
+        fine_tune(network, still, epochs=1, progress=False, launch_sigma=0.0)
     network.track(still.states(network.dimension), 1)

@@ -6,11 +6,13 @@ widen the stated error of the tunes.
 """
 
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2 as chi_square
 
 from tmlattice.beam.model import Model
 from tmlattice.beam.strengths import LARGEST
@@ -37,6 +39,12 @@ FAULT = 0.3
 
 LARGEST_NUMBER, REFINED = 5, 12
 """Of causes, and of candidates that are refined after each scan."""
+
+BY_CHANCE = 5.0
+"""Standard errors by which a misfit may exceed the noise before it is more than noise."""
+
+ONCE_IN = 1e6
+"""False alarms of `warn_of_launches` are that rare."""
 
 RARER = 10.0
 """Each cause beyond the first is so many times less likely than the one before: faults are rare,
@@ -68,8 +76,8 @@ def fit_sparse(
         ring: that the network was made from; else the network's own `ring`.
         kinds: of magnets whose strength may have changed.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; None:
-            known; inf: unknown.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
+            exact; inf: unknown; None: the measurement's own.
         fault: prior rms of a relative change.
         largest_number: of causes.
         refined: candidates that are refined after each scan.
@@ -96,6 +104,7 @@ def fit_sparse(
     found = few_causes(
         ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
     )
+    warn_of_launches(ring, data, network.dimension, found)
     best = _settled(found)
     turn = RingTunes(turns_of(found).model.assembly)
     tunes = turn.of(best.causes)
@@ -125,8 +134,43 @@ def fit_sparse(
             for cause, error in zip(best.causes, errors, strict=True)
         },
         launches=in_coordinates(best.nuisances, network.dimension)
-        if launch_sigma is not None
+        if data.launch_sigma.any()
         else None,
+    )
+
+
+def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation) -> None:
+    """Warn if the readings contradict the stated launches.
+
+    The same search with free launches must explain the readings, and lower chi-square by more than
+    four free numbers a shot do by chance, once in `ONCE_IN` times.
+
+    Args:
+        ring: the design.
+        data: with the launches as stated; unknown ones cannot be contradicted.
+        dimension: 4 or 6.
+        found: the search with the launches as stated.
+    """
+    stated = np.isfinite(data.launch_sigma[:, :4])
+    if not stated.any():
+        return
+    sigma = data.launch_sigma.copy()
+    sigma[:, :4] = np.inf
+    free = few_causes(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
+    readings, numbers = int(data.valid.sum()), int(stated.sum())
+    gain = found.fit.chi2 - free.chi2
+    explained = free.chi2 <= readings + BY_CHANCE * np.sqrt(2 * readings)
+    if not explained or gain <= chi_square.isf(1 / ONCE_IN, numbers):
+        return
+    off = np.abs(free.nuisances - data.launches)[:, :4]
+    x, y = 1e6 * off[:, [0, 2]].max(axis=0)
+    px, py = 1e6 * off[:, [1, 3]].max(axis=0)
+    warnings.warn(
+        f"the launches are not those stated: if they are fitted freely, chi-square falls by "
+        f"{gain:.0f}, of {readings} readings, and they differ from the stated ones by up to "
+        f"{x:.3g} µm and {px:.3g} µrad in x, {y:.3g} µm and {py:.3g} µrad in y; give "
+        "launch_sigma=, inf where the launches are unknown",
+        stacklevel=3,
     )
 
 

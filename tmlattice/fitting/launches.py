@@ -30,20 +30,6 @@ STEP = 1e-6
 """m, rad or relative: half the way between the two launches of a slope."""
 
 
-def launch_errors(measurement: Measurement, dimension: int) -> Array:
-    """rms of the launches in the coordinates of a network, [shot, n]: inf where they are unknown.
-
-    A measurement that says nothing of its launches has unknown ones, of a known energy.
-    """
-    shots = len(measurement.launches)
-    stated = measurement.launch_sigma
-    sigma = np.zeros((shots, dimension))
-    sigma[:, :4] = np.inf if stated is None else stated[:, :4]
-    if dimension == 6 and stated is not None:
-        sigma[:, 5] = stated[:, 4]
-    return sigma
-
-
 ROUGH = 1e-4
 """m; stands for the noise while the launches are fitted for its estimate."""
 

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from tmlattice.beam.shifts import Shifts
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.few import few_causes, in_coordinates
+from tmlattice.fitting.few import few_causes, in_coordinates, warn_of_launches
 from tmlattice.fitting.launches import FreeLaunches, launch_slopes
 from tmlattice.inference.dual import MostProbable, best_of, most_probable, posterior_base
 from tmlattice.inference.priors import Student
@@ -135,8 +135,8 @@ def fit_map(
         kinds: of magnets, for the priors on strengths.
         scale: factor on the prior's rms; None: 0.01 for faults, else that of greatest evidence.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; None:
-            known; inf: unknown.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
+            exact; inf: unknown; None: the measurement's own.
         iterations: of Gauss-Newton at most, at each level of noise on the way to the readings' own.
         progress: there is nothing to show; every method takes it.
 
@@ -166,6 +166,8 @@ def fit_map(
     data = first_turn(monitors, measurement, noise, launch_sigma, dimension)
     tails = prior is Prior.FAULTS
     few = few_causes(ring, data, kinds, dimension) if tails and ring is not None else None
+    if few is not None and ring is not None:
+        warn_of_launches(ring, data, dimension, few)
     problem = _readings(space, data, measurement.states(dimension), few)
     width = FAULT_SCALE if tails and scale is None else scale
     student = Student(1.0 if width is None else width, 1.0 if tails else np.inf)
@@ -202,7 +204,7 @@ def fit_map(
         tune_sigma=sigma,
         changes=changes,
         launches=None
-        if launch_sigma is None
+        if not problem.launch_sigma.any()
         else _free(problem).fitted(space.network, problem.launches),
     )
 

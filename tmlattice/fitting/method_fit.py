@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.fitting.adam import FitResult
+from tmlattice.fitting.few import BY_CHANCE
 from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
@@ -17,9 +18,6 @@ METHODS = ("adam", "sparse", "map")
 
 NAMING = ("sparse", "told")
 """Those that name a few magnets; the second knows which might have changed."""
-
-BY_CHANCE = 5.0
-"""Standard errors by which a misfit may exceed the noise before it is more than noise."""
 
 
 @dataclass(frozen=True, repr=False)

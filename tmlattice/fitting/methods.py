@@ -1,15 +1,20 @@
 """`fine_tune`: one call, four methods."""
 
+from dataclasses import replace
 from enum import StrEnum
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from tmlattice.by_name import by_name
 from tmlattice.errors import unknown_choice
 from tmlattice.fitting.adam import FitResult, fit_adam
-from tmlattice.fitting.few import fit_sparse
+from tmlattice.fitting.few import EFFECTS, few_causes, fit_sparse, warn_of_launches
 from tmlattice.fitting.many import fit_map
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
+from tmlattice.observe.data import NOISE_FLOOR, first_turn
 
 
 class Method(StrEnum):
@@ -42,6 +47,9 @@ def fine_tune(
             tunes.
         options: of the method, see there.
 
+    Launches are as exact as the measurement states (`launch_sigma=` overrides it). A warning says
+    where the readings contradict that.
+
     Raises:
         ChoiceError: an unknown method; it is a ValueError too.
         ValueError: an option's value.
@@ -52,9 +60,11 @@ def fine_tune(
     except ValueError:
         raise unknown_choice("method", method, Method) from None
     if chosen is Method.ADAM:
-        return fit_adam(network, measurement, **options)
+        result = fit_adam(network, measurement, **options)
+        _check_launches(network, measurement, options.get("launch_sigma"))
+        return _judged(result, measurement)
     if chosen is Method.MAP:
-        return fit_map(network, measurement, **options)
+        return _judged(fit_map(network, measurement, **options), measurement)
     if chosen is Method.TOLD and not options.get("candidates"):
         raise ValueError(
             "method 'told' is told the magnets that may have changed: give candidates="
@@ -63,4 +73,30 @@ def fine_tune(
         if network.ring is None:
             raise ValueError("methods 'sparse' and 'told' need a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
-    return fit_sparse(network, measurement, **options)
+    return _judged(fit_sparse(network, measurement, **options), measurement)
+
+
+def _check_launches(
+    network: TaylorNetwork | SymplecticNetwork, measurement: Measurement, sigma: ArrayLike | None
+) -> None:
+    """Warn of launches that are not those stated; nothing is said without a ring or a noise."""
+    ring, n = network.ring, network.dimension
+    if ring is None or measurement.noise is None:
+        return
+    if not any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
+        return
+    data = first_turn(network.monitors, measurement, None, sigma, n)
+    warn_of_launches(ring, data, n, few_causes(ring, data, dimension=n))
+
+
+def _judged(result: FitResult, measurement: Measurement) -> FitResult:
+    """The result with its chi-square."""
+    noise = result.options.get("noise")
+    ordered = measurement.in_order_of(result.network.monitors)
+    sigma = ordered.noise if noise is None else np.full((len(ordered.monitors), 2), noise)
+    if sigma is None:
+        return result
+    n = result.network.dimension
+    launches = ordered.states(n) if result.launches is None else result.launches
+    left = ordered.readings[:, 0] - result.network(launches).detach().numpy()
+    return replace(result, chi2=float(np.nanmean((left / np.maximum(sigma, NOISE_FLOOR)) ** 2)))

@@ -174,7 +174,8 @@ def run_case(
     clean = truth(launches).detach().numpy()
     readings = clean + noise * generator.standard_normal(clean.shape)
     stated = np.full((len(design.monitors), 2), noise) if noise else None
-    measurement = Measurement(launches, readings[:, None], design.monitors, stated)
+    exact = np.zeros_like(launches)
+    measurement = Measurement(launches, readings[:, None], design.monitors, stated, exact)
     known = dataclasses.replace(empty, true_tunes=_pair(true))
     try:
         kind, _, regularization = method.partition("-")

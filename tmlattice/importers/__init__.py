@@ -7,6 +7,16 @@
 
 from tmlattice.importers.bring_in import Options, bring_in
 from tmlattice.importers.imported import Imported, described, write_imported
+from tmlattice.importers.speaking import read_measurement
 from tmlattice.importers.told import Told, read_told
 
-__all__ = ["Imported", "Options", "Told", "bring_in", "described", "read_told", "write_imported"]
+__all__ = [
+    "Imported",
+    "Options",
+    "Told",
+    "bring_in",
+    "described",
+    "read_measurement",
+    "read_told",
+    "write_imported",
+]

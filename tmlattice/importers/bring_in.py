@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.columns import CSV, HDF5, SDDS
+from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, text_of
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
@@ -16,7 +16,7 @@ from tmlattice.importers.lattices import Elements, elements_of
 from tmlattice.importers.loco import Iteration, bring_loco, is_loco
 from tmlattice.importers.middle_layer import bring_middle_layer, is_beside, is_response
 from tmlattice.importers.readings import bring_readings, with_unit
-from tmlattice.importers.tables import bring_plain, bring_table, bring_turns, is_response_table
+from tmlattice.importers.tables import bring_table, bring_turns, is_response_table
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
@@ -44,7 +44,7 @@ class Options:
         noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
-    iteration: Iteration = "last"
+    iteration: Iteration = "first"
     keep_bad: bool = False
     sequence: str | None = None
     lattice: str | None = None
@@ -76,6 +76,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     for path in files:
         if not path.is_file():
             raise MeasurementError(f"no file '{path}'; check the path")
+        if path.suffix.lower() in SHEETS:
+            text_of(path)  # says what to do
     if options.turns and len(files) != 1:
         raise MeasurementError("turns are in one file; name one")
     known = [] if options.turns else files
@@ -164,12 +166,6 @@ def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
     if path.suffix.lower() in CSV and is_response_table(path):
         return bring_table(path, ring)
-    if ring is None:
-        if path.suffix.lower() in CSV:
-            return bring_plain(path, options.unit)
-        raise MeasurementError(
-            f"'{path}' holds readings: name its lattice with --lattice, which knows the monitors"
-        )
     return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
 
 

@@ -22,6 +22,30 @@ _BRACKETS = re.compile(r"^\s*(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 _TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_](?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
 
 
+SHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
+_ARCHIVE, _OLD_SHEET, _UTF_16 = b"PK\x03\x04", b"\xd0\xcf\x11\xe0", (b"\xff\xfe", b"\xfe\xff")
+
+
+def text_of(path: Path) -> str:
+    """The text of a table: UTF-8, or as spreadsheets write it, UTF-16 and Latin-1.
+
+    Raises:
+        MeasurementError: it cannot be read, or is no text.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise MeasurementError(f"cannot read '{path}': {error.strerror or error}") from error
+    if path.suffix.lower() in SHEETS or content.startswith((_ARCHIVE, _OLD_SHEET)):
+        raise MeasurementError(f"'{path}' is a spreadsheet, which is not read; save it as CSV")
+    try:
+        return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+    except UnicodeDecodeError:
+        if b"\0" in content:
+            raise MeasurementError(f"'{path}' is no text; save the table as CSV") from None
+        return content.decode("latin-1")
+
+
 @dataclass(frozen=True)
 class Column:
     """One column.
@@ -66,10 +90,7 @@ def named(text: str) -> tuple[str, str]:
 def _csv(path: Path) -> list[Column]:
     """Comma, semicolon, tab or blanks; lines that begin with # are passed over, but for the last
     one above the numbers where there is no other header."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise MeasurementError(f"'{path}' cannot be read ({error}); save it as UTF-8") from error
+    text = text_of(path)
     numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     lines = [(i, line) for i, line in numbered if not line.lstrip().startswith("#")]
     if not lines:

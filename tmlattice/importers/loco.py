@@ -7,10 +7,12 @@ from 1. Of the lists by iteration the first says what was measured; gains, kicks
 later ones are the fit's answer and are not taken.
 
 `RINGData` is the lattice with the parameters of the fit's last iteration, and `FitParameters`
-has those of every iteration: `iteration` says which are put in.
+has those of every iteration: `iteration` says which are put in. A diagnosis of what LOCO fitted
+would find what LOCO left: by default the model is the one before the fit.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,7 +51,7 @@ def is_loco(content: Fields) -> bool:
 def bring_loco(
     content: Fields,
     path: Path,
-    iteration: Iteration = "last",
+    iteration: Iteration = "first",
     keep_bad: bool = False,
     energy: float | None = None,
 ) -> Imported:
@@ -58,8 +60,8 @@ def bring_loco(
     Args:
         content: its variables, of `read_mat`.
         path: of the file, for names and errors.
-        iteration: "last": the lattice as the file has it, which is as the fit left it; "first":
-            with the parameters with which the fit began, the model as it was before.
+        iteration: "first": the lattice with the parameters with which the fit began, the model
+            before it; "last": the lattice as the file has it, which is as the fit left it.
         keep_bad: take monitors and correctors too that the good lists leave out.
         energy: GeV; None: what the file states.
 
@@ -87,7 +89,7 @@ def bring_loco(
                 f"'{path}': a monitor of plane {plane} is not among the {len(at_monitor)} of "
                 "BPMIndex; mend BPMData"
             )
-    elements, of_lattice = _elements(lattice, content.get("FitParameters"), iteration)
+    elements, of_lattice, model = _elements(lattice, content.get("FitParameters"), iteration)
     kicks: dict[int, frozenset[str]] = {}
     for plane, index in kickers.items():
         for place in index.tolist():
@@ -107,7 +109,7 @@ def bring_loco(
     )
     return Imported(
         measured,
-        placed.ring,
+        replace(placed.ring, model=model),
         assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.said),
         doubts=(
             *placed.doubts,
@@ -164,17 +166,17 @@ def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
 # --- the lattice ----------------------------------------------------------------------------------
 def _elements(
     lattice: Fields, parameters: Any, iteration: Iteration
-) -> tuple[list[dict[str, Any]], str]:
-    """The elements with an iteration's parameters, and a sentence that says so."""
+) -> tuple[list[dict[str, Any]], str, str]:
+    """The elements with an iteration's parameters, a sentence that says so, and what they are."""
     given = _field(lattice, "Lattice")
     if not isinstance(given, list) or not all(isinstance(e, Mapping) for e in given):
         raise MeasurementError("RINGData.Lattice is no list of elements; save the ring in it")
     elements = [dict(fields) for fields in given]
     steps = parameters if isinstance(parameters, list) else [parameters]
     steps = [step for step in steps if isinstance(step, Mapping)]
-    as_it_is = "the model is RINGData as it stands"
+    as_it_is, unknown = "the model is RINGData as it stands", "lattice of the file"
     if not steps:
-        return elements, as_it_is
+        return elements, as_it_is, unknown
     try:
         last, first = (_settings(step) for step in (steps[-1], steps[0]))
         there = [_number_of(elements, setting) for setting in last]
@@ -182,19 +184,27 @@ def _elements(
             abs(a - b) <= SAME * max(abs(a), abs(b)) for a, (*_, b) in zip(there, last, strict=True)
         )
         if not same:
-            return elements, f"{as_it_is}: its numbers are not those of the fit's last iteration"
+            return (
+                elements,
+                f"{as_it_is}: its numbers are not those of the fit's last iteration",
+                unknown,
+            )
         if iteration == "last":
-            return elements, (
+            return (
+                elements,
                 f"{as_it_is}, with the {len(last)} parameters that LOCO fitted to these data in "
-                f"{len(steps) - 1} iterations (--iteration first: the model before the fit)"
+                f"{len(steps) - 1} iterations (--iteration first: the model before the fit)",
+                "fitted lattice",
             )
         for setting in first:
             _put(elements, setting)
     except (ArithmeticError, KeyError, IndexError, TypeError, ValueError):
-        return elements, f"{as_it_is}: the fit's parameters cannot be followed"
-    return elements, (
+        return elements, f"{as_it_is}: the fit's parameters cannot be followed", unknown
+    return (
+        elements,
         f"the model is RINGData with the {len(first)} parameters of FitParameters(1), with which "
-        f"the fit began: RINGData itself has those of its last iteration (--iteration last)"
+        f"the fit began: RINGData itself has those of its last iteration (--iteration last)",
+        "model before the fit",
     )
 
 

@@ -45,7 +45,7 @@ def bring_middle_layer(
     beside: Sequence[Fields],
     loco: Fields,
     path: Path,
-    iteration: Iteration = "last",
+    iteration: Iteration = "first",
     keep_bad: bool = False,
     energy: float | None = None,
 ) -> Imported:

@@ -55,13 +55,19 @@ class Place:
     plane: int
 
 
-def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported:
+def bring_readings(
+    path: Path,
+    ring: Ring | None,
+    told: Told | None = None,
+    monitors: Sequence[str] | None = None,
+) -> Imported:
     """The measurement of a file whose columns are not known.
 
     Args:
         path: CSV of any separator, HDF5 or SDDS.
-        ring: the lattice, whose monitors are looked for.
+        ring: the lattice, whose monitors are looked for; None: names are as the file has them.
         told: names, unit, noise, bad monitors.
+        monitors: names to look for, instead of the lattice's.
 
     Raises:
         MeasurementError: no table, no monitor of the ring, or a field that is no number.
@@ -69,13 +75,13 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
     """
     told = told or Told()
     columns = read_columns(path)
-    finder = _Finder(ring, told)
     found = _long(path, columns, told) or _wide(path, columns, told)
     shots, turns, places, values, units = found
     devices = list(dict.fromkeys(place.device for place in places))
+    names = list(monitors or devices if ring is None else [e.name for e in ring.monitors])
+    finder = _Finder(names, told)
     monitor = finder.all(path, devices)
     scale, of_unit = _scale(values, units, told)
-    names = [element.name for element in ring.monitors]
     readings = np.full((len(set(shots)), max(turns) + 1, len(names), 2), np.nan)
     order = {shot: i for i, shot in enumerate(dict.fromkeys(shots))}
     taken = np.zeros(readings.shape, dtype=bool)
@@ -96,7 +102,7 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
     taken[:, :, sorted(finder.bad)] = False
     read = np.flatnonzero(taken.any(axis=(0, 1, 3)))
     noise = None if told.noise is None else np.full((len(read), 2), told.noise)
-    hints = ring.name, ring.energy
+    hints = (None, None) if ring is None else (ring.name, ring.energy)
     data: Measurement | TurnByTurn = Measurement(
         launches=np.zeros((len(order), 5)),
         readings=readings[:, :, read],
@@ -279,8 +285,8 @@ def _norm(text: str) -> str:
 class _Finder:
     """The lattice's monitor of a device."""
 
-    def __init__(self, ring: Ring, told: Told) -> None:
-        self._names = [element.name for element in ring.monitors]
+    def __init__(self, names: Sequence[str], told: Told) -> None:
+        self._names = list(names)
         self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
         self._plain = _unique(_norm, self._names)
         self._told: dict[str, int] = {}

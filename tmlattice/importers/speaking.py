@@ -1,35 +1,69 @@
-"""A measurement by its path, whatever stands there: for `diagnose(ring, "readings.csv")`."""
+"""A measurement by its path, of any kind of file: for `diagnose(ring, "readings.csv")`."""
 
 import logging
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.bring_in import Options, bring_in
+from tmlattice.importers.columns import CSV, HDF5, SDDS
+from tmlattice.importers.readings import bring_readings, with_unit
+from tmlattice.importers.tables import is_response_table
 from tmlattice.lattice import Ring
-from tmlattice.measurement import read_measurement
+from tmlattice.measurement import AnyMeasurement, folder
+from tmlattice.measurement.tables import Unit
 
 log = logging.getLogger(__name__)
 
 
-def measured(path: str | PathLike[str], ring: Ring | None = None) -> Any:
-    """The measurement of a folder, or of a file of another program; what is assumed of a file is
-    logged (logger `tmlattice.importers`, level info).
+def read_measurement(
+    path: str | PathLike[str],
+    monitors: Sequence[str] | None = None,
+    turn_by_turn: str | None = None,
+    unit: Unit | None = None,
+    *,
+    ring: Ring | None = None,
+) -> AnyMeasurement:
+    """Read a measurement: a folder, or any file that `diagnose` reads.
+
+    What is assumed of a file (units, names, signs) is logged (logger `tmlattice.importers`, level
+    info). Without `ring` and `monitors` the names are those of the file.
 
     Args:
-        path: a measurement folder, or a file that `importers.bring_in` takes.
-        ring: whose names a table has.
+        path: a measurement folder, its measurement.json, or a file that `bring_in` takes: a table
+            (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`), turns, a LOCO file.
+        monitors: the ring's names. Of a folder, a monitor that is not among them is an error.
+        turn_by_turn: the path is a turn-by-turn file of this kind, see `read_turn_by_turn`.
+        unit: of the readings of a file that states none; else taken from their size.
+        ring: the lattice, which knows the names of monitors and correctors.
 
     Raises:
-        MeasurementError: nothing there, or nothing that is known.
+        MeasurementError: nothing there, or nothing that is known; one sentence.
+        UnknownNameError: a monitor that the ring does not have.
     """
     place = Path(path)
-    if not place.is_file() or place.name == "measurement.json":
-        return read_measurement(place)
-    if ring is None:
-        raise MeasurementError(f"'{place}' is a file of another program: give the ring with it")
-    brought = bring_in([place], Options(ring=ring))
+    if turn_by_turn is not None or not place.is_file() or place.name == "measurement.json":
+        return folder.read_measurement(place, monitors, turn_by_turn, unit or "m")
+    suffix = place.suffix.lower()
+    response = suffix in CSV and is_response_table(place)
+    if monitors is not None and suffix in (*CSV, *HDF5, *SDDS) and not response:
+        brought = bring_readings(place, None, with_unit(None, unit, None), monitors)
+    else:
+        brought = bring_in([place], Options(ring=ring, unit=unit))
     for sentence in (*brought.assumed, *brought.doubts):
         log.info("%s: %s", place, sentence)
     return brought.measurement
+
+
+def measured(path: str | PathLike[str], ring: Ring | None = None) -> Any:
+    """The measurement of a path that was given where a measurement is taken.
+
+    Raises:
+        MeasurementError: a file of another program without the ring; see `read_measurement`.
+    """
+    place = Path(path)
+    if ring is None and place.is_file() and place.name != "measurement.json":
+        raise MeasurementError(f"'{place}' is a file of another program: give the ring with it")
+    return read_measurement(place, ring=ring)

@@ -10,13 +10,14 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
-from tmlattice.importers.columns import SDDS
+from tmlattice.importers.columns import SDDS, text_of
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.lattice import Ring
@@ -24,7 +25,6 @@ from tmlattice.measurement import (
     Measurement,
     OrbitResponse,
     TurnByTurn,
-    read_table,
     read_turn_by_turn,
 )
 from tmlattice.measurement.monitors import Names
@@ -46,9 +46,9 @@ def is_response_table(path: Path) -> bool:
     """Whether a CSV table is an orbit response, by its header: correctors in a column, or a row for
     each monitor and plane."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header = next((row for row in csv.reader(file, skipinitialspace=True) if row), [])
-    except (OSError, UnicodeDecodeError, csv.Error):
+        lines = csv.reader(StringIO(text_of(path), newline=""), skipinitialspace=True)
+        header = next((row for row in lines if row), [])
+    except csv.Error:
         return False
     names = [m["name"].lower() for name in header if (m := _HEADER.match(name))]
     return "corrector" in names or (names[:2] == ["monitor", "plane"] and "value" not in names)
@@ -175,19 +175,6 @@ def _stored(data: Measurement, ring: Ring | None) -> TurnByTurn:
     )
 
 
-def bring_plain(path: Path, unit: Unit | None = None) -> Imported:
-    """First turns of a table of a known form whose lattice is not named: names as they are.
-
-    Raises:
-        MeasurementError: see `read_table`.
-    """
-    data = read_table(path, unit=unit or "m")
-    return Imported(
-        _unlaunched(data, None), None,
-        (f"readings are in {unit or 'm'}", "where the beam was launched is not known"),
-    )  # fmt: skip
-
-
 # --- an orbit response ----------------------------------------------------------------------------
 Header = list[tuple[str, str]]
 """Name and unit of each column."""
@@ -195,12 +182,10 @@ Header = list[tuple[str, str]]
 
 def _read(path: Path) -> tuple[Header, list[list[str]]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file, skipinitialspace=True) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeasurementError(f"'{path}' cannot be read as CSV ({error}); save it as UTF-8") from (
-            error
-        )
+        lines = csv.reader(StringIO(text_of(path), newline=""), skipinitialspace=True)
+        rows = [row for row in lines if row]
+    except csv.Error as error:
+        raise MeasurementError(f"'{path}' cannot be read as CSV ({error})") from error
     if len(rows) < 2:
         raise MeasurementError(f"{path}: no rows below the header; nothing was read")
     matched = [_HEADER.match(name) for name in rows[0]]

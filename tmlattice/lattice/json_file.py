@@ -78,6 +78,7 @@ def save_ring(ring: Ring, path: str | Path) -> None:
                 "name": ring.name,
                 "energy_gev": ring.energy,
                 **({} if ring.mass == ELECTRON_GEV else {"mass_gev": ring.mass}),
+                **({} if ring.model == "design" else {"model": ring.model}),
                 "changes": {name: dict(change) for name, change in ring.changes.items()},
                 **({"supplies": ring.supplies} if ring.supplies else {}),
                 "definitions": definitions,
@@ -154,7 +155,8 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
     )
     energy = float(content["energy_gev"]) if energy is None else energy
     mass = float(content.get("mass_gev", ELECTRON_GEV))
-    ring = Ring(name, elements, energy, content.get("changes", {}), mass)
+    model = content.get("model", "design")
+    ring = Ring(name, elements, energy, content.get("changes", {}), mass, model=model)
     return replace(ring, known_supplies=_supplies(path, ring, content.get("supplies")))
 
 

@@ -109,18 +109,16 @@ def place_elements(
     Args:
         families: names without numbers.
         sources: OCELOT elements; one object may stand in many places.
-        kinds: else what `source_kind` says.
+        kinds: else what `source_kind` says of each source and its family's name.
 
     Raises:
         LatticeError: a length that is not finite.
     """
-    known = {id(source): source for source in sources}
-    for source in known.values():
+    for source in {id(source): source for source in sources}.values():
         _check(source)
     _warn_of_octupoles(sources)
     if kinds is None:
-        by_source = {key: source_kind(source, str(source.id)) for key, source in known.items()}
-        kinds = [by_source[id(source)] for source in sources]
+        kinds = [source_kind(source, name) for source, name in zip(sources, families, strict=True)]
     placed = []
     start = 0.0
     for name, family, kind, source in zip(

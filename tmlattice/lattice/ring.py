@@ -211,6 +211,8 @@ class Ring(Speaks):
         changes: what was changed since it was loaded, by element name.
         mass: rest energy of a particle, GeV; an electron's unless the lattice says otherwise.
         known_supplies: those of the design that this ring was changed from; None: it is one.
+        model: what the lattice is of the machine, as reports call it: "design", or what its file
+            says ("fitted lattice", "model before the fit").
     """
 
     name: str
@@ -219,6 +221,7 @@ class Ring(Speaks):
     changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mass: float = ELECTRON_GEV
     known_supplies: Supplies | None = field(default=None, compare=False)
+    model: str = field(default="design", compare=False)
 
     plot = Method(
         "tmlattice.plots.speaking",
@@ -235,6 +238,7 @@ class Ring(Speaks):
             "monitors": str(len(self.monitors)),
             "correctors": str(correctors),
             "changed": shown(self.changes),
+            "model": self.model,
         }
 
     def __post_init__(self) -> None:

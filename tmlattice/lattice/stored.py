@@ -78,7 +78,7 @@ def load(key: str, name: str) -> Ring | None:
         elements.append(Element(own, family, kind, s, length, k1, k2, angle, tilt, source))
         start += length
     ring = Ring(name, tuple(elements), kept["energy"], kept["changes"], kept["mass"],
-                kept.get("supplies"))  # fmt: skip
+                kept.get("supplies"), kept.get("model", "design"))  # fmt: skip
     ring.memory[KEPT] = key
     return ring
 
@@ -106,6 +106,7 @@ def save(key: str, ring: Ring) -> None:
         "mass": ring.mass,
         "changes": {name: dict(change) for name, change in ring.changes.items()},
         "supplies": ring.known_supplies,
+        "model": ring.model,
         "definitions": list(index),
         "families": families,
         "sequence": sequence,

@@ -42,6 +42,7 @@ _TAKES: Mapping[str, frozenset[str]] = {
     "hcorrector": _CORRECTOR,
     "vcorrector": _CORRECTOR,
     "wiggler": frozenset({"loss", "entrance", "middle"}),
+    "matrix": frozenset({"entrance"}),
     "marker": _EMPTY,
     "drift": _EMPTY,
     "cavity": frozenset({"middle"}),  # the RF takes the place of its first piece

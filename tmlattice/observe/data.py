@@ -109,6 +109,28 @@ def joined(first: Data, second: Data) -> Data:
     return Data(settings=first.settings + second.settings, turns=first.turns, **arrays)
 
 
+def launch_errors(
+    measurement: Measurement, dimension: int, launch_sigma: ArrayLike | None = None
+) -> Array:
+    """Return the rms of the launches in n coordinates, [shot, n]: inf where unknown, 0 where exact.
+
+    Args:
+        measurement: whose own is taken by default. If it states none, its launches are unknown
+            and their energy is exact.
+        dimension: n, 4 or 6.
+        launch_sigma: instead: one number, [n] or [shot, n].
+    """
+    sigma = np.zeros((len(measurement.launches), dimension))
+    if launch_sigma is not None:
+        sigma[:] = launch_sigma
+        return sigma
+    stated = measurement.launch_sigma
+    sigma[:, :4] = np.inf if stated is None else stated[:, :4]
+    if dimension == 6 and stated is not None:
+        sigma[:, 5] = stated[:, 4]
+    return sigma
+
+
 NOISE_FLOOR = 1e-9
 """m. Readings without noise are trusted to this: where OCELOT's maps are rounded and truncated."""
 
@@ -126,8 +148,7 @@ def first_turn(
         monitors: names, in the order of the readings.
         measurement: at least one shot.
         noise: rms of one reading, m; None: the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; None:
-            known; inf: unknown.
+        launch_sigma: standard error of the launch coordinates, see `launch_errors`.
         dimension: n, of the network.
 
     Raises:
@@ -148,9 +169,7 @@ def first_turn(
         )
     sigma = np.empty_like(readings)
     sigma[:] = np.maximum(np.nan_to_num(stated, nan=1.0), NOISE_FLOOR)
-    width = np.zeros((len(readings), dimension))
-    if launch_sigma is not None:
-        width[:] = launch_sigma
+    width = launch_errors(measurement, dimension, launch_sigma)
     known = np.zeros((len(readings), 5))
     known[:, :4] = width[:, :4]
     if dimension == 6:

@@ -362,9 +362,9 @@ def gap_labels(diagnosis: Diagnosis) -> list[str]:
     """What each model of the held-out gap has in it beyond the one before, the design first."""
     steps = 0 if diagnosis.heldout is None else len(diagnosis.heldout.misfits)
     if diagnosis.priors:
-        return ["design", "+ small errors everywhere", "+ what was found"][:steps]
+        return [diagnosis.ring.model, "+ small errors everywhere", "+ what was found"][:steps]
     faults = (f"+ {find(c.effect).words} {c.element or ''}".rstrip() for c in diagnosis.faults)
-    return ["design", *faults][:steps]
+    return [diagnosis.ring.model, *faults][:steps]
 
 
 # --- credible set ---------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def plot_readings(
     s = np.array([monitor.s for monitor in monitors])
     read, dropped = readings[shot, first], found.dropped[shot, first]
     grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
-    names = ("design", "with the findings")
+    names = (diagnosis.ring.model, "with the findings")
     styles = ((BEFORE, "-"), (AFTER, "-"))
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
@@ -107,7 +107,7 @@ def plot_readings(
             orbit.plot(s, 1e3 * predicted, style, color=colour, linewidth=0.9, label=label)
             left = np.where(dropped[:, plane], np.nan, read[:, plane] - predicted)
             residual.plot(s, 1e3 * left, color=colour, linewidth=0.9)
-            texts.append(_left_text(left, before if label == "design" else None))
+            texts.append(_left_text(left, before if label == names[0] else None))
         if dropped[:, plane].any():
             at = dropped[:, plane]
             orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="left out")
@@ -115,7 +115,7 @@ def plot_readings(
         residual.set_ylabel(f"residual {name} [mm]")
         after = f"; with the findings {texts[1]}" if len(texts) > 1 else ""
         residual.annotate(
-            f"rms of the design {texts[0]}{after}; noise {1e3 * sigma:.1f} µm (grey: 2 rms)",
+            f"rms of the {names[0]} {texts[0]}{after}; noise {1e3 * sigma:.1f} µm (grey: 2 rms)",
             (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
         )  # fmt: skip
         low, high = residual.get_ylim()
@@ -128,7 +128,7 @@ def plot_readings(
     )
     title = f"Shot {shot + 1} of the {len(readings)} of the fit"
     if before is not None:
-        title += f"; the design's launch from the {int(before.sum())} monitors before"
+        title += f"; the {names[0]}'s launch from the {int(before.sum())} monitors before"
     grid[0].set_title(title, loc="left", fontsize="medium")
     lattice_strip(diagnosis.ring, grid[4])
     mark(grid[4], diagnosis)

@@ -39,7 +39,7 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
 
 def _before(result: Diagnosis) -> str:
     """What the fit began at."""
-    return "reference" if result.since_reference else "design"
+    return "reference" if result.since_reference else result.ring.model
 
 
 def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
@@ -85,7 +85,8 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
     shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
     axes = figure.subplots(1, 2, sharey=True)
     limit = 0.0
-    for ax, name, model in zip(axes, ("before", "after"), (view.design, view.model), strict=True):
+    models = {_before(result): view.design, "result": view.model}
+    for ax, (name, model) in zip(axes, models.items(), strict=True):
         left = 1e6 * (view.data - model)[shown][:, view.good]
         left = left[np.arange(len(shown)), :, plane[shown]]
         limit = limit or float(np.nanpercentile(abs(left), 98))
@@ -152,7 +153,7 @@ def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     for plane, colour in enumerate(("C0", "C3")):
         beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
         ax.plot(before.s, beat, color=colour, linewidth=0.8, label="xy"[plane])
-    ax.set_ylabel("beta / design - 1 [%]")
+    ax.set_ylabel(f"beta / {result.ring.model} - 1 [%]")
     ax.grid(alpha=0.25)
     ax.legend(frameon=False)
     lattice_strip(result.ring, strip)

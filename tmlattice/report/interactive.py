@@ -218,10 +218,10 @@ def readings(diagnosis: Diagnosis) -> Figure:
     monitors = diagnosis.ring.monitors
     first = slice(0, len(monitors))
     read = np.where(data.valid, data.readings, np.nan)
-    models = {"design": (design_readings(diagnosis), BEFORE)}
+    models = {diagnosis.ring.model: (design_readings(diagnosis), BEFORE)}
     if diagnosis.verdict != "distributed":
         models["with the findings"] = (np.asarray(found.fit.point.view.readings), AFTER)
-    left = np.nan_to_num(read - models["design"][0]) ** 2 * data.active[:, None, None]
+    left = np.nan_to_num(read - models[diagnosis.ring.model][0]) ** 2 * data.active[:, None, None]
     shot = int(left.sum(axis=(1, 2)).argmax())
     s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
     traces = []
@@ -252,7 +252,7 @@ def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
         order = np.argsort(s)
         names = [part.monitors[i] for i in order]
         for model, colour, left in zip(
-            ("design", "with the findings"), (BEFORE, AFTER), part.left, strict=True
+            (diagnosis.ring.model, "with the findings"), (BEFORE, AFTER), part.left, strict=True
         ):
             traces.append(
                 _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
@@ -412,7 +412,7 @@ def beta_beat(diagnosis: Diagnosis) -> Figure:
         name = "xy"[plane]
         traces.append(_trace(before.s, beat, name, colour, text=names,
                              told=f"<br>s = %{{x:.2f}} m<br>{name}: %{{y:+.3f}} %"))  # fmt: skip
-    return _above_strip(diagnosis, traces, "beta / design - 1 [%]")
+    return _above_strip(diagnosis, traces, f"beta / {diagnosis.ring.model} - 1 [%]")
 
 
 def _above_strip(diagnosis: Diagnosis, traces: Iterable[Figure], title: str) -> Figure:

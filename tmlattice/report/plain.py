@@ -9,10 +9,10 @@ from tmlattice.report.next_shot import next_text
 from tmlattice.report.response_text import steps_text
 from tmlattice.report.tables import (
     LARGE_TITLE,
-    NUMBERS,
-    OPTICS,
     large_text,
+    number_head,
     number_rows,
+    optics_head,
     optics_rows,
 )
 from tmlattice.report.text import (
@@ -20,6 +20,7 @@ from tmlattice.report.text import (
     closed_text,
     columns,
     finding_rows,
+    gap_head,
     gap_rows,
     left_text,
     noise_text,
@@ -72,7 +73,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
             lines += wrapped(text, f"   {name:<{size}}   ", width)
     if diagnosis.steps:
         if diagnosis.causes:
-            lines += ["", *columns([OPTICS, *optics_rows(diagnosis)])]
+            lines += ["", *columns([optics_head(diagnosis), *optics_rows(diagnosis)])]
         lines += ["", *steps_text(diagnosis, width)]
     if diagnosis.verdict == "nothing":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
@@ -89,7 +90,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
 def _gap_table(diagnosis: Diagnosis) -> list[str]:
     before, after = tune_texts(diagnosis)
     rows = [
-        ("readings less model, rms", "before", "after"),
+        gap_head(diagnosis),
         *gap_rows(diagnosis),
         ("fractional tunes Qx, Qy", before, after),
     ]
@@ -97,6 +98,6 @@ def _gap_table(diagnosis: Diagnosis) -> list[str]:
     lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows)
     numbers = number_rows(diagnosis)
     if numbers:
-        lines += ["", *columns([NUMBERS, *numbers[:MOST]])]
+        lines += ["", *columns([number_head(diagnosis), *numbers[:MOST]])]
         lines += [f"and {len(numbers) - MOST} more"] if len(numbers) > MOST else []
     return lines

@@ -127,11 +127,11 @@ def _after_text(told: Consequences) -> str:
 
 def _beam_text(beam: Beam | None, told: Consequences) -> str:
     if told.design is None:
-        return "the design itself is unstable"
+        return "the model itself is unstable"
     if beam is None:
         return "unstable: no beam can be stored"
     x, y = beam.tunes
-    said = [f"tunes {x:.4f}, {y:.4f} (design {told.design[0]:.4f}, {told.design[1]:.4f})"]
+    said = [f"tunes {x:.4f}, {y:.4f} (model {told.design[0]:.4f}, {told.design[1]:.4f})"]
     if max(beam.beta_beat_max) > SETTLED.beta_beat_max[0]:
         rms, most = _pair(beam.beta_beat_rms, 100, 2), _pair(beam.beta_beat_max, 100, 2)
         said.append(f"beta beat {rms} % rms, {most} % at most")

@@ -17,11 +17,11 @@ PULLS = 4
 """Gradients that are pulled apart, of those that are listed."""
 
 
-def step_rows(steps: Iterable[Step]) -> list[tuple[str, ...]]:
-    """Effect, parameters, and the held-out figures in µm."""
+def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
+    """Effect (of the first step, what the model is), parameters, and held-out figures in µm."""
     return [
         (
-            step.effect,
+            (model if step.effect == "design" else "") or step.effect,
             str(step.parameters),
             three_digits(step.heldout_rms_in_plane),
             three_digits(step.heldout_rms_position),
@@ -219,7 +219,7 @@ def bad_monitors_text(result: Diagnosis) -> str:
 def steps_text(result: Diagnosis, width: int) -> list[str]:
     """The section of a plain text, in lines."""
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
-    lines += columns([HEAD, *step_rows(result.steps)], right=True)
+    lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
     if result.refused:
         lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
         lines += columns([HEAD, *step_rows(result.refused)], right=True)

@@ -138,16 +138,19 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         ("fractional tunes, x / y", *tunes),
         row("beta beat, rms [%]", "beta_beat_rms", 100, 2),
         row("beta beat, largest [%]", "beta_beat_max", 100, 2),
-        row("dispersion off the design's, rms [mm]", "dispersion_rms", 1e3, 1),
+        row("change of the dispersion, rms [mm]", "dispersion_rms", 1e3, 1),
         row("closed orbit, rms [µm]", "orbit_rms", 1e6, 1),
     ]
 
 
-OPTICS = ("stored beam on energy", "design", "as found")
-"""Head of `optics_rows`."""
+def optics_head(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Head of `optics_rows`."""
+    return "stored beam on energy", diagnosis.ring.model, "as found"
 
-NUMBERS = ("tunes", "read", "design", "as found")
-"""Head of `number_rows`."""
+
+def number_head(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Head of `number_rows`."""
+    return "tunes", "read", diagnosis.ring.model, "as found"
 
 
 def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:

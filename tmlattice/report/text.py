@@ -72,7 +72,7 @@ def closed_text(diagnosis: Diagnosis) -> str:
     after = gap.misfits[-1]
     if diagnosis.priors and after.expected is not None:
         rms = [f"{1e6 * step.rms:.3g}" for step in gap.misfits]
-        added = ["the design", "with small errors", "with what was found"][: len(rms)]
+        added = [f"the {diagnosis.ring.model}", "with small errors", "with what was found"]
         text += ": " + ", ".join(f"{a} {b} µm" for a, b in zip(added, rms, strict=False))
         text += f"; {1e6 * after.expected:.3g} µm are to be expected of it"
     return text
@@ -128,7 +128,7 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
             "The data differ from the model all along the ring; no single place, and no few "
             "places, explain it."
         )
-    return "No error is seen: the design explains the readings within their noise."
+    return f"No error is seen: the {diagnosis.ring.model} explains the readings within their noise."
 
 
 def _located_sentence(diagnosis: Diagnosis) -> str:
@@ -318,6 +318,16 @@ def _chance(p_value: float) -> str:
 
 MOST = 6
 """Other remedies that a finding lists."""
+
+
+def gap_head(diagnosis: Diagnosis) -> tuple[str, str, str]:
+    """Head of `gap_rows`: what the model is."""
+    model, gap = diagnosis.ring.model, diagnosis.heldout
+    if diagnosis.since_reference:
+        model = "reference"
+    elif gap is not None and gap.since:
+        model = f"{model} with small errors" if diagnosis.priors else "before"
+    return "readings less model, rms", model, "with what was found"
 
 
 def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
