@@ -30,6 +30,21 @@ def some(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
+def one_plane(unread: str) -> str:
+    """What is said where nothing was read in a plane."""
+    return (
+        f"no BPM reads {unread}: the orbit in {unread} is unknown, and errors that act in {unread} "
+        "alone are not determined"
+    )
+
+
+def planes(read: Flags) -> Check:
+    """Whether both planes were read, [2]."""
+    if read.all():
+        return fine("planes", "both planes were read")
+    return note("planes", one_plane("xy"[int(read.argmin())]))
+
+
 def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True) -> list[Check]:
     """Silent, frozen and copied monitors.
 
@@ -44,6 +59,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         said = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen monitors", said)]
     checks = []
+    checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
     ]
