@@ -20,6 +20,8 @@ from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
+from tmlattice.measurement.assume import in_beam_order
+from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.data import Data, joined, of_measurement
 from tmlattice.observe.first_turns import STEPS, FirstTurns
 from tmlattice.observe.noise import estimate, local_misfit
@@ -113,16 +115,18 @@ def prepare(
 
 
 def batch(ring: Ring, measurement: Measurement, said: list[str]) -> Measurement:
-    """As many shots as find room, evenly taken; what that leaves out is told.
+    """Readings that are a signal, of as many shots as find room, evenly taken.
 
     Args:
         ring: the design.
         measurement: any number of shots.
-        said: told here.
+        said: which shots are left out is told here.
 
     Raises:
         MeasurementError: not one shot finds room.
     """
+    names = [monitor.name for monitor in ring.monitors]
+    measurement = beam_lost(in_beam_order(measurement, names)).without
     shots, turns = measurement.readings.shape[:2]
     each = COPIES * 8 * 36 * turns * (len(ring.magnets) + 1)
     if each > MEMORY:
@@ -185,10 +189,13 @@ def _dead_monitors(
     _, own = np.unique(readings.reshape(len(readings), -1), axis=0, return_index=True)
     readings, valid = readings[own], valid[own]
     silent, frozen, half, said = [], [], [], []
+    order = [m for m, name in enumerate(model.maps.monitors) if name.casefold() in listed]
+    behind = signals.not_reached(np.asarray(~valid[:, order].any(axis=(0, 2))))
+    reached = {m for m, lost in zip(order, behind, strict=True) if not lost}
     for m, name in enumerate(model.maps.monitors):
         there = valid[:, m]
         if not there.any():
-            if name.casefold() in listed:
+            if m in reached:
                 silent.append(m)
         elif not there.any(axis=0).all():
             half.append(name)

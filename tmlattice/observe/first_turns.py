@@ -71,8 +71,8 @@ class FirstTurns(Problem):
 
         At y = 0 the readings in x do not depend on y to first order, so a fit never leaves it.
         """
-        read = self.data.valid.any(axis=1)  # [shot, plane]
-        unread = np.repeat(~read & np.asarray(read.any(axis=1))[:, None], 2, axis=1)
+        read = np.asarray(self.data.valid.any(axis=1))  # [shot, plane]
+        unread = np.repeat(~read & read.any(axis=1, keepdims=True), 2, axis=1)
         launches = self.data.launches.copy()
         launches[:, :4] += np.where(unread, self.data.launch_sigma[:, :4], 0.0)
         return launches

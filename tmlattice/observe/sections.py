@@ -406,8 +406,8 @@ def _shared(inner: Told, outer: Told, prior: Array, alone: bool) -> tuple[Array,
 def _unread(passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int64]) -> Array:
     """Precision of the prior of each coordinate, [pass, section, 4]; 0 in a plane that was read.
 
-    In a plane with less than two readings a trajectory is expected to be as large as in what was
-    read of the turn. Sextupoles would else let it go anywhere for the sake of the other plane.
+    In a plane with fewer than two readings a trajectory is expected to be as large as what was read
+    of the turn. Sextupoles would else let it go anywhere for the sake of the other plane.
 
     Args:
         passes: what was read.
@@ -420,7 +420,8 @@ def _unread(passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int
     square = np.where(members[..., None, None], own**2, 0.0).sum(axis=2)
     square = square / members.sum(axis=1)[:, None, None]
     precision = square / np.maximum(size, 1e-30) ** 2
-    return np.where(count[..., None] < TWO, precision, 0.0).reshape(*count.shape[:2], 4)
+    unread = (count < TWO) & (count.max(axis=2, keepdims=True) >= TWO)
+    return np.where(unread[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
 
 
 def _inverse(curvature: Array) -> Array:
