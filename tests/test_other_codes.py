@@ -141,10 +141,11 @@ def test_table_without_a_row_contradicts_its_header(madx, tmp_path, gone, messag
 def test_header_that_states_other_figures_is_a_contradiction(madx, tmp_path):
     right = stated(madx)
     load_ring(table(madx, tmp_path, **right))
-    for key, by in (("Q1", 0.01), ("DQ2", 3.0), ("ALFA", right["ALFA"] / 10), ("LENGTH", 0.1)):
+    for key, by in (("Q1", 0.01), ("DQ2", 6.0), ("ALFA", right["ALFA"] / 10), ("LENGTH", 0.1)):
         header = {**right, "LENGTH": madx.length}
+        wrong = table(madx, tmp_path, **{**header, key: header[key] + by})
         with pytest.raises(LatticeError, match="contradicts its header"):
-            load_ring(table(madx, tmp_path, **{**header, key: header[key] + by}))
+            load_ring(wrong)
 
 
 def test_tables_that_say_too_little(madx, tmp_path):

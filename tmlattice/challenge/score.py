@@ -292,5 +292,5 @@ def clean_gap(
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
     design = FirstTurns(model=Model(ring, data.settings), data=data, places={})
     found = replace(design, fixed=tuple(causes))
-    gap = held_out_gap([judged(problem, data.launches) for problem in (design, found)])
+    gap = held_out_gap([judged(problem) for problem in (design, found)])
     return {"clean_before": gap.misfits[0].rms, "clean_after": gap.misfits[-1].rms}

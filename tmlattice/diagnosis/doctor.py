@@ -34,6 +34,7 @@ from tmlattice.measurement import (
     in_words,
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.evidence import Names, Verdict, certain
 from tmlattice.observe.global_errors import Judge
 from tmlattice.observe.noise import random_part
@@ -198,10 +199,15 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
 
 # --- first turns ----------------------------------------------------------------------------------
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
-    flat = data.readings.reshape(-1, len(data.monitors), 2)
+    lost = beam_lost(data)
+    data = lost.without
+    read = np.asarray(np.isfinite(data.readings).any(axis=(0, 1, 3)))
+    reached = ~signals.not_reached(~read)
+    flat = data.readings.reshape(-1, len(data.monitors), 2)[:, reached]
+    names = [name for name, there in zip(data.monitors, reached, strict=True) if there]
     moved = bool(np.ptp(data.launches, axis=0).any()) or any(data.settings)
     checks = [
-        *signals.monitors(ring, data.monitors, flat, moved), *signals.first_turns(ring, data)
+        *signals.monitors(ring, names, flat, moved), *signals.first_turns(ring, data, lost)
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns

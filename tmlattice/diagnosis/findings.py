@@ -15,6 +15,7 @@ from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.newton import Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
@@ -206,6 +207,8 @@ def verdict_of(
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
     """The least certain of the findings', the findings that stand, and what is to be said."""
     more, far_more = judgement.noise
+    if findings and (why := _no_solution(explanation)):
+        return "distributed", (), (f"no cause is named: {why}",)
     if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
         said = (
@@ -220,6 +223,18 @@ def verdict_of(
     if p_value < more and not estimated:
         return worst, findings, ("what is left is more than the noise: see 'unexplained'",)
     return worst, findings, ()
+
+
+def _no_solution(explanation: Explanation) -> str:
+    """Why the fit of what was found is none; empty where it is one."""
+    last, before = explanation.fit, explanation.before
+    if not (last.causes or last.kicks):
+        return ""
+    if last.outcome is Outcome.STEPS:
+        return f"their fit did not converge ({last.outcome.value})"
+    if last.chi2 > before.chi2:
+        return f"with them chi-square rises from {before.chi2:.4g} to {last.chi2:.4g}"
+    return ""
 
 
 def unexplained(ring: Ring, left: FreeScan, p_value: float, judgement: Judgement) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
+from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.choice import chosen_effects
 from tmlattice.effects import Cause, expected_radiation, find, rare
 from tmlattice.errors import BeamLostError, MeasurementError, first_of
@@ -19,8 +20,10 @@ from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
+from tmlattice.measurement.assume import in_beam_order
+from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.data import Data, joined, of_measurement
-from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.observe.first_turns import STEPS, FirstTurns
 from tmlattice.observe.noise import estimate, local_misfit
 
 Array = NDArray[np.float64]
@@ -31,6 +34,13 @@ millimetre and 7e-5 of one of three, the same in every reading of a turn. A faul
 this is found with less."""
 ROUGH = 1e-4
 """m; stands for a noise that is not known yet, while the launches are fitted for the first time."""
+SMALL = 1e-5
+"""m and, a tenth of it, rad: launches of trajectories on which sextupoles mix no planes."""
+ALONE = 1e-6
+"""Square of the share of a signature in a plane below which there is nothing of it: sextupoles make
+1e-8 along small trajectories, and coupling of the thousandth part of an orbit is seen."""
+CHUNK = 256
+"""Hypotheses whose signatures are made at a time."""
 COPIES = 16
 """Of all tangents, which are held at once: they, their inverses, and those of every rival."""
 MEMORY = 2e9
@@ -93,28 +103,30 @@ def prepare(
     problem = FirstTurns(
         model=model, data=rough, places=places, rare=rare(ring, chosen), judgement=judgement
     )
-    start = _on_its_way(fit(problem, (), data.launches), ring)
+    start = _on_its_way(fit(problem, (), problem.first, steps=STEPS), ring)
     data, noise, estimated = _with_noise(data, start)
     data, noise, floor = _above_the_floor(data, noise)
     _check_lattice(ring, data, start, judgement)
     said = (*said, *floor)
     problem = replace(problem, data=data, white=None)
-    before = _on_its_way(fit(problem, (), start.nuisances), ring)
-    hypotheses = tuple(model.hypotheses(chosen))
+    before = _on_its_way(fit(problem, (), start.nuisances, steps=STEPS), ring)
+    hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data.planes))
     return Prepared(problem, before, hypotheses, known, dead, noise, estimated, said)
 
 
 def batch(ring: Ring, measurement: Measurement, said: list[str]) -> Measurement:
-    """As many shots as find room, evenly taken; what that leaves out is told.
+    """Readings that are a signal, of as many shots as find room, evenly taken.
 
     Args:
         ring: the design.
         measurement: any number of shots.
-        said: told here.
+        said: which shots are left out is told here.
 
     Raises:
         MeasurementError: not one shot finds room.
     """
+    names = [monitor.name for monitor in ring.monitors]
+    measurement = beam_lost(in_beam_order(measurement, names)).without
     shots, turns = measurement.readings.shape[:2]
     each = COPIES * 8 * 36 * turns * (len(ring.magnets) + 1)
     if each > MEMORY:
@@ -128,6 +140,32 @@ def batch(ring: Ring, measurement: Measurement, said: list[str]) -> Measurement:
     taken = np.linspace(0, shots - 1, room).round().astype(int)
     said.append(f"{room} of {shots} shots are used, evenly taken: the others find no room")
     return measurement.select(shots=[measurement.shots[i] for i in taken])
+
+
+def _determined(
+    ring: Ring, hypotheses: Sequence[Hypothesis], planes: NDArray[np.bool_]
+) -> list[Hypothesis]:
+    """Those that the planes [2] that were read determine.
+
+    In the other plane the orbit is unknown all along the ring, so what acts there alone cannot be
+    determined by what sextupoles make of it. Along small trajectories that part vanishes. The
+    energy is the focusing's in both planes.
+    """
+    if planes.all():
+        return list(hypotheses)
+    model = Model(ring, [{}, {}])
+    launches = SMALL * np.array([[1.0, 0, 1.0, 0, 0], [0, 0.1, 0, 0.1, 0]])
+    paths = model.paths(launches, ())
+    found: list[Hypothesis] = []
+    for start in range(0, len(hypotheses), CHUNK):
+        some = hypotheses[start : start + CHUNK]
+        squares = np.nan_to_num(model.signatures(paths, some, launches)) ** 2
+        read = squares.sum(axis=(1, 2)) @ np.array([planes, ~planes]).T  # [hypothesis, read or not]
+        found += [
+            h for h, (seen, other) in zip(some, read, strict=True)
+            if seen >= ALONE * other or find(h[0]).energy
+        ]  # fmt: skip
+    return found
 
 
 def _on_its_way(start: Fit, ring: Ring) -> Fit:
@@ -151,10 +189,13 @@ def _dead_monitors(
     _, own = np.unique(readings.reshape(len(readings), -1), axis=0, return_index=True)
     readings, valid = readings[own], valid[own]
     silent, frozen, half, said = [], [], [], []
+    order = [m for m, name in enumerate(model.maps.monitors) if name.casefold() in listed]
+    behind = signals.not_reached(np.asarray(~valid[:, order].any(axis=(0, 2))))
+    reached = {m for m, lost in zip(order, behind, strict=True) if not lost}
     for m, name in enumerate(model.maps.monitors):
         there = valid[:, m]
         if not there.any():
-            if name.casefold() in listed:
+            if m in reached:
                 silent.append(m)
         elif not there.any(axis=0).all():
             half.append(name)
@@ -165,7 +206,10 @@ def _dead_monitors(
     absent = sum(1 for name in model.maps.monitors if name.casefold() not in listed)
     if absent:
         said.append(f"{absent} of the ring's {count} monitors are not in the measurement")
-    if half:
+    unread = [plane for plane, read in zip("xy", data.planes, strict=True) if not read]
+    if unread:
+        said.append(signals.one_plane(unread[0]))
+    elif half:
         said.append(f"{len(half)} monitors read one plane only: {first_of(half, 3)}")
     if len(silent) > judgement.silent * count:
         said.append(f"{len(silent)} monitors have no signal; they count as not there")

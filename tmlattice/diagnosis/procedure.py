@@ -8,7 +8,7 @@
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.newton import Outcome
+from tmlattice.inference.newton import Outcome, fit
 from tmlattice.inference.scan import FreeScan
 from tmlattice.inference.search import Explanation, Search
 from tmlattice.lattice import Ring
@@ -50,6 +50,9 @@ from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
+
+FINAL_STEPS = 60
+"""Of the fit that is reported, at most."""
 
 
 def diagnose(
@@ -125,7 +128,7 @@ def diagnose(
             ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress
         ),
     )  # fmt: skip
-    small, explanation = found.small, found.explanation
+    small, explanation = found.small, _finished(found.explanation)
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
     gap = _held_out(ring, heldout, ready, told, small, explanation, said)
@@ -167,6 +170,15 @@ def diagnose(
 
 
 # --- what is told ----
+def _finished(explanation: Explanation) -> Explanation:
+    """With as many steps of its fit as it takes to converge, if it ran out of them."""
+    last = explanation.fit
+    if last.outcome is not Outcome.STEPS:
+        return explanation
+    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=FINAL_STEPS)
+    return replace(explanation, fit=again) if again.good else explanation
+
+
 def _errors(explanation: Explanation) -> tuple[float, ...]:
     """Standard error of the amount of each cause."""
     return tuple(np.sqrt(np.maximum(np.diag(explanation.fit.covariance), 0.0)).tolist())
@@ -262,8 +274,8 @@ def _held_out(
 
     if small is None:
         steps = [told.causes[:i] for i in range(len(told.causes) + 1)]
-        return held_out_gap([judged(problem((), step), other.launches) for step in steps])
-    scored = [judged(problem((), ()), other.launches)]
+        return held_out_gap([judged(problem((), step)) for step in steps])
+    scored = [judged(problem((), ()))]
     seen_by = (small.problem, turns_of(explanation))
     fits = (explanation.before, explanation.fit)[: len(told.estimates)]
     for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
@@ -272,7 +284,7 @@ def _held_out(
         except BeamLostError as error:
             said.append(f"{error}: the held-out shots do not judge the gap")
             return None
-        scored.append(judged(problem(errors, one.causes), other.launches, unknown))
+        scored.append(judged(problem(errors, one.causes), unknown))
     return held_out_gap(scored, since=max(len(scored) - 2, 0))
 
 
@@ -317,6 +329,12 @@ def _said(
     if ready.estimated:
         x, y = map(micrometres, noise)
         found.append(f"the noise was estimated from the data: {x} in x, {y} in y")
+    read = ready.problem.data.planes
+    if not read.all() and any(finding.effect is None for finding in told.findings):
+        unread, other = ("x", "y") if read[1] else ("y", "x")
+        found.append(
+            f"what is located may begin upstream in {unread}, which sextupoles pass on to {other}"
+        )
     if ready.problem.data.active.sum() == 1 and told.findings:
         found.append(
             "one trajectory gives one kick at each place: it locates, but any single multipole "

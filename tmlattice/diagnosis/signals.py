@@ -9,6 +9,7 @@ from tmlattice.diagnosis.checkup import Check, fine, note, wrong
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement.lost_beam import FEWEST, LostBeam
 from tmlattice.observe.noise import SAME_PLACE
 
 Array = NDArray[np.float64]
@@ -16,7 +17,7 @@ Flags = NDArray[np.bool_]
 
 NAMED = 3
 """Names of monitors that a sentence has at most."""
-CUT = 3
+CUT = FEWEST
 """Monitors without a reading, the last ones of a shot, from which the beam is said to be lost."""
 ALIKE = 0.5
 """Share of the signals that never change, from which the data are no readings."""
@@ -28,6 +29,28 @@ def some(names: Sequence[str]) -> str:
     """The first few of several names."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
+
+
+def not_reached(silent: Flags) -> Flags:
+    """Which of the silent monitors [monitor], in beam order, are behind a lost beam: a run of the
+    last ones."""
+    run = np.cumprod(silent[::-1])[::-1].astype(bool)
+    return np.asarray(run & (run.sum() >= CUT))
+
+
+def one_plane(unread: str) -> str:
+    """What is said where nothing was read in a plane."""
+    return (
+        f"no BPM reads {unread}: the orbit in {unread} is unknown, and errors that act in {unread} "
+        "alone are not determined"
+    )
+
+
+def planes(read: Flags) -> Check:
+    """Whether both planes were read, [2]."""
+    if read.all():
+        return fine("planes", "both planes were read")
+    return note("planes", one_plane("xy"[int(read.argmin())]))
 
 
 def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True) -> list[Check]:
@@ -44,6 +67,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         said = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen monitors", said)]
     checks = []
+    checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
     ]
@@ -104,30 +128,58 @@ def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> li
     return found
 
 
-def first_turns(ring: Ring, data: Measurement) -> list[Check]:
-    """What first turns have beyond that: turns that are none, beams that are lost."""
+def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
+    """What first turns have beyond that: turns that are none, beams that are lost.
+
+    Args:
+        ring: the design.
+        data: without the readings after a lost beam.
+        lost: where these begin.
+    """
     there = np.asarray(np.isfinite(data.readings).any(axis=3))  # [shot, turn, monitor]
     checks = [_turns(there)]
     if checks[0].status == "wrong":
         return checks
+    if len(lost.shots):
+        return [*checks, note("lost beam", _no_signal(ring, lost))]
     count, turns = there.shape[2], there.shape[1]
     last = [np.flatnonzero(own.ravel()) for own in there]
     stops = [i for i, own in enumerate(last) if len(own) and own[-1] < turns * count - CUT]
     if stops:
         shot = stops[0]
-        turn, monitor = divmod(int(last[shot][-1]), count)
-        element = ring[data.monitors[monitor]]
         others = f"; so have {len(stops) - 1} others" if len(stops) > 1 else ""
-        on = f" on turn {turn}" if turns > 1 else ""
         said = (
-            f"shot {data.shots[shot]} has no reading behind {element.name} (s = {element.s:.2f} m)"
-            f"{on}{others}: the beam was lost there, or the monitors behind did not record; it is "
+            f"shot {data.shots[shot]} has no reading behind {_place(ring, data, last[shot][-1])}"
+            f"{others}: the beam was lost there, or the monitors behind did not record; it is "
             "used up to there"
         )
         checks.append(note("lost beam", said))
     else:
         checks.append(fine("lost beam", "every shot is read to its end"))
     return checks
+
+
+def _no_signal(ring: Ring, lost: LostBeam) -> str:
+    """Where the beam was lost, by constant readings."""
+    data, shots = lost.without, lost.shots
+    ends = sorted(set(lost.last[shots].tolist()))
+    names = [_place(ring, data, end) if end >= 0 else "the start" for end in ends]
+    where = f"after {names[0]}" if len(ends) == 1 else f"between {names[0]} and {names[-1]}"
+    number = len(data.shots)
+    which = "every shot" if len(shots) == number else f"{len(shots)} of {number} shots"
+    return (
+        f"no signal: beam lost {where}"
+        + (f" in {which}" if number > 1 else "")
+        + "; the BPMs read a constant from there on, and these readings are left out"
+    )
+
+
+def _place(ring: Ring, data: Measurement, reading: int) -> str:
+    """A reading's BPM, with its turn where there are several."""
+    turn, monitor = divmod(int(reading), len(data.monitors))
+    element = ring[data.monitors[monitor]]
+    on = f" on turn {turn}" if data.readings.shape[1] > 1 else ""
+    return f"{element.name} (s = {element.s:.2f} m){on}"
 
 
 def _turns(there: Flags) -> Check:

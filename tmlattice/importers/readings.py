@@ -3,7 +3,8 @@
 Wide: a row a shot, and a column a monitor and plane (`SR:BPM_07:X [mm]`, `bpm_7_x`, `x_bpm7`).
 Long: a row a monitor (and shot, and turn), with columns `monitor`, `x`, `y`, or a `value` with a
 `plane`, or with the plane in the device's name (`SR:BPM_07:X 0.13`). What the file does not prove,
-units above all, is said.
+units above all, is said. A sum signal (`SR:BPM_07:SUM`, `intensity`, `charge`) says which of the
+BPMs had a beam.
 """
 
 import re
@@ -21,6 +22,7 @@ from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, TurnByTurn
+from tmlattice.measurement.lost_beam import about_sums, no_beam
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
@@ -39,6 +41,9 @@ _PLANE = re.compile(
     r"(?:pos|position|orbit)?(?P<p>x|y|h|v|hor|ver|horizontal|vertical)(?:pos|position|mean|avg)?",
     re.IGNORECASE,
 )
+SUM = 2
+"""Stands for the sum signal, where 0 and 1 are planes."""
+_SUM = re.compile(r"(?:bpm)?(?:sum|intensity|charge)(?:signal)?", re.IGNORECASE)
 _TOKEN = re.compile(r"[A-Za-z0-9]+")
 
 
@@ -48,7 +53,7 @@ class Place:
 
     Attributes:
         device: as the file has it, without the plane.
-        plane: 0 for x, 1 for y.
+        plane: 0 for x, 1 for y, `SUM` for the sum signal.
     """
 
     device: str
@@ -77,14 +82,22 @@ def bring_readings(
     columns = read_columns(path)
     found = _long(path, columns, told) or _wide(path, columns, told)
     shots, turns, places, values, units = found
-    devices = list(dict.fromkeys(place.device for place in places))
+    position = np.array([place.plane != SUM for place in places])
+    devices = list(dict.fromkeys(place.device for place in places if place.plane != SUM))
+    if not devices:
+        raise MeasurementError(f"{path}: sum signals without x and y; give the positions too")
     names = list(monitors or devices if ring is None else [e.name for e in ring.monitors])
     finder = _Finder(names, told)
     monitor = finder.all(path, devices)
-    scale, of_unit = _scale(values, units, told)
-    readings = np.full((len(set(shots)), max(turns) + 1, len(names), 2), np.nan)
+    for place in places:
+        monitor.setdefault(place.device, finder.find(place.device))
+    scale = np.ones(len(values))
+    scale[position], of_unit = _scale(
+        values[position], [u for u, p in zip(units, position, strict=True) if p], told
+    )
+    both = np.full((len(set(shots)), max(turns) + 1, len(names), 3), np.nan)
     order = {shot: i for i, shot in enumerate(dict.fromkeys(shots))}
-    taken = np.zeros(readings.shape, dtype=bool)
+    taken = np.zeros(both.shape, dtype=bool)
     for shot, turn, place, value in zip(shots, turns, places, values * scale, strict=True):
         at = monitor.get(place.device)
         if at is None:
@@ -96,11 +109,14 @@ def bring_readings(
                 "'turn' that tells them apart"
             )
         taken[where] = True
-        readings[where] = value
+        both[where] = value
+    readings, silent = both[..., :SUM], no_beam(both[..., SUM])
+    before = np.isfinite(readings).any(axis=3)
+    readings[silent] = np.nan
     left = [device for device in devices if monitor.get(device) is None]
     bad = sorted({names[at] for at in finder.bad if np.isfinite(readings[:, :, at]).any()})
     taken[:, :, sorted(finder.bad)] = False
-    read = np.flatnonzero(taken.any(axis=(0, 1, 3)))
+    read = np.flatnonzero(taken[..., :SUM].any(axis=(0, 1, 3)))
     noise = None if told.noise is None else np.full((len(read), 2), told.noise)
     hints = (None, None) if ring is None else (ring.name, ring.energy)
     data: Measurement | TurnByTurn = Measurement(
@@ -121,7 +137,8 @@ def bring_readings(
     if isinstance(data, Measurement) and data.readings.shape[1] >= FEWEST:  # as of other files
         beam = f"{data.readings.shape[1]} turns are those of a stored beam that was kicked before"
         data = TurnByTurn(data.readings[:, :MOST], data.monitors, noise, (), (), *hints)
-    said = [of_unit, beam, of_noise, *finder.said]
+    sums = about_sums(both[..., SUM], silent, before, names)
+    said = [of_unit, beam, of_noise, *finder.said, *sums]
     if bad:
         said.append(f"bad monitors, left out as told: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
@@ -151,7 +168,7 @@ def _long(path: Path, columns: Sequence[Column], told: Told) -> Found | None:
     else:
         for column in columns:
             own = _plane(column.name)
-            if own is not None:
+            if own is not None and _holds(own, column):
                 parts.append(([Place(name, own) for name in names.values], column))
     if not parts:
         raise MeasurementError(
@@ -168,7 +185,10 @@ def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
     shots = _labels(columns, "shot", SHOTS, told)
     if shots is None:
         shots = ["0"] * rows if turns is not None else [str(i) for i in range(rows)]
-    used = [column for column in columns if place_of(column.name, told) is not None]
+    used = [
+        column for column in columns
+        if (place := place_of(column.name, told)) is not None and _holds(place.plane, column)
+    ]  # fmt: skip
     if not used:
         raise MeasurementError(
             f"{path}: no column holds readings that are known; name columns such as "
@@ -201,6 +221,11 @@ def _joined(
             values.append(_number(path, row, column.name, text))
             units.append(column.unit)
     return shots, turns, places, np.array(values), units
+
+
+def _holds(plane: int, column: Column) -> bool:
+    """Whether a column holds what its name says: of other meanings of a sum nothing is read."""
+    return plane != SUM or all(map(_is_number, column.values))
 
 
 def _number(path: Path, row: int, name: str, text: str) -> float:
@@ -252,6 +277,8 @@ def _turns(path: Path, columns: Sequence[Column], told: Told) -> list[int] | Non
 
 
 def _plane(text: str) -> int | None:
+    if _SUM.fullmatch(text.strip()):
+        return SUM
     match = _PLANE.fullmatch(text.strip())
     return None if match is None else int(match["p"][0].casefold() in "yv")
 
@@ -315,7 +342,7 @@ class _Finder:
             self.said.append("devices are the lattice's monitors in beam order, as told")
             found: dict[str, int | None] = {device: i for i, device in enumerate(devices)}
         else:
-            found = {device: self._find(device) for device in devices}
+            found = {device: self.find(device) for device in devices}
         if all(at is None for at in found.values()):
             error = unknown_name("monitor", devices[0], self._names)
             raise MeasurementError(
@@ -341,7 +368,8 @@ class _Finder:
     def _same(self, device: str, at: int) -> bool:
         return _norm(device) in (_norm(self._names[at]), *self._told)
 
-    def _find(self, device: str) -> int | None:
+    def find(self, device: str) -> int | None:
+        """Its place among the ring's monitors; None: it is none of them."""
         plain = _norm(device)
         for table, key in ((self._told, plain), (self._exact, device.casefold()),
                            (self._plain, plain)):  # fmt: skip

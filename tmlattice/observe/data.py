@@ -45,6 +45,11 @@ class Data:
         """Their number."""
         return len(self.readings)
 
+    @property
+    def planes(self) -> Flags:
+        """Whether anything was read in x, and in y, [2]."""
+        return np.asarray(self.valid.any(axis=(0, 1)))
+
     def with_sigma(self, planes: Array) -> "Data":
         """The same with the noise of each plane [2] put in where it is not known."""
         filled = np.where(np.isfinite(self.sigma), self.sigma, planes)

@@ -27,6 +27,11 @@ from tmlattice.observe.metric import TurnMetric, metric
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+COORDINATES = 2
+"""Of a launch in one plane."""
+STEPS = 24
+"""Of a fit of launches, at most: in a plane without readings they act by their squares."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FirstTurns(Problem):
@@ -49,6 +54,7 @@ class FirstTurns(Problem):
     white: Whitening | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "data", _bounded(self.data, self.model))
         if self.white is None:
             object.__setattr__(self, "white", Whitening(self.data, self.spread))
 
@@ -61,8 +67,15 @@ class FirstTurns(Problem):
     # --- the model ------------------------------------------------------------------------------
     @property
     def first(self) -> Array:
-        """The nominal launches."""
-        return self.data.launches
+        """The nominal launches; one sigma from that in a plane without readings.
+
+        At y = 0 the readings in x do not depend on y to first order, so a fit never leaves it.
+        """
+        read = np.asarray(self.data.valid.any(axis=1))  # [shot, plane]
+        unread = np.repeat(~read & read.any(axis=1, keepdims=True), 2, axis=1)
+        launches = self.data.launches.copy()
+        launches[:, :4] += np.where(unread, self.data.launch_sigma[:, :4], 0.0)
+        return launches
 
     @property
     def free(self) -> int:
@@ -221,7 +234,7 @@ def turns_of(found: State) -> FirstTurns:
     return found.problem
 
 
-def judged(problem: FirstTurns, launches: Array, unknown: Array | None = None) -> Judged:
+def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
     """What a model leaves of shots that no fit saw.
 
     In each shot only the launch is fitted, to one half of the monitors; the readings of the other
@@ -229,21 +242,20 @@ def judged(problem: FirstTurns, launches: Array, unknown: Array | None = None) -
 
     Args:
         problem: of these shots; its `fixed` causes are the model's.
-        launches: first guess.
         unknown: covariance that what is not known of the model makes of all readings,
             [shot * reading * 2] twice, m^2; None: nothing.
     """
     data = problem.data
     odd = problem.owner() % 2 == 1
     fitted = problem.without(odd)
-    point = fit(fitted, (), launches).point
+    point = fit(fitted, (), fitted.first, steps=STEPS).point
     residuals = np.full(data.valid.shape, np.nan)
     if point.projection is None:
         return Judged(residuals, ())
     left = np.where(data.valid, data.readings - point.view.readings, 0.0)
     columns = fitted.whitening.columns
     off = (data.launches - point.nuisances)[:, columns]
-    sigma = np.maximum(data.launch_sigma[:, columns], EXACT)
+    sigma = np.maximum(fitted.data.launch_sigma[:, columns], EXACT)
     index = np.arange(data.valid.size).reshape(data.valid.shape)
     parts = []
     for shots in np.array_split(np.arange(data.shots), data.shots if unknown is None else 1):
@@ -264,6 +276,30 @@ def judged(problem: FirstTurns, launches: Array, unknown: Array | None = None) -
         parts.append(found)
         residuals[shots] = _scattered(found.residual, scored)
     return Judged(residuals, tuple(parts))
+
+
+def _bounded(data: Data, model: Model) -> Data:
+    """The data, launches in planes without readings as unknown as the orbit is large.
+
+    In a plane with fewer readings than a launch has coordinates the trajectory is expected to be as
+    large as what was read of the shot: without a prior, sextupoles let it go anywhere for the sake
+    of noise in the other plane.
+    """
+    count = data.valid.sum(axis=1)  # [shot, plane]
+    few = np.repeat(count < COORDINATES, 2, axis=1)
+    if not (few & ~np.isfinite(data.launch_sigma[:, :4])).any():
+        return data
+    square = np.where(data.valid, data.readings**2, 0.0).sum(axis=(1, 2))
+    read = count.sum(axis=1)
+    usual = square.sum() / max(read.sum(), 1)
+    size = np.sqrt(np.where(read > 0, square / np.maximum(read, 1), usual))
+    launch = model.paths(data.launches, ()).launch  # [shot, reading, 2, 5]
+    slopes = np.concatenate([launch[:, :, 0, 0:2], launch[:, :, 1, 2:4]], axis=2)
+    with np.errstate(divide="ignore"):
+        width = size[:, None] / np.sqrt(np.mean(np.nan_to_num(slopes) ** 2, axis=1))
+    sigma = data.launch_sigma.copy()
+    sigma[:, :4] = np.where(few, np.minimum(sigma[:, :4], width), sigma[:, :4])
+    return replace(data, launch_sigma=sigma)
 
 
 def _scattered(values: Array, where: Flags) -> Array:

@@ -34,6 +34,8 @@ WEAK = 1e-8
 """Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
 STEPS = 8
 """Of Newton's method: the maps are nearly linear."""
+TWO = 2
+"""Coordinates of a trajectory in a plane, and so readings that determine it."""
 FAR_OFF = 1e15
 """Sigma that stand for a trajectory which cannot be followed."""
 SETTLED = 1e-2
@@ -282,7 +284,9 @@ class Sections:
         data = passes.readings[:, owner]
         there = np.isfinite(data) & padded[None, :, :, None]
         sigma = np.where(there, passes.sigma[owner], np.inf)
-        freedom = np.maximum(np.asarray(there.sum(axis=(2, 3)), dtype=np.int64) - 4, 0)
+        count = np.asarray(there.sum(axis=2), dtype=np.int64)  # [pass, section, plane]
+        freedom = np.maximum(count - TWO, 0).sum(axis=2)
+        prior = _unread(passes, maps.c1, padded, count)
         x = np.zeros((P, W, 5))
         x[..., 4] = passes.delta[:, None]
         moved, by_energy = np.inf, np.zeros((P, W, 4))
@@ -291,19 +295,19 @@ class Sections:
                 image, slope = maps(x[:, :, None])
                 left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
                 A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
-                curvature = _held(np.swapaxes(A, -1, -2) @ A)
+                curvature = _held(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
                 if step == STEPS - 1 or not moved > SETTLED:
                     break
                 own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
                 back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
-                step_4 = (back @ left[..., None])[..., 0]
+                pull = np.linalg.solve(curvature, (prior * x[..., :4])[..., None])
+                step_4 = (back @ left[..., None] - pull)[..., 0]
                 fitted = (A @ step_4[..., None])[..., 0]
                 drift = -(back @ own[..., None])[..., 0]  # of the trajectories, by the energy
                 inner = _told(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
                 ends = way[group[:, None], np.arange(W)](x)
                 outer = _joints(x[..., :4], ends, step_4, drift, _inverse(curvature))
-                prior = passes.delta - x[:, 0, 4]
-                change, known = _shared(inner, outer, prior, passes.alone)
+                change, known = _shared(inner, outer, passes.delta - x[:, 0, 4], passes.alone)
                 by_energy = drift / np.sqrt(known)[:, None, None]
                 moved = float(np.nanmedian(np.abs(fitted)))
                 moved = max(moved, float(np.nanmax(np.abs(change) * np.sqrt(known))))
@@ -397,6 +401,27 @@ def _shared(inner: Told, outer: Told, prior: Array, alone: bool) -> tuple[Array,
         return asked / known, known
     count = len(prior)
     return np.full(count, asked.sum() / known.sum()), np.full(count, known.sum())
+
+
+def _unread(passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int64]) -> Array:
+    """Precision of the prior of each coordinate, [pass, section, 4]; 0 in a plane that was read.
+
+    In a plane with fewer than two readings a trajectory is expected to be as large as what was read
+    of the turn. Sextupoles would else let it go anywhere for the sake of the other plane.
+
+    Args:
+        passes: what was read.
+        slopes: d readings / d coordinate of the design, [pass, section, monitor, 2, 5].
+        members: which of the monitors there are, [section, monitor].
+        count: of the readings, [pass, section, 2].
+    """
+    size = np.sqrt(np.nanmean(passes.readings**2, axis=(1, 2)))[:, None, None, None]
+    own = np.stack([slopes[..., 0, 0:2], slopes[..., 1, 2:4]], axis=-2)  # [..., plane, coordinate]
+    square = np.where(members[..., None, None], own**2, 0.0).sum(axis=2)
+    square = square / members.sum(axis=1)[:, None, None]
+    precision = square / np.maximum(size, 1e-30) ** 2
+    unread = (count < TWO) & (count.max(axis=2, keepdims=True) >= TWO)
+    return np.where(unread[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
 
 
 def _inverse(curvature: Array) -> Array:

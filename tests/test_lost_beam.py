@@ -1,0 +1,188 @@
+"""After the beam is lost the electronics go on: these readings are no signal, and no fault."""
+
+import csv
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.diagnosis.doctor import check_data
+from tmlattice.errors import MeasurementError
+from tmlattice.importers import Options, bring_in
+
+FAULT = Cause("quadrupole_gradient", "QD::5", -0.2)
+LOST = 20
+"""BPMs that have a signal."""
+
+
+@pytest.fixture(scope="module")
+def data(small_ring):
+    return simulate(small_ring, [FAULT], shots=6, seed=1).measurement()
+
+
+def constant(data, value=0.0, shots=slice(None), after=LOST):
+    readings = data.readings.copy()
+    readings[shots, :, after:] = value
+    return replace(data, readings=readings)
+
+
+def lost_in(found):
+    return {check.name: check for check in found.checks}["lost beam"]
+
+
+def the_fault_alone(result):
+    (finding,) = result.findings
+    assert (finding.effect, finding.element) == (FAULT.effect, FAULT.element)
+    assert finding.amount == pytest.approx(FAULT.amount, abs=4 * finding.amount_sigma + 1e-3)
+
+
+OWN = np.random.default_rng(0).normal(0, 1e-3, (35 - LOST, 2))
+"""Constants, each BPM's."""
+
+
+@pytest.mark.parametrize("value", [0.0, 2e-3, OWN], ids=["zero", "one constant", "each its own"])
+def test_constants_after_a_bpm_in_all_shots_are_a_lost_beam(small_ring, data, value):
+    lost = constant(data, value)
+    check = lost_in(check_data(small_ring, lost))
+    assert check.status == "note"
+    assert f"no signal: beam lost after {data.monitors[LOST - 1]} " in check.sentence
+    assert "every shot" in check.sentence
+    result = diagnose(small_ring, lost)
+    the_fault_alone(result)
+    assert [w for w in result.warnings if "no signal" in w] == [check.sentence]
+    assert not any("35 monitors" in w or "count as not there" in w for w in result.warnings)
+
+
+def test_a_beam_lost_near_the_end_leaves_no_dead_bpms(small_ring, data):
+    """Few BPMs without a reading would else be a finding each."""
+    the_fault_alone(diagnose(small_ring, constant(data, after=31)))
+    the_fault_alone(diagnose(small_ring, constant(data, np.nan, after=31)))
+
+
+@pytest.mark.parametrize("value", [0.0, 2e-3])
+def test_one_shot_shows_a_lost_beam_too(small_ring, data, value):
+    one = constant(data.select(shots=[0]), value)
+    said = lost_in(check_data(small_ring, one)).sentence
+    assert f"beam lost after {data.monitors[LOST - 1]} " in said
+    result = diagnose(small_ring, one)
+    assert "QD::5" in {m.element for m in result.findings[0].credible_set}
+    assert len(result.findings) == 1
+
+
+def test_a_shot_that_is_lost_is_used_up_to_there(small_ring, data):
+    lost = constant(data, 0.0, slice(2, 3))
+    assert "in 1 of 6 shots" in lost_in(check_data(small_ring, lost)).sentence
+    the_fault_alone(diagnose(small_ring, lost))
+
+
+def test_shots_that_end_at_different_bpms(small_ring, data):
+    lost = constant(constant(data, 0.0, slice(0, 2)), 0.0, slice(2, 4), after=25)
+    said = lost_in(check_data(small_ring, lost)).sentence
+    assert f"between {data.monitors[LOST - 1]} " in said
+    assert f"and {data.monitors[24]} " in said
+    assert "in 4 of 6 shots" in said
+
+
+@pytest.mark.parametrize("at", [12, 34])
+def test_one_frozen_bpm_is_frozen(small_ring, data, at):
+    """In the middle, and the last one: a beam is lost for all that follow."""
+    readings = data.readings.copy()
+    readings[:, :, at] = 1e-3, -2e-4
+    frozen = replace(data, readings=readings)
+    checks = {check.name: check for check in check_data(small_ring, frozen).checks}
+    assert checks["lost beam"].status == "fine"
+    assert data.monitors[at] in checks["frozen monitors"].sentence
+    found = {(f.effect, f.element) for f in diagnose(small_ring, frozen).findings}
+    assert found == {("monitor_dead", data.monitors[at]), (FAULT.effect, FAULT.element)}
+
+
+def test_coarse_readings_are_no_lost_beam(small_ring):
+    """Neighbours read the same digit now and then: three in a row prove nothing."""
+    coarse = simulate(small_ring, shots=4, seed=2, amplitude=2e-5, noise=5e-6).measurement()
+    readings = np.round(coarse.readings / 5e-5) * 5e-5
+    checks = check_data(small_ring, replace(coarse, readings=readings, noise=None))
+    assert lost_in(checks).status == "fine"
+
+
+def test_a_copied_shot_stays_a_copy(small_ring, data):
+    copied = replace(data, readings=np.repeat(data.readings[:1], 6, axis=0))
+    with pytest.raises(MeasurementError, match="one reading was copied"):
+        diagnose(small_ring, copied)
+
+
+def test_a_plane_of_zeros_was_not_read(small_ring, data):
+    readings = data.readings.copy()
+    readings[..., 1] = 0.0
+    found = check_data(small_ring, replace(data, readings=readings))
+    assert next(check.sentence for check in found.told).startswith("no BPM reads y")
+    the_fault_alone(diagnose(small_ring, replace(data, readings=readings)))
+
+
+# --- sum signals ----------------------------------------------------------------------------------
+def with_sums(data, rng):
+    """Readings of noise after the loss, and sum signals of BPMs whose gains differ."""
+    readings = data.readings.copy()
+    readings[:, :, LOST:] = rng.normal(0, 3e-4, readings[:, :, LOST:].shape)
+    sums = rng.uniform(600, 1400, (len(readings), len(data.monitors)))
+    sums[:, LOST:] *= 0.01
+    return readings[:, 0], sums
+
+
+def long_table(path, data, readings, sums, name):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["shot", "bpm", "x [mm]", "y [mm]", name])
+        for shot, (values, own) in enumerate(zip(readings, sums, strict=True)):
+            for monitor, (x, y), s in zip(data.monitors, values, own, strict=True):
+                writer.writerow([shot, monitor, 1e3 * x, 1e3 * y, s])
+    return path
+
+
+def wide_table(path, data, readings, sums, name):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        kinds = ("x [mm]", "y [mm]", name)
+        writer.writerow(["shot", *(f"{m} {kind}" for m in data.monitors for kind in kinds)])
+        for shot, (values, own) in enumerate(zip(readings, sums, strict=True)):
+            row = np.column_stack([1e3 * values, own])
+            writer.writerow([shot, *row.ravel()])
+    return path
+
+
+def hdf5_file(path, data, readings, sums, name):
+    path = path.with_suffix(".h5")
+    with h5py.File(path, "w") as file:
+        file["names"] = [name.encode() for name in data.monitors]
+        for plane, key in enumerate("xy"):
+            file[key] = 1e3 * readings[..., plane]
+            file[key].attrs["unit"] = "mm"
+        file[name] = sums
+    return path
+
+
+@pytest.mark.parametrize("write", [long_table, wide_table, hdf5_file])
+@pytest.mark.parametrize("name", ["sum", "Intensity"])
+def test_sum_signals_say_where_the_beam_was(small_ring, data, tmp_path, rng, write, name):
+    path = write(tmp_path / "readings.csv", data, *with_sums(data, rng), name)
+    brought = bring_in([path], Options(ring=small_ring, noise=2e-5))
+    read = np.isfinite(brought.measurement.readings).any(axis=(0, 1, 3))
+    assert read.sum() == LOST
+    (said,) = [text for text in brought.assumed if "sum signal" in text]
+    assert f"at {35 - LOST} BPMs in 6 of 6 shots, the first is {data.monitors[LOST]}" in said
+    the_fault_alone(diagnose(small_ring, brought.measurement))
+    assert lost_in(check_data(small_ring, brought.measurement)).status == "note"
+
+
+def test_sum_signals_of_a_beam_change_nothing(small_ring, data, tmp_path, rng):
+    sums = rng.uniform(0.3, 1.4, (6, 35))
+    path = wide_table(tmp_path / "r.csv", data, data.readings[:, 0], sums, "charge [nC]")
+    brought = bring_in([path], Options(ring=small_ring)).measurement
+    np.testing.assert_allclose(brought.readings, data.readings, rtol=1e-9)
+
+
+def test_a_sum_without_numbers_is_passed_over(small_ring, data, tmp_path):
+    path = long_table(tmp_path / "r.csv", data, data.readings[:, 0], [["ok"] * 35] * 6, "sum")
+    brought = bring_in([path], Options(ring=small_ring)).measurement
+    np.testing.assert_allclose(brought.readings, data.readings, rtol=1e-9)

@@ -1,0 +1,113 @@
+"""Readings of one plane: the other one carries no information, and nothing is named in it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.diagnosis.doctor import check_data
+from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
+
+PLANES = ("x", "y")
+
+
+def one_plane(data, plane, launches_known=True):
+    """The measurement without readings in the other plane."""
+    readings = data.readings.copy()
+    readings[..., 1 - PLANES.index(plane)] = np.nan
+    known = {}
+    if not launches_known:
+        shots = len(data.launches)
+        known = {
+            "launches": np.zeros((shots, 5)), "launch_sigma": np.tile(UNKNOWN_LAUNCH, (shots, 1))
+        }  # fmt: skip
+    return replace(data, readings=readings, **known)
+
+
+def measured(ring, causes, plane, launches_known=True, seed=1, **options):
+    made = simulate(ring, causes, shots=6, seed=seed, **options).measurement()
+    return one_plane(made, plane, launches_known)
+
+
+@pytest.mark.parametrize("launches_known", [True, False], ids=["launched", "unknown"])
+@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize("amplitude", [3e-4, 1e-3, 3e-3])
+def test_a_healthy_ring_is_healthy_in_one_plane(small_ring, plane, launches_known, amplitude):
+    """At 3 mm sextupoles move the orbit by 100 µm with the plane that is not read: five sigma."""
+    data = measured(small_ring, [], plane, launches_known, amplitude=amplitude)
+    result = diagnose(small_ring, data)
+    assert (result.verdict, result.findings) == ("nothing", ())
+    assert result.fit_after.chi2_per_dof < 1.2
+    assert not any("settled" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("launches_known", [True, False], ids=["launched", "unknown"])
+@pytest.mark.parametrize("plane", PLANES)
+def test_a_weak_quadrupole_is_found_in_one_plane(small_ring, plane, launches_known):
+    cause = Cause("quadrupole_gradient", "QD::5", -0.1)
+    result = diagnose(small_ring, measured(small_ring, [cause], plane, launches_known))
+    (finding,) = result.findings
+    members = {(m.effect, m.element): m for m in finding.credible_set}
+    assert (cause.effect, cause.element) in members
+    own = members[cause.effect, cause.element]
+    assert own.amount == pytest.approx(cause.amount, abs=4 * finding.amount_sigma)
+
+
+@pytest.mark.parametrize(
+    ("plane", "cause"),
+    [
+        ("x", Cause("quadrupole_offset_y", "QD::5", 3e-4)),
+        ("x", Cause("corrector_kick_y", "v5", 1e-4)),
+        ("y", Cause("quadrupole_offset_x", "QD::5", 3e-4)),
+    ],
+)
+def test_what_acts_in_the_other_plane_alone_is_not_named(small_ring, plane, cause):
+    result = diagnose(small_ring, measured(small_ring, [cause], plane))
+    assert result.verdict in ("nothing", "distributed")
+    assert result.findings == ()
+    unread = PLANES[1 - PLANES.index(plane)]
+    assert any(f"no BPM reads {unread}" in warning for warning in result.warnings)
+
+
+def test_an_energy_offset_is_seen_in_y_by_the_focusing(small_ring):
+    result = diagnose(small_ring, measured(small_ring, [Cause("energy_offset", None, 1e-3)], "y"))
+    members = {m.effect: m for m in result.findings[0].credible_set}
+    assert members["energy_offset"].amount == pytest.approx(1e-3, rel=0.25)
+
+
+@pytest.mark.parametrize(("plane", "unread"), [("x", "y"), ("y", "x")])
+def test_a_strong_kick_in_the_other_plane_has_a_place_and_no_amount(small_ring, plane, unread):
+    """Sextupoles pass it on to the plane that was read."""
+    cause = Cause(f"quadrupole_offset_{unread}", "QD::5", 3e-3)
+    result = diagnose(small_ring, measured(small_ring, [cause], plane, seed=2))
+    (finding,) = result.findings
+    low, high = finding.where
+    assert (finding.verdict, finding.amount) == ("located", None)
+    assert low <= small_ring["QD::5"].s <= high
+    assert any(f"upstream in {unread}" in warning for warning in result.warnings)
+
+
+def test_a_corrector_is_named_in_its_own_plane_alone(small_ring):
+    cause = Cause("corrector_kick_y", "v5", 3e-5)
+    result = diagnose(small_ring, measured(small_ring, [cause], "y"))
+    members = {(m.effect, m.element) for m in result.findings[0].credible_set}
+    assert (cause.effect, cause.element) in members
+    assert not any(effect.endswith("_x") for effect, _ in members)
+
+
+@pytest.mark.parametrize("plane", PLANES)
+def test_the_check_states_which_plane_was_not_read(petra3, plane):
+    """Sections of eight BPMs leave the noise that is there, whatever the other plane would do."""
+    fault = [Cause("quadrupole_gradient", "qd::12", -0.05)]
+    found = check_data(petra3, measured(petra3, fault, plane))
+    (planes,) = [check for check in found.checks if check.name == "planes"]
+    unread = PLANES[1 - PLANES.index(plane)]
+    assert planes.status == "note"
+    assert planes.sentence.startswith(f"no BPM reads {unread}")
+    assert {check.name for check in found.told} == {"planes"}
+
+
+def test_both_planes_are_read(small_ring):
+    found = check_data(small_ring, simulate(small_ring, shots=3).measurement())
+    assert [check.status for check in found.checks if check.name == "planes"] == ["fine"]

@@ -1,0 +1,154 @@
+"""Readings without a signal: after the beam was lost electronics go on and write 0, or a constant.
+
+>>> lost = beam_lost(measurement)
+>>> lost.without                                  # the measurement, those readings NaN
+>>> lost.first                                    # first reading without beam, [shot]
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.measurement.trajectory import Measurement
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Places = NDArray[np.intp]
+
+FEWEST = 3
+"""BPMs without signal, the last ones, from which the beam is lost: one or two may be frozen."""
+CHANCE = 1e-4
+"""That successive BPMs read the same by chance, below which they have no signal."""
+NO_BEAM = 0.05
+"""Share of the BPMs' upstream, of their median, from which a sum signal is that of no beam."""
+MANY = 200
+"""Sum signals of which a median is taken: of those of many turns the first."""
+REPEATED = 0.01
+"""Share of successive readings that are equal in both planes, at least: few readings show none."""
+
+
+@dataclass(frozen=True)
+class LostBeam:
+    """Where the signals of a measurement end.
+
+    Attributes:
+        without: the measurement with the readings after that NaN, and with those of a plane that is
+            one constant.
+        first: the first reading without signal, turn * monitors + monitor, [shot]; the number of
+            readings where the signal goes on to the end.
+        last: the last reading with a signal before that, [shot]; -1 where there is none.
+    """
+
+    without: Measurement
+    first: Places
+    last: Places
+
+    @property
+    def shots(self) -> Places:
+        """Indices of the shots in which the beam was lost."""
+        return np.flatnonzero(self.first < self.without.readings[0].size // 2)
+
+
+def beam_lost(data: Measurement) -> LostBeam:
+    """Where the signals of each shot end in a constant.
+
+    No signal is a run of the last BPMs of a shot that read the same, to the last digit in both
+    planes; or of which each reads the same in all shots. A run that begins at the first BPM of all
+    shots is none.
+
+    Args:
+        data: monitors in beam order.
+    """
+    shots = len(data.readings)
+    data = _planes(data)
+    flat = data.readings.reshape(shots, -1, 2)
+    there = np.isfinite(flat)
+    count = flat.shape[1]
+    first = np.full(shots, count, dtype=np.intp)
+    for shot in range(shots):
+        first[shot] = _constant_from(flat[shot], there[shot])
+    if not first.any():
+        first[:] = count
+    first = np.minimum(first, _frozen_from(flat, there))
+    after = np.arange(count) >= first[:, None]
+    if not (after[..., None] & there).any():
+        return LostBeam(data, np.full(shots, count, dtype=np.intp), np.full(shots, count - 1))
+    kept = there & ~after[..., None]
+    last = np.where(kept.any(axis=2), np.arange(count), -1).max(axis=1)
+    readings = np.where(kept, flat, np.nan).reshape(data.readings.shape)
+    return LostBeam(replace(data, readings=readings), first, last)
+
+
+def _planes(data: Measurement) -> Measurement:
+    """Without a plane that is one constant at all BPMs in all shots, where the other one is none.
+
+    Readings without noise may be so: the orbit of a flat ring.
+    """
+    values = [own[np.isfinite(own)] for own in np.moveaxis(data.readings, 3, 0)]
+    constant = [len(own) > 1 and not np.ptp(own) for own in values]
+    exact = data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
+    if exact or sum(constant) != 1 or not all(len(own) for own in values):
+        return data
+    return replace(data, readings=np.where(constant, np.nan, data.readings))
+
+
+def _constant_from(readings: Array, there: Flags) -> int:
+    """The first of the last readings [reading, 2] of a shot that are one constant."""
+    count = len(readings)
+    read = np.flatnonzero(there.any(axis=1))
+    if not len(read):
+        return count
+    own = readings[read]
+    same = ((own[1:] == own[:-1]) | ~there[read][1:]).all(axis=1)
+    differ = np.flatnonzero(~same)
+    start = int(differ[-1]) + 1 if len(differ) else 0
+    number = len(read) - start
+    usual = max(float(same[: max(start - 1, 0)].mean()) if start > 1 else 0.0, REPEATED)
+    by_chance = usual ** (number - 1)
+    return int(read[start]) if number >= FEWEST and by_chance <= CHANCE else count
+
+
+def _frozen_from(readings: Array, there: Flags) -> int:
+    """The first of the last readings [shot, reading, 2] that are each the same in all shots."""
+    count = readings.shape[1]
+    several = there.sum(axis=0) > 1  # [reading, plane]
+    high = np.where(there, readings, -np.inf).max(axis=0)
+    low = np.where(there, readings, np.inf).min(axis=0)
+    stuck = (several & (high == low)) | ~there.any(axis=0)
+    signal = np.flatnonzero(~stuck.all(axis=1))
+    start = int(signal[-1]) + 1 if len(signal) else 0
+    number = int(several[start:].any(axis=1).sum())
+    return start if start and number >= FEWEST else count
+
+
+def no_beam(sums: Array) -> Flags:
+    """Where a sum signal is next to nothing of that of the BPMs upstream, [shot, turn, monitor]."""
+    none = np.zeros(sums.shape, dtype=bool)
+    for signal, own in zip(np.abs(sums).reshape(len(sums), -1),
+                           none.reshape(len(sums), -1), strict=True):  # fmt: skip
+        upstream: list[float] = []
+        read = np.flatnonzero(np.isfinite(signal))
+        usual = float(np.median(signal[read])) if len(read) else 0.0
+        for place in read:
+            own[place] = signal[place] <= NO_BEAM * usual
+            if not own[place] and len(upstream) < MANY:
+                upstream.append(float(signal[place]))
+                usual = float(np.median(upstream))
+    return none
+
+
+def about_sums(sums: Array, silent: Flags, read: Flags, names: Sequence[str]) -> list[str]:
+    """What is said of sum signals [shot, turn, monitor], and of readings that are left out."""
+    if not np.isfinite(sums).any():
+        return []
+    lost = silent & read
+    if not lost.any():
+        return ["the sum signals are those of a beam at every BPM"]
+    shots = np.flatnonzero(lost.any(axis=(1, 2)))
+    first = names[int(lost[shots[0]].reshape(-1).argmax()) % len(names)]
+    return [
+        f"no beam by the sum signal at {lost.any(axis=(0, 1)).sum()} BPMs in {len(shots)} of "
+        f"{len(sums)} shots, the first is {first}: their readings are left out"
+    ]
