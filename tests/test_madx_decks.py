@@ -81,7 +81,7 @@ REFUSED = {
 WARNED = {
     "makethin": (PLAIN + "makethin, sequence=ring;", "MAKETHIN is not carried out"),
     "system": (PLAIN + 'system, "touch x";', "SYSTEM is not run"),
-    "thick knl": (PLAIN + "qf, knl={0,0.01};", r"KNL of QUADRUPOLE qf \(1\) is left out"),
+    "thick knl": (PLAIN + "qf, knl={0,0.01};", r"left out.*KNL of the QUADRUPOLE .* of qf \(1\)"),
     "crab cavity": (
         with_element("c: crabcavity, volt=1, at=4.95;"),
         "voltage does in the CRABCAVITY",
@@ -90,7 +90,7 @@ WARNED = {
         with_element("d: multipole, knl={0,0,0,0,9}, at=4.95;"),
         "above the sextupole of d",
     ),
-    "later length": (PLAIN + "qf, l=0.5;", r"the later L or ANGLE of qf \(1\) is left out"),
+    "later length": (PLAIN + "qf, l=0.5;", r"left out.*the later L or ANGLE .* of qf \(1\)"),
 }
 
 

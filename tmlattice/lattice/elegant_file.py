@@ -9,7 +9,6 @@ Nothing of a file is run: RPN is worked out by `_Rpn`, which knows numbers, name
 
 import math
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.errors import LatticeError, first_of, plain, unknown_name
-from tmlattice.lattice.parts import Part, ring_of_parts
+from tmlattice.errors import LatticeError, plain
+from tmlattice.lattice.lines import DEEPEST, Items, chosen, inner_names, items_of, laid_out
+from tmlattice.lattice.parts import Part, Report, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 MOST_FILES = 1000
 MOST_BYTES = 200_000_000
 MOST_WORK = 2_000_000
 """Words of RPN, and elements of lines."""
-MOST_ELEMENTS = 1_000_000
 LONGEST_STATEMENT = 5000
 """Lines."""
-DEEPEST = 50
-"""Lines in lines, and files in files."""
 LIGHT = 299792458.0
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -152,18 +149,13 @@ def read_elegant(
         reader.read(path)
     except LatticeError as error:
         raise LatticeError(f"'{path}' cannot be read as elegant's lattice: {error}") from error
-    use = reader.chosen(path, sequence)
+    inside = [name for items in reader.lines.values() for name in inner_names(items)]
+    use = chosen(path, list(reader.lines), sequence, reader.used or "", inside)
     if energy is None:
         raise LatticeError(f"'{path}' has no beam energy; say energy= (GeV)")
     try:
         parts = reader.parts(use, energy)
-        if reader.left_out:
-            what = "; ".join(
-                f"{reason} of {first_of(list(dict.fromkeys(names)), 3)} ({len(names)})"
-                for reason, names in reader.left_out.items()
-            )
-            warnings.warn(f"'{path}': left out of the model: {what}", stacklevel=4)
-        return ring_of_parts(parts, name, energy, charge=-1.0)
+        return ring_of_parts(parts, name, energy, charge=-1.0, report=reader.report)
     except LatticeError as error:
         raise LatticeError(f"'{path}' cannot be read as elegant's lattice: {error}") from error
 
@@ -311,10 +303,6 @@ class _Element:
         return value
 
 
-Items = list[tuple[int, bool, Any]]
-"""Of a line: how often, reversed, and the name or the items."""
-
-
 class _Reader:
     """What the statements of a file define."""
 
@@ -323,7 +311,7 @@ class _Reader:
         self.elements: dict[str, _Element] = {}
         self.lines: dict[str, Items] = {}
         self.used: str | None = None
-        self.left_out: dict[str, list[str]] = {}
+        self.report = Report()
         self._folded: dict[str, str] = {}
         self._files = 0
         self._rigidity = 0.0
@@ -389,7 +377,7 @@ class _Reader:
         if name in self.lines or name in self.elements:
             raise LatticeError(f"'{plain(name, 60)}' is defined twice; give one another name")
         if line:
-            known[name] = self._items(line[1].strip(), 0)  # type: ignore[assignment]
+            known[name] = items_of(line[1], _split, _bare)  # type: ignore[assignment]
             return
         head, *given = _split(rest) or [""]
         parent = self.elements.get(_bare(head))
@@ -427,31 +415,6 @@ class _Reader:
             raise LatticeError(f"{key} is an expression without a value")
         return value
 
-    # --- lines ------------------------------------------------------------------------------------
-    def _items(self, text: str, depth: int) -> Items:
-        if depth > DEEPEST:
-            raise LatticeError("a line has too many nested brackets")
-        bare = text
-        if bare[:1] == "(":
-            if bare[-1:] != ")":
-                raise LatticeError("a bracket is left open; close it")
-            bare = bare[1:-1]
-        items: Items = []
-        for item in _split(bare):
-            match = re.fullmatch(
-                r'(-?)\s*(?:(\d+)\s*\*)?\s*(-?)\s*(\(.*\)|"[^"]*"|[^\s()*",=]+)', item, re.DOTALL
-            )
-            if match is None:
-                raise LatticeError(f"'{plain(item, 60)}' is no item of a line")
-            times, what = int(match[2] or 1), match[4]
-            if times > MOST_ELEMENTS:
-                raise LatticeError(f"a line is repeated {times} times: no ring is as long")
-            if "<<" in what:
-                raise LatticeError("names that are edited in a line (<<) are not read")
-            inner = self._items(what, depth + 1) if what[0] == "(" else _bare(what)
-            items.append((times, bool(match[1]) != bool(match[3]), inner))
-        return items
-
     def _found(self, name: str) -> str:
         """The name as it is defined; outside quotation marks elegant has capitals."""
         if name in self.elements or name in self.lines:
@@ -461,65 +424,6 @@ class _Reader:
         if name.casefold() in self._folded:
             return self._folded[name.casefold()]
         raise LatticeError(f"no element or line '{plain(name, 60)}' is defined")
-
-    def _count(self, items: Items, known: dict[str, int], depth: int = 0) -> int:
-        """Elements of a line, counted before it is laid out."""
-        if depth > 2 * DEEPEST:
-            raise LatticeError("a line contains itself")
-        total = 0
-        for times, _, what in items:
-            if isinstance(what, list):
-                own = self._count(what, known, depth + 1)
-            elif (name := self._found(what)) in self.lines:
-                if name not in known:
-                    known[name] = self._count(self.lines[name], known, depth + 1)
-                own = known[name]
-            else:
-                own = 1
-            total += times * own
-            if total > MOST_ELEMENTS:
-                raise LatticeError("its line has more elements than any ring")
-        return total
-
-    def _names(self, items: Items, backwards: bool = False) -> list[tuple[str, bool]]:
-        """Elements in beam order, each with whether it is reversed."""
-        names: list[tuple[str, bool]] = []
-        for times, turned, what in reversed(items) if backwards else items:
-            way = turned != backwards
-            if isinstance(what, list):
-                own = self._names(what, way)
-            elif (name := self._found(what)) in self.lines:
-                own = self._names(self.lines[name], way)
-            else:
-                own = [(name, way)]
-            names += times * own
-        return names
-
-    def chosen(self, path: Path, wanted: str | None) -> str:
-        """Of the lines the one that is the ring."""
-        if not self.lines:
-            raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
-        names = {name.casefold(): name for name in self.lines}
-        if wanted:
-            if wanted.casefold() not in names:
-                raise unknown_name(f"sequence in '{path}' named", wanted, list(self.lines))
-            return names[wanted.casefold()]
-        if self.used:
-            if self.used.casefold() not in names:
-                raise LatticeError(
-                    f"'{path}' says USE, {plain(self.used, 60)}, and has no such line"
-                )
-            return names[self.used.casefold()]
-        if "ring" in names:
-            return names["ring"]
-        inside = {name.casefold() for items in self.lines.values() for name in _inner(items)}
-        outermost = [name for name in self.lines if name.casefold() not in inside]
-        outermost = outermost or list(self.lines)
-        if len(outermost) > 1:
-            raise LatticeError(
-                f"'{path}' has the sequences {', '.join(outermost)}; name one with sequence="
-            )
-        return outermost[0]
 
     # --- the ring ---------------------------------------------------------------------------------
     def parts(self, use: str, energy: float) -> list[Part]:
@@ -533,8 +437,8 @@ class _Reader:
         self._rigidity = 1e9 * momentum / LIGHT
         self._slip = (ELECTRON_GEV / energy) ** 2
         items = self.lines[use]
-        self.rpn.work(self._count(items, {}))
-        names = self._names(items)
+        names = laid_out(items, self.lines, self._found)
+        self.rpn.work(len(names))
         made: dict[tuple[Any, ...], list[Part]] = {}
         parts: list[Part] = []
         for k, (name, turned) in enumerate(names):
@@ -556,9 +460,6 @@ class _Reader:
             j += step
         return 0 <= j < len(names) and names[j][0] == names[k][0]
 
-    def _leave(self, reason: str, name: str) -> None:
-        self.left_out.setdefault(reason, []).append(name)
-
     def _converted(self, element: _Element, turned: bool, inner: tuple[bool, bool]) -> list[Part]:
         """What one element is in the ring."""
         cls, name, where = element.cls, element.name.lower(), element.where
@@ -574,7 +475,7 @@ class _Reader:
                         f"{named} changes the beam by its {key}, which is not modelled; take it out"
                     )
         if cls in _COLLECTIVE:
-            self._leave(f"what {cls} does", name)
+            self.report.left_out(f"what {cls} does", name)
         if cls in (*_DRIFTS, *_SILENT, *_COLLECTIVE, *_INERT):
             length = element.number("L")
             return [Part(name, "drift" if length else "marker", {"l": length}, where)]
@@ -583,7 +484,7 @@ class _Reader:
                 continue
             if key in NONLINEAR or (key == "K3" and cls in ("CSBEND", "CCBEND", "CSRCSBEND",
                                                             "KSBEND")):  # fmt: skip
-                self._leave(key, name)
+                self.report.left_out(key, name)
             elif key not in NO_EFFECT and not self._harmless(cls, key, value):
                 raise LatticeError(
                     f"the attribute {plain(key, 40)} of {named} is not modelled; set it to 0 or "
@@ -780,7 +681,7 @@ class _Reader:
             r[2:4, 2:4] = [[cos, sin / focus], [-focus * sin, cos]]
         if any(element.number(key) for key in ("DX", "DY", "DZ")):
             raise LatticeError(f"WIGGLER '{plain(element.name, 60)}' is displaced; set DX to 0")
-        self._leave("what it has beyond its first-order matrix", name)
+        self.report.left_out("what it has beyond its first-order matrix", name)
         values = {"l": length, "rmat": r, "tilt": element.number("TILT")}
         return Part(name if "wig" in name else f"{name}_wiggler", "matrix", values, element.where)
 
@@ -883,13 +784,6 @@ def _bare(text: str) -> str:
     """A name: as it is in quotation marks, else in capitals."""
     text = text.strip()
     return text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text.upper()
-
-
-def _inner(items: Items) -> set[str]:
-    names: set[str] = set()
-    for _, _, what in items:
-        names |= _inner(what) if isinstance(what, list) else {what}
-    return names
 
 
 def _class_of(word: str) -> str:

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.errors import LatticeError, first_of, plain, unknown_name
+from tmlattice.errors import LatticeError, first_of, plain
+from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out
 from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.madx_language import (
     CONSTANTS,
@@ -31,12 +32,11 @@ from tmlattice.lattice.madx_language import (
     unquoted,
     values,
 )
-from tmlattice.lattice.parts import ACTING, MODELLED, NO_EFFECT, STATIC, Part, ring_of_parts
+from tmlattice.lattice.parts import ACTING, MODELLED, NO_EFFECT, STATIC, Part, Report, ring_of_parts
 from tmlattice.lattice.ring import Ring
 
 MOST_WORK = 4_000_000
 """Statements (ten each), names and elements looked up; the LHC needs some hundred thousand."""
-MOST_ELEMENTS = 1_000_000
 MOST_FILES = 1000
 MOST_BYTES = 200_000_000
 ROUNDING = 1e-6
@@ -131,13 +131,6 @@ class _Slot:
     length: float
 
 
-@dataclass
-class _Line:
-    """Elements, lines and sequences: (how often, reversed, name or items)."""
-
-    items: list[tuple[int, bool, Any]]
-
-
 def read_madx(
     path: Path, name: str, sequence: str | None = None, energy: float | None = None
 ) -> Ring:
@@ -173,14 +166,10 @@ def read_madx(
             reader.warnings.append(
                 f"{first_of(names)} ({len(names)}) have no value: taken for 0, as by MAD-X"
             )
-        for what, names in reader.passed_over.items():
-            reader.warnings.append(
-                f"{what} {first_of(names, 3)} ({len(names)}) is left out, as by MAD-X"
-            )
         energy = beam.energy if energy is None else energy
         if reader.warnings:
             warnings.warn(f"'{path}': {'; '.join(reader.warnings)}", stacklevel=4)
-        return ring_of_parts(parts, name, energy, beam.mass, beam.charge)
+        return ring_of_parts(parts, name, energy, beam.mass, beam.charge, reader.report)
     except LatticeError as error:
         raise LatticeError(f"'{path}' cannot be read as MAD-X: {error}") from error
 
@@ -199,14 +188,14 @@ class _Reader:
         self.variables: dict[str, float | Evaluate] = dict(CONSTANTS)
         self.elements: dict[str, _Definition] = {}
         self.sequences: dict[str, _Sequence] = {}
-        self.lines: dict[str, _Line] = {}
+        self.lines: dict[str, Items] = {}
         self.macros: dict[str, tuple[list[str], str]] = {}
         self.beams: dict[str, Beam] = {"": Beam()}
         self.order: list[str] = []
         self.used = ""
         self.undefined: set[str] = set()
         self.warnings: list[str] = []
-        self.passed_over: dict[str, list[str]] = {}
+        self.report = Report()
         self.rbarc = self.thin_focusing = True
         self._open: _Sequence | None = None
         self._edited: _Sequence | None = None
@@ -367,7 +356,7 @@ class _Reader:
     def _define(self, name: str, rest: str, statement: Statement) -> None:
         line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
         if line:
-            self.lines[name] = _Line(self._line_items(line[1], 0))
+            self.lines[name] = items_of(line[1], _line_parts, _bare)
             self._known_as(name)
             return
         head, *items = split(rest)
@@ -781,84 +770,12 @@ class _Reader:
         turned = [replace(s, centre=length - s.centre) for s in self.slots(self._edited)]
         self._put(turned[::-1])
 
-    # --- lines ----------------------------------------------------------------------------------
-    def _line_items(self, text: str, depth: int) -> list[tuple[int, bool, Any]]:
-        bare = text.strip()
-        if depth > 50:
-            raise LatticeError("a line has more than 50 nested brackets")
-        if bare[:1] == "(" and bare[-1:] == ")":
-            bare = bare[1:-1]
-        items = []
-        for item in (i for part in split(bare) for i in split(part, "+")):
-            if not item:
-                continue
-            match = re.fullmatch(
-                r"(-?)\s*(?:(\d+)\s*\*)?\s*(-?)\s*(\(.*\)|\"[^\"]*\"|'[^']*'|[\w.$%]+)",
-                item,
-                re.DOTALL,
-            )
-            if match is None:
-                raise LatticeError(f"'{plain(item, 60)}' is no item of a line")
-            times = int(match[2] or 1)
-            if times > MOST_ELEMENTS:
-                raise LatticeError(f"a line is repeated {times} times: no ring is as long")
-            what = match[4]
-            inner = self._line_items(what, depth + 1) if what[0] == "(" else unquoted(what).lower()
-            items.append((times, bool(match[1]) != bool(match[3]), inner))
-        return items
-
-    def _line_length(self, items: Any, known: dict[str, int], depth: int = 0) -> int:
-        """Elements of a line, counted before it is laid out."""
-        if depth > 100:
-            raise LatticeError("a line contains itself")
-        total = 0
-        for times, _, what in items:
-            if isinstance(what, list):
-                own = self._line_length(what, known, depth + 1)
-            elif what in self.lines:
-                if what not in known:
-                    known[what] = self._line_length(self.lines[what].items, known, depth + 1)
-                own = known[what]
-            else:
-                own = 1
-            total += times * own
-            if total > MOST_ELEMENTS:
-                raise LatticeError("its line has more elements than any ring")
-        return total
-
-    def _line_names(self, items: Any, backwards: bool = False) -> list[str]:
-        names: list[str] = []
-        for times, turned, what in reversed(items) if backwards else items:
-            if isinstance(what, str) and what not in self.lines:
-                own = [what]
-            else:
-                inner = what if isinstance(what, list) else self.lines[what].items
-                own = self._line_names(inner, backwards != turned)
-            names += times * own
-        return names
-
     # --- the ring -------------------------------------------------------------------------------
     def chosen(self, path: Path, wanted: str | None) -> str:
         """Of the sequences and lines the one that is the ring."""
-        if not self.order:
-            raise LatticeError(f"'{path}' has no SEQUENCE and no LINE; give a file with one")
-        if wanted:
-            if wanted.casefold() not in self.order:
-                raise unknown_name(f"sequence in '{path}' named", wanted, self.order)
-            return wanted.casefold()
-        if self.used:
-            return self.used
-        if "ring" in self.order:
-            return "ring"
-        inside = {node.name for s in self.sequences.values() for node in s.nodes}
-        for line in self.lines.values():
-            inside |= _names_in(line.items)
-        outermost = [name for name in self.order if name not in inside] or self.order
-        if len(outermost) > 1:
-            raise LatticeError(
-                f"'{path}' has the sequences {', '.join(outermost)}; name one with sequence="
-            )
-        return outermost[0]
+        inside = [node.name for s in self.sequences.values() for node in s.nodes]
+        inside += [name for items in self.lines.values() for name in inner_names(items)]
+        return chosen(path, self.order, wanted, self.used, inside)
 
     def parts(self, use: str) -> list[Part]:
         """The elements of the ring in beam order, drifts included."""
@@ -866,10 +783,9 @@ class _Reader:
         if use in self.sequences:
             sequence = self.sequences[use]
             return self._laid_out(sequence, beam, self._length(use))
-        items = self.lines[use].items
-        self.work(self._line_length(items, {}))
+        names = [name for name, _ in laid_out(self.lines[use], self.lines)]
+        self.work(len(names))
         parts: list[Part] = []
-        names = self._line_names(items)
         circumference = sum(self._length(name) for name in names)
         for name in names:
             if name in self.sequences:
@@ -909,7 +825,7 @@ class _Reader:
             definition = self.elements[name]
             self._made[name, length] = self._new_part(definition, length, beam, circumference)
             if abs(length - self._element_length(definition)) > 1e-12:
-                self.passed_over.setdefault("the later L or ANGLE of", []).append(name)
+                self.report.left_out("the later L or ANGLE (as in MAD-X)", name)
         return self._made[name, length]
 
     def _new_part(
@@ -934,9 +850,8 @@ class _Reader:
                 own["lrad"] = 0.0
         for attribute in _NOT_IN_TWISS.get(keyword, ()):
             if np.any(own.pop(attribute, 0.0)):
-                self.passed_over.setdefault(f"{attribute.upper()} of {keyword.upper()}", []).append(
-                    definition.name
-                )
+                what = f"{attribute.upper()} of the {keyword.upper()} (as in MAD-X's TWISS)"
+                self.report.left_out(what, definition.name)
         if float(beam.given.get("bv", 1.0)) == -1:
             own = _reversed_fields(keyword, own)
         return Part(definition.name, keyword, own, definition.where)
@@ -963,6 +878,15 @@ def _constant(value: float) -> Evaluate:
     return lambda names: value
 
 
+def _bare(word: str) -> str:
+    return unquoted(word).lower()
+
+
+def _line_parts(text: str) -> list[str]:
+    """Items of a line; MAD-X takes a plus for a comma."""
+    return [item for part in split(text) for item in split(part, "+")]
+
+
 def _refer(given: Given) -> str:
     word = unquoted(given.text).lower()
     if word in ("centre", "center"):
@@ -970,13 +894,6 @@ def _refer(given: Given) -> str:
     if word not in ("entry", "exit"):
         raise LatticeError(f"REFER is '{plain(word, 40)}'; it is ENTRY, CENTRE or EXIT")
     return word
-
-
-def _names_in(items: Any) -> set[str]:
-    found: set[str] = set()
-    for _, _, what in items:
-        found |= _names_in(what) if isinstance(what, list) else {what}
-    return found
 
 
 def _with_matrix(own: dict[str, Any]) -> dict[str, Any]:

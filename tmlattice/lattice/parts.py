@@ -107,16 +107,18 @@ NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl",
 """Attributes that act beyond the linear optics: named in a warning."""
 
 
-class _Report:
-    """What is left out: names by reason, warned of once."""
+class Report:
+    """What a reader and the model leave out: names by reason, in one warning."""
 
     def __init__(self) -> None:
         self.names: dict[str, dict[str, None]] = {}
 
     def left_out(self, reason: str, name: str) -> None:
+        """Note that something of this element is left out."""
         self.names.setdefault(reason, {})[name] = None
 
     def warn(self, ring: str) -> None:
+        """Warn of all that was noted, if anything was."""
         if not self.names:
             return
         what = "; ".join(
@@ -132,6 +134,7 @@ def ring_of_parts(
     energy: float,
     mass: float = ELECTRON_GEV,
     charge: float = 1.0,
+    report: Report | None = None,
 ) -> Ring:
     """The ring of these elements in beam order; one `Part` may stand in many places.
 
@@ -141,6 +144,7 @@ def ring_of_parts(
         energy: of a particle, rest energy included, GeV.
         mass: rest energy, GeV.
         charge: of a particle, in elementary charges; a cavity acts by its voltage times the charge.
+        report: what the reader left out already.
 
     Raises:
         LatticeError: no element, or one that the model lacks and the optics needs.
@@ -152,7 +156,7 @@ def ring_of_parts(
         raise LatticeError(f"'{name}' has no elements; name another sequence with sequence=")
     mass = ELECTRON_GEV if mass < 2 * ELECTRON_GEV else mass
     design = Ring(name, (), energy, mass=mass)
-    report = _Report()
+    report = report or Report()
     known: dict[int, list[Place]] = {}
     errors: dict[int, dict[str, Any]] = {}
     places: list[Place] = []
@@ -199,7 +203,7 @@ def _acts(value: Any) -> bool:
         return bool(value)
 
 
-def _check(part: Part, report: _Report) -> None:
+def _check(part: Part, report: Report) -> None:
     """Attributes that the model lacks.
 
     Raises:
@@ -290,7 +294,7 @@ def strengths(part: Part) -> NDArray[np.complex128]:
     return total
 
 
-def _places(part: Part, ring: Ring, charge: float, report: _Report) -> list[Place]:
+def _places(part: Part, ring: Ring, charge: float, report: Report) -> list[Place]:
     """What one element of a file is in the ring."""
     from tmlattice.lattice.ocelot import elements as ocelot
 
@@ -358,7 +362,7 @@ def _corrector(part: Part) -> list[Place]:
     return corrector_pair(name, length, x * cos - y * sin, x * sin + y * cos)
 
 
-def _thin(part: Part, report: _Report) -> Any:
+def _thin(part: Part, report: Report) -> Any:
     """A thin multipole; its first normal component bends the design orbit, as in MAD-X.
 
     `angle`, where it is given, is the design's bend, and the rest of KNL[0] a field error.
@@ -385,7 +389,7 @@ def _thin(part: Part, report: _Report) -> Any:
     )  # fmt: skip
 
 
-def _bend(part: Part, report: _Report) -> Any:
+def _bend(part: Part, report: Report) -> Any:
     from tmlattice.lattice.ocelot import elements as ocelot
 
     fields = strengths(part)

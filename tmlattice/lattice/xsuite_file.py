@@ -8,7 +8,6 @@ Every class is in one of three lists: modelled; without effect on the static opt
 import json
 import math
 import re
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import LatticeError, first_of, plain, unknown_name
+from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.expressions import Arithmetic
-from tmlattice.lattice.parts import Part, edge_focusing, fringe_of, ring_of_parts
+from tmlattice.lattice.lines import chosen
+from tmlattice.lattice.parts import Part, Report, edge_focusing, fringe_of, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
 Array = NDArray[np.float64]
@@ -127,7 +127,7 @@ def _ring(path: Path, content: Any, name: str, sequence: str | None, energy: flo
         content, beside = content["line"], content
     line = content
     if isinstance(content.get("lines"), dict):
-        line = content["lines"][_chosen(path, list(content["lines"]), sequence)]
+        line = content["lines"][chosen(path, list(content["lines"]), sequence)]
     mass, charge, stated = _particle(line, content, beside)
     if energy is None and stated is None:
         raise LatticeError(f"'{path}' has no reference particle; say energy= (GeV)")
@@ -135,29 +135,8 @@ def _ring(path: Path, content: Any, name: str, sequence: str | None, energy: flo
     reader = _Reader(content, line, energy, mass)
     parts = reader.parts()
     if "energy_program" in content or "energy_program" in line:
-        reader.left_out.setdefault("the energy programme", []).append("line")
-    if reader.left_out:
-        what = "; ".join(
-            f"{reason} of {first_of(list(dict.fromkeys(names)), 3)} ({len(names)})"
-            for reason, names in reader.left_out.items()
-        )
-        warnings.warn(f"'{path}': left out of the model: {what}", stacklevel=5)
-    return ring_of_parts(parts, name, energy, mass, charge)
-
-
-def _chosen(path: Path, found: Sequence[str], wanted: str | None) -> str:
-    """Of the lines of a file the one that is the ring."""
-    names = {name.casefold(): name for name in found}
-    if wanted:
-        if wanted.casefold() not in names:
-            raise unknown_name(f"sequence in '{path}' named", wanted, found)
-        return names[wanted.casefold()]
-    if "ring" in names:
-        return names["ring"]
-    if len(found) != 1:
-        which = f"the sequences {', '.join(found)}; name one with sequence=" if found else "no line"
-        raise LatticeError(f"'{path}' has {which}")
-    return found[0]
+        reader.report.left_out("the energy programme", "line")
+    return ring_of_parts(parts, name, energy, mass, charge, reader.report)
 
 
 def _particle(*places: Mapping[str, Any]) -> tuple[float, float, float | None]:
@@ -274,7 +253,7 @@ class _Reader:
         self.line = line
         self.beta = math.sqrt(max(0.0, 1 - (mass / energy) ** 2))
         self.momentum = 1e9 * energy * self.beta
-        self.left_out: dict[str, list[str]] = {}
+        self.report = Report()
         variables = (content.get("_var_management_data") or {}).get("var_values") or {}
         self.variables = {k: v for k, v in variables.items() if isinstance(v, int | float)}
         self._arithmetic = Arithmetic((math.sqrt, math.sin, math.cos, math.tan, math.exp))
@@ -456,7 +435,7 @@ class _Reader:
         if sliced or cls == "DriftExactSlice":
             return self._slice(fields, name, where, sliced)
         if cls in COLLECTIVE:
-            self._leave(f"what the {cls} does", name)
+            self.report.left_out(f"what the {cls} does", name)
         if cls in PASSIVE or cls in COLLECTIVE:
             return [_passive(name, _way_of(fields))]
         if cls in ACTING:
@@ -498,9 +477,6 @@ class _Reader:
             "BeamPositionMonitor": lambda f, name, where: [_monitor(f, name, where)],
         }
 
-    def _leave(self, reason: str, name: str) -> None:
-        self.left_out.setdefault(reason, []).append(name)
-
     def _inert(self, fields: _Fields, name: str) -> Part:
         """An element of a class that is not modelled, where its strength is zero."""
         change = fields.cls == "ReferenceEnergyChange"
@@ -519,7 +495,7 @@ class _Reader:
                     f"{fields.named} is turned by its {key}, which is not modelled; set it to 0"
                 )
         if fields.number("delta_taper"):
-            self._leave("delta_taper", fields.name)
+            self.report.left_out("delta_taper", fields.name)
         return {
             "dx": fields.number("shift_x"), "dy": fields.number("shift_y"),
             "ds": fields.number("shift_s"), "tilt": fields.number("rot_s_rad"),
@@ -611,7 +587,7 @@ class _Reader:
     def _few_kicks(self, fields: _Fields, name: str) -> None:
         exact = ("adaptive", "mat-kick-mat", "mat-kick-mat-exact", "full", "0", "expanded")
         if fields.number("num_multipole_kicks") and fields.word("model", "adaptive") not in exact:
-            self._leave("the finite number of kicks", name)
+            self.report.left_out("the finite number of kicks", name)
 
     def _straight(self, fields: _Fields, name: str, where: str) -> list[Part]:
         if fields.cls == "Magnet":
@@ -645,7 +621,7 @@ class _Reader:
             return [whole]
         if rule not in ("uniform", "teapot"):
             if rule in ("yoshida4", "yoshida-4") and count:
-                self._leave("the finite number of kicks", whole.name)
+                self.report.left_out("the finite number of kicks", whole.name)
             return [whole]
         return _kicks(whole, knl, ksl, max(1, count), rule == "teapot", body / length)
 
@@ -743,7 +719,7 @@ class _Reader:
         else:
             m, b = fields.list("R"), fields.list("k", 6)
             if fields.list("T").any():
-                self._leave("the second order", name)
+                self.report.left_out("the second order", name)
         matrix = np.eye(6) if not len(m) else np.reshape(m, (6, 6))
         # zeta = -beta0 tau, delta = p / beta0
         turn = np.diag([1.0, 1.0, 1.0, 1.0, -1 / self.beta, self.beta])
