@@ -295,7 +295,7 @@ def _write_rings(
         written[str(lattice_out)] = write_ring(result.as_found, lattice_out)
         beside = calibration_beside(lattice_out)
         if result.calibration or result.by_steps:
-            write_calibration(beside, result.calibration, result.dispersion)
+            write_calibration(beside, result.calibration, result.dispersion, result.rejected)
             written[str(beside)] = ()
         else:  # that of the ring which stood there
             beside.unlink(missing_ok=True)

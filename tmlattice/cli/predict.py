@@ -40,7 +40,8 @@ def predict(
     """Predict how the stored beam's orbit answers a kick of each corrector, at fixed RF frequency.
 
     The table has the columns of a measurement's response.csv: corrector, monitor, and the orbit
-    change x, y in m. It is linear in the kick.
+    change x, y in m. It is linear in the kick. Silent monitors and channels that the fit rejected
+    are left empty.
     """
     from tmlattice.files import output_file
     from tmlattice.measurement.write import write_response_table
@@ -48,6 +49,7 @@ def predict(
         calibrated_response,
         read_calibration,
         read_dispersion,
+        read_rejected,
     )
 
     if kick == 0 or not abs(kick) < float("inf"):
@@ -56,7 +58,10 @@ def predict(
         ring = open_ring(lattice, sequence, energy)
         causes = read_calibration(calibration, ring) if calibration else []
         dispersion = read_dispersion(calibration, ring) if calibration else None
-        columns, response = calibrated_response(ring, causes, correctors or None, dispersion)
+        rejected = read_rejected(calibration, ring) if calibration else []
+        columns, response = calibrated_response(
+            ring, causes, correctors or None, dispersion, rejected
+        )
         monitors = [monitor.name for monitor in ring.monitors]
         orbits = list(zip(columns.names, kick * response, strict=True))
         write_response_table(file, monitors, orbits)

@@ -188,6 +188,8 @@ class Diagnosis(ShownDiagnosis):
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
         dispersion: beside that of the ring as found, for `write_calibration`.
+        rejected: channels that the model cannot describe: (monitor, "x" or "y"), or (corrector,
+            None).
     """
 
     verdict: str
@@ -221,6 +223,7 @@ class Diagnosis(ShownDiagnosis):
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
+    rejected: tuple[tuple[str, str | None], ...] = ()
 
     @property
     def kind(self) -> str:
@@ -273,7 +276,11 @@ class Diagnosis(ShownDiagnosis):
     def calibration(self) -> tuple[Cause, ...]:
         """What monitors and correctors do, for `write_calibration`."""
         bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
-        return (*(c for c in self.causes if c.effect in CALIBRATES), *bad)
+        own = [c for c in self.causes if c.effect in CALIBRATES]
+        # a fit by steps is of readings whose planes were exchanged back
+        swaps = (Cause(f.effect, f.element, 1.0) for f in self.findings
+                 if f.effect == "monitor_swap" and self.by_steps)  # fmt: skip
+        return (*own, *swaps, *bad)
 
     def error(self, effect: str, element: str | None) -> tuple[float, float]:
         """Amount and standard error of a cause.
@@ -351,6 +358,7 @@ class Diagnosis(ShownDiagnosis):
             "steps": [step.as_json() for step in self.steps],
             "refused": [step.as_json() for step in self.refused],
             "bad_monitors": list(self.bad_monitors),
+            "rejected": [{"element": name, "plane": plane} for name, plane in self.rejected],
             "degenerate": list(self.degenerate),
             "priors": dict(self.priors),
             "prior_errors": dict(self.prior_errors),

@@ -24,6 +24,8 @@ CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrat
 Dispersion = Mapping[str, tuple[float, float]]
 """What kicks of the closed orbit add to the dispersion of the lattice at monitors and correctors, x
 and y, m per relative energy; see `beam.kicks`."""
+Channel = tuple[str, str | None]
+"""A monitor and its plane, "x" or "y"; or a corrector, and None."""
 
 
 def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
@@ -83,10 +85,36 @@ def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
     return found
 
 
+def read_rejected(path: str | Path, ring: Ring) -> list[Channel]:
+    """The channels of which a calibration file lets nothing be predicted; empty if it names none.
+
+    Args:
+        path: JSON, see the schema `calibration`.
+        ring: that it is of.
+
+    Raises:
+        MeasurementError: no such file, or not a calibration.
+        UnknownNameError: of another ring.
+    """
+    path = Path(path)
+    document = read_document(path, "calibration", FORMAT)
+    with located(path):
+        return [(ring[row["element"]].name, row["plane"]) for row in document.get("rejected", [])]
+
+
 def write_calibration(
-    path: str | Path, causes: Iterable[Cause], dispersion: Dispersion | None = None
+    path: str | Path,
+    causes: Iterable[Cause],
+    dispersion: Dispersion | None = None,
+    rejected: Iterable[Channel] = (),
 ) -> None:
     """Write a calibration file: whole, or not at all.
+
+    Args:
+        path: of the file, JSON.
+        causes: effects on monitors, correctors and the beam.
+        dispersion: beside that of the lattice.
+        rejected: channels that the fit rejected.
 
     Raises:
         EffectError: an effect that is no calibration.
@@ -102,6 +130,8 @@ def write_calibration(
         document["dispersion"] = [
             {"element": name, "x": x, "y": y} for name, (x, y) in dispersion.items()
         ]
+    if silenced := [{"element": name, "plane": plane} for name, plane in rejected]:
+        document["rejected"] = silenced
     with output_file(Path(path)) as file:
         write_json(file, document)
 
@@ -127,6 +157,7 @@ def calibrated_response(
     causes: Sequence[Cause] = (),
     correctors: Sequence[str] | None = None,
     dispersion: Dispersion | None = None,
+    rejected: Iterable[Channel] = (),
 ) -> tuple[Columns, Array]:
     """What the monitors of a ring with errors read for a radian of each corrector.
 
@@ -135,9 +166,11 @@ def calibrated_response(
         causes: on the ring, on its monitors, and of the beam's energies.
         correctors: names; None: all, in beam order.
         dispersion: beside that of the ring.
+        rejected: channels of which nothing is predicted.
 
     Returns:
-        The correctors, and m/rad [corrector, monitor, 2]; NaN where a monitor is silent.
+        The correctors, and m/rad [corrector, monitor, 2]; NaN where a monitor is silent, and of
+        rejected channels.
 
     Raises:
         EffectError, UnknownNameError: a cause that the ring cannot have.
@@ -153,6 +186,11 @@ def calibrated_response(
     beam = scales[:, None, None] * _of_centroid(model, columns, causes, dispersion or {})
     readings = np.einsum("mij,cmj->cmi", monitors.matrix(), beam)
     readings[:, monitors.silent | monitors.frozen] = np.nan
+    for name, plane in rejected:
+        if plane is None:
+            readings[[own == name for own in columns.names]] = np.nan
+        else:
+            readings[:, model.monitors.index(name), "xy".index(plane)] = np.nan
     return columns, readings
 
 

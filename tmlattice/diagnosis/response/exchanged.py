@@ -27,11 +27,13 @@ Pair = tuple[str, str]
 
 class PutRight(NamedTuple):
     """What was exchanged: planes of monitors; pairs of correctors, and of monitors, and by how much
-    chi-square fell once they were put right, with the typical noise."""
+    chi-square fell once they were put right, with the typical noise. And what was rejected: a
+    monitor with its plane, or a corrector with None."""
 
     planes: list[str]
     correctors: dict[Pair, float]
     monitors: dict[Pair, float]
+    rejected: list[tuple[str, str | None]]
 
 
 def righted(

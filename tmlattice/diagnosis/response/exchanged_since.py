@@ -29,7 +29,7 @@ def all_right(
         measured: as it was read.
         holdout: share of the correctors that are held out.
     """
-    known = PutRight([], {}, {})
+    known = PutRight([], {}, {}, [])
     while True:
         data = made(measured)
         state = begin(data, split_columns(data, holdout, np.random.default_rng(0)))
@@ -52,4 +52,4 @@ def since(first: PutRight, second: PutRight, said: list[str]) -> PutRight:
             said.append(f"on both days {told(both, what)}")
         alone = {pair: a[pair] for key, pair in before.items() if key not in now}
         found.append(alone | {pair: b[pair] for key, pair in now.items() if key not in before})
-    return PutRight([], *found)
+    return PutRight([], found[0], found[1], [])

@@ -133,9 +133,11 @@ def diagnose_response(
     if few is None or overstated(ring, data.measured):  # to such a noise a few explain anything
         whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
         few = None if few is None or knows_more(whole[0], few.fit) else few
+    rejected: tuple[tuple[str, str | None], ...] = ()
     if few is None:
         fit, measured, odd, exchanges = whole
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
+        rejected = tuple(exchanges.rejected)
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
         found, degenerate = told(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
@@ -156,6 +158,7 @@ def diagnose_response(
         findings=with_consequences(ring, findings, causes),
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
+        rejected=rejected,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
         pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),
@@ -175,7 +178,7 @@ def _families(
     """The dense fit of what resembles the model; what was fitted, and what was done to it; and
     what is exchanged."""
     said: list[str] = []
-    known = PutRight([], {}, {})
+    known = PutRight([], {}, {}, [])
     fit: DenseFit | None = None
     while True:
         data = response_data(ring, measured)
@@ -196,6 +199,7 @@ def _families(
             continue
         if odd.any:
             said += odd.said
+            known.rejected.extend([*odd.monitors, *((name, None) for name in odd.correctors)])
             measured = odd.without(measured)
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))

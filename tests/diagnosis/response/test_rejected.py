@@ -1,0 +1,128 @@
+"""What the fit rejected is silent in the prediction from the files that a diagnosis writes."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from tmlattice import Cause, write_measurement
+from tmlattice.cli.command import tmlattice
+from tmlattice.lattice import save_ring
+from tmlattice.machine.response import simulate_response
+from tmlattice.observe.response_data import response_data
+from tmlattice.observe.split import split_columns
+
+KICK = 2e-5
+BOTH, ONE, SWAPPED, CORRECTOR = "end_3", "end_8", "end_11", "v6"
+
+
+@pytest.fixture(scope="module")
+def day(ring_kicking_x, tmp_path_factory):
+    """A BPM that reads noise in both planes, one in y alone, one whose planes are swapped, and a
+    corrector whose orbit is noise, among usual errors."""
+    rng = np.random.default_rng(5)
+    ring = ring_kicking_x("i % 2")
+    causes = [
+        Cause("quadrupole_gradient", e.name, 2e-3 * rng.standard_normal())
+        for e in ring.elements if e.kind == "quadrupole"
+    ]  # fmt: skip
+    causes += [Cause("monitor_gain_x", m.name, 0.02 * rng.standard_normal()) for m in ring.monitors]
+    causes += [Cause("monitor_gain_y", m.name, 0.02 * rng.standard_normal()) for m in ring.monitors]
+    causes += [Cause("monitor_swap", SWAPPED, 1.0)]
+    measured = simulate_response(
+        ring, causes, kick=KICK, noise=1e-7, rf_step=-3000.0, engine="ocelot", progress=False,
+        seed=3,
+    ).measured  # fmt: skip
+    response, at = measured.response.copy(), measured.monitors.index
+
+    def noise(part):
+        return float(np.std(part)) * rng.standard_normal(part.shape)
+
+    response[:, at(BOTH)] = noise(response[:, at(BOTH)])
+    response[:, at(ONE), 1] = noise(response[:, at(ONE), 1])
+    response[measured.correctors.index(CORRECTOR)] = noise(response[0])
+    measured = replace(measured, response=response)
+    folder = tmp_path_factory.mktemp("day")
+    save_ring(ring, folder / "ring.json")
+    write_measurement(folder / "day", measured)
+    words = ["diagnose", folder / "ring.json", folder / "day", "--lattice-out",
+             folder / "found.json", "--json", folder / "found.diagnosis.json"]  # fmt: skip
+    done = CliRunner().invoke(tmlattice, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    return ring, measured, folder
+
+
+def predicted(folder, name="found.json.calibration.json"):
+    """{corrector: {monitor: (x, y)}}, m/rad; NaN of empty fields."""
+    words = ["predict", folder / "found.json", "--calibration", folder / name, "--kick", "1",
+             "--out", folder / "predicted.csv"]  # fmt: skip
+    done = CliRunner().invoke(tmlattice, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    table = {}
+    with (folder / "predicted.csv").open() as file:
+        for row in csv.DictReader(file):
+            own = table.setdefault(row["corrector"], {})
+            own[row["monitor"]] = [float(row[plane] or "nan") for plane in "xy"]
+    return table
+
+
+def left(table, measured, columns):
+    """rms of what the prediction leaves of correctors in their plane, m; the kick of each is fitted
+    to every other BPM."""
+    squares = []
+    for k in columns:
+        p = "xy".index(measured.planes[k])
+        own = table[measured.correctors[k]]
+        model = np.array([own[name][p] for name in measured.monitors])
+        there = np.isfinite(model)
+        model, read = model[there], measured.response[k, there, p]
+        if len(read):
+            kick = (model[::2] @ read[::2]) / (model[::2] @ model[::2])
+            squares.append((read - kick * model)[1::2] ** 2)
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def test_prediction_of_the_written_files_reproduces_the_held_out_figure(day):
+    ring, measured, folder = day
+    told = json.loads((folder / "found.diagnosis.json").read_text())
+    figure = told["steps"][-1]["heldout_rms_in_plane"]
+    gone = {own["element"] for own in told["rejected"] if own["plane"] is None}
+    kept = measured.select(correctors=[c for c in measured.correctors if c not in gone])
+    options = told["provenance"]
+    rng = np.random.default_rng(options["seed"])
+    split = split_columns(response_data(ring, kept), options["options"]["holdout"], rng)
+    names = [kept.correctors[k] for k in np.flatnonzero(split.held[:-1])]
+    held = [measured.correctors.index(name) for name in names]
+    assert len(held) > 1
+    table = predicted(folder)
+    assert 0.7 * figure < left(table, measured, held) < 1.4 * figure
+    document = json.loads((folder / "found.json.calibration.json").read_text())
+    assert "rejected" in document
+    spoken = {**document, "rejected": []}
+    (folder / "spoken.json").write_text(json.dumps(spoken))
+    assert left(predicted(folder, "spoken.json"), measured, held) > 10 * figure
+
+
+def test_rejected_channels_are_empty_in_the_prediction_and_no_others(day):
+    _, measured, folder = day
+    told = json.loads((folder / "found.diagnosis.json").read_text())
+    rejected = {(own["element"], own["plane"]) for own in told["rejected"]}
+    assert (ONE, "y") in rejected
+    assert (CORRECTOR, None) in rejected
+    silent = {BOTH, *told["bad_monitors"]}
+    for corrector, own in predicted(folder).items():
+        for monitor, xy in own.items():
+            empty = [
+                corrector == CORRECTOR or monitor in silent or (monitor, plane) == (ONE, "y")
+                for plane in "xy"
+            ]
+            assert np.isnan(xy).tolist() == empty, (corrector, monitor)
+    # the BPM whose planes are swapped is predicted as it reads
+    own = predicted(folder)
+    k = next(k for k, name in enumerate(measured.correctors) if name != CORRECTOR)
+    both = np.array([own[measured.correctors[k]][SWAPPED], measured.response[k][
+        measured.monitors.index(SWAPPED)] / KICK])  # fmt: skip
+    np.testing.assert_allclose(*both, atol=0.1 * np.abs(both).max())
