@@ -37,7 +37,7 @@ from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.evidence import Names, Verdict, certain
 from tmlattice.observe.global_errors import Judge
-from tmlattice.observe.noise import random_part
+from tmlattice.observe.noise import PASSES, random_part
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_errors import ANOTHER, ResponseJudge, ResponseVerdict
 from tmlattice.observe.sections import Found, Passes
@@ -322,7 +322,21 @@ def _noise(judge: Judge, passes: Passes, found: Found) -> Check:
             "go on with --assume noise-from-data",
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
-    return fine("noise", f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}")
+    said = f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}"
+    if level <= UNDER:
+        return fine("noise", said)
+    if random is None:
+        return note(
+            "noise",
+            f"{said}: the noise is larger than stated, or errors all along the ring are as large; "
+            f"{len(judge.measurement.shots)} shots do not show which: take {PASSES} or more",
+        )
+    return fine(
+        "noise",
+        f"{_micro(typical)} is stated, and the scatter from shot to shot is no larger; neighbours "
+        f"leave {_micro(level * typical)}, the same or in proportion in all shots: errors of the "
+        "machine",
+    )
 
 
 def _micro(metres: float) -> str:

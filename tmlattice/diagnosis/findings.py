@@ -15,7 +15,7 @@ from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import Outcome
+from tmlattice.inference.newton import Outcome, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
@@ -32,6 +32,19 @@ def credible(rivals: Sequence[Rival], mass: float) -> tuple[list[Rival], Array]:
     probability /= probability.sum()
     size = int(np.searchsorted(np.cumsum(probability), mass)) + 1
     return list(rivals[:size]), probability
+
+
+FINAL_STEPS = 60
+"""Of the fit that is reported, at most."""
+
+
+def finished(explanation: Explanation) -> Explanation:
+    """With as many steps of its fit as it takes to converge, if it ran out of them."""
+    last = explanation.fit
+    if last.outcome is not Outcome.STEPS:
+        return explanation
+    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=FINAL_STEPS)
+    return replace(explanation, fit=again) if again.good else explanation
 
 
 def findings_of(
@@ -204,17 +217,26 @@ def verdict_of(
     p_value: float,
     estimated: bool,
     judgement: Judgement,
+    reference: bool = False,
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
-    """The least certain of the findings', the findings that stand, and what is to be said."""
+    """The least certain of the findings', the findings that stand, and what is to be said.
+
+    Args:
+        explanation: of the search.
+        findings: its own.
+        p_value: chance that noise leaves as much.
+        estimated: the noise comes from the data.
+        judgement: thresholds.
+        reference: whether one was given.
+    """
     more, far_more = judgement.noise
     if findings and (why := _no_solution(explanation)):
         return "distributed", (), (f"no cause is named: {why}",)
     if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
-        said = (
-            f"{many} not explain the data; a reference from before the fault would cancel what was "
-            "there anyway"
-        )
+        said = f"{many} not explain the data"
+        if not reference:
+            said += "; a reference from before the fault would cancel what was there anyway"
         return "distributed", (), (said,)
     clean = "nothing" if p_value >= far_more or estimated else "distributed"
     worst = least_certain(findings, clean)

@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
+from tmlattice.diagnosis.findings import (
+    findings_of,
+    finished,
+    sensitivity,
+    verdict_of,
+    with_consequences,
+)
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.left_out import spikes, with_silent
 from tmlattice.diagnosis.next_kind import next_kind
@@ -329,7 +335,7 @@ def _told(
     made: Mapping[str, Any],
 ) -> Diagnosis:
     judgement = how.judgement
-    found = _by_ring(ring, problem, found)
+    found = finished(_by_ring(ring, problem, found))
     result = found.fit
     # what counts turns late reads nothing in the first ones
     late = {c.element for c in result.causes if find(c.effect).of_turns}
@@ -339,7 +345,9 @@ def _told(
     estimated = any(part.estimated for part in parts)
     findings = findings_of(ring, found, dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
-    verdict, findings, said = verdict_of(found, findings, p_value, estimated, judgement)
+    verdict, findings, said = verdict_of(
+        found, findings, p_value, estimated, judgement, not all(problem.active)
+    )
     if verdict == "nothing" and small is not None and small.errors and all(problem.active):
         verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:

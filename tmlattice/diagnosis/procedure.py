@@ -8,7 +8,7 @@
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from tmlattice.diagnosis.common import sought_in
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     findings_of,
+    finished,
     sensitivity,
     unexplained,
     verdict_of,
@@ -37,7 +38,7 @@ from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.newton import Outcome, fit
+from tmlattice.inference.newton import Outcome
 from tmlattice.inference.scan import FreeScan
 from tmlattice.inference.search import Explanation, Search
 from tmlattice.lattice import Ring
@@ -50,9 +51,6 @@ from tmlattice.version import __version__
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-FINAL_STEPS = 60
-"""Of the fit that is reported, at most."""
 
 
 def diagnose(
@@ -128,7 +126,7 @@ def diagnose(
             ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress
         ),
     )  # fmt: skip
-    small, explanation = found.small, _finished(found.explanation)
+    small, explanation = found.small, finished(found.explanation)
     progress("report")
     told = _told(ring, ready, small, explanation, judgement)
     gap = _held_out(ring, heldout, ready, told, small, explanation, said)
@@ -170,15 +168,6 @@ def diagnose(
 
 
 # --- what is told ----
-def _finished(explanation: Explanation) -> Explanation:
-    """With as many steps of its fit as it takes to converge, if it ran out of them."""
-    last = explanation.fit
-    if last.outcome is not Outcome.STEPS:
-        return explanation
-    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=FINAL_STEPS)
-    return replace(explanation, fit=again) if again.good else explanation
-
-
 def _errors(explanation: Explanation) -> tuple[float, ...]:
     """Standard error of the amount of each cause."""
     return tuple(np.sqrt(np.maximum(np.diag(explanation.fit.covariance), 0.0)).tolist())
@@ -219,9 +208,12 @@ def _told(
     result, problem, left = explanation.fit, turns_of(explanation), explanation.left
     findings = findings_of(ring, explanation, ready.dead, judgement)
     p_value = float(chi2.sf(result.chi2, freedom(problem, result)))
-    verdict, standing, said = verdict_of(explanation, findings, p_value, ready.estimated, judgement)
+    alone = bool(problem.data.active.all())
+    verdict, standing, said = verdict_of(
+        explanation, findings, p_value, ready.estimated, judgement, not alone
+    )
     learnt = small is not None and small.evidence is not None
-    if verdict == "nothing" and learnt and problem.data.active.all():
+    if verdict == "nothing" and learnt and alone:
         verdict = "distributed"  # the gap has a cause: many small ones
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         result, left = explanation.before, explanation.first_kicks

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
 
+MUCH_MORE = 1e-4
+"""Chance that noise leaves as much, below which what is left is no noise."""
+
 
 @dataclass(frozen=True)
 class Member:
@@ -240,7 +243,17 @@ class Diagnosis(ShownDiagnosis):
     @property
     def since_reference(self) -> bool:
         """Whether what is told is a change from an earlier measurement (but of trajectories)."""
-        return self.kind != "trajectory" and bool(self.provenance["options"].get("reference"))
+        return self.kind != "trajectory" and self.has_reference
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether a measurement from before was given."""
+        return bool(self.provenance["options"].get("reference"))
+
+    @property
+    def explains(self) -> bool:
+        """Whether what was found leaves little more than the noise."""
+        return bool(self.unexplained["p_value"] >= MUCH_MORE)
 
     @property
     def parts(self) -> tuple[PartView, ...]:

@@ -63,6 +63,8 @@ def estimate(data: Data, paths: Paths) -> Array:
 SCATTER = 3
 """Passes beyond those that errors of monitors and magnets take up: a constant, and what is in
 proportion to the trajectory in its plane (or in both, where there are enough)."""
+PASSES = 5 + SCATTER
+"""From which errors of both planes are taken out."""
 IN_PROPORTION = 0.015
 """Share of the orbit that unknown errors leave in proportion to what is not taken up."""
 
@@ -75,7 +77,7 @@ def random_part(passes: Passes, found: Found) -> float | None:
     left to tell it from errors of the other plane.
     """
     count = len(found.left)
-    both = count >= 5 + SCATTER
+    both = count >= PASSES
     if count < 3 + SCATTER - 1:
         return None
     ratios = []

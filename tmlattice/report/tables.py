@@ -14,6 +14,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.amounts import all_of, amount_text, numbers, scaled, words
+from tmlattice.report.remedies import SETTLED
 from tmlattice.report.text import HARDLY, NOT_HELD_OUT
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
@@ -134,13 +135,15 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         return name, "", pair(None if found is None else getattr(found, field), factor, digits)
 
     tunes = pair(told.design, 1, 5), pair(None if told.found is None else told.found.tunes, 1, 5)
-    return [
+    rows = [
         ("fractional tunes, x / y", *tunes),
         row("beta beat, rms [%]", "beta_beat_rms", 100, 2),
         row("beta beat, largest [%]", "beta_beat_max", 100, 2),
         row("change of the dispersion, rms [mm]", "dispersion_rms", 1e3, 1),
-        row("closed orbit, rms [µm]", "orbit_rms", 1e6, 1),
     ]
+    if told.found is None or max(told.found.orbit_rms) > SETTLED.orbit_rms[0]:
+        rows.append(row("closed orbit of these errors, rms [µm]", "orbit_rms", 1e6, 1))
+    return rows
 
 
 def optics_head(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -182,7 +185,7 @@ LARGE = 3.0
 
 def large_text(diagnosis: Diagnosis) -> str:
     """Small errors that are larger than a sound ring's: single faults may pass for them."""
-    if diagnosis.by_steps:
+    if diagnosis.by_steps or not diagnosis.explains:
         return ""
     large = []
     for name, rms in diagnosis.priors.items():
@@ -191,10 +194,10 @@ def large_text(diagnosis: Diagnosis) -> str:
             large.append(f"{words(name)} ({rms / usual:.2g} times)")
     if not large:
         return ""
-    return (
-        f"{', '.join(large)}: faults may hide among them; a measurement of this machine from "
-        "before (--reference) would show them"
-    )
+    hide = f"{', '.join(large)}: faults may hide among them"
+    if diagnosis.has_reference:
+        return hide
+    return f"{hide}; a measurement of this machine from before (--reference) would show them"
 
 
 LARGE_TITLE = "small errors larger than usual"

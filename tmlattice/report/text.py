@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.result import MUCH_MORE, Diagnosis, Finding
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
 from tmlattice.report.amounts import amount_text, least_text, probability_text, words
@@ -44,6 +44,9 @@ def place_text(finding: Finding) -> str:
     return f"s = {finding.s:.2f} m; from {span}{between}"
 
 
+LARGER = 1.5
+"""Times what is left after, from which what was left before is no noise."""
+
 NOT_HELD_OUT = "Nothing was held out: nobody but the fit judges the gap"
 
 
@@ -63,13 +66,18 @@ def closed_text(diagnosis: Diagnosis) -> str:
         return (
             "The beam of held-out shots is lost in one of the models, so they do not judge the gap"
         )
+    before, after = gap.misfits[gap.since], gap.misfits[-1]
+    if gap.closed is None and before.rms > LARGER * after.rms:
+        return (
+            f"Held-out readings are left with {micrometres(before.rms)} before and "
+            f"{micrometres(after.rms)} after; their launches leave open how much of that is closed"
+        )
     if gap.closed is None:
         return "Held-out readings show no gap beyond the noise, so there is none to close"
     text = f"{100 * gap.closed:.1f} % of the gap beyond the noise is closed on held-out readings"
     if gap.interval is not None:
         low, high = gap.interval
         text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
-    after = gap.misfits[-1]
     if diagnosis.priors and after.expected is not None:
         rms = [f"{1e6 * step.rms:.3g}" for step in gap.misfits]
         added = [f"the {diagnosis.ring.model}", "with small errors", "with what was found"]
@@ -89,9 +97,11 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         if name in CATALOGUE and not diagnosis.by_steps:
             usual = CATALOGUE[name].background
             times = f", {rms / usual:.2g} times the usual one" if usual else ""
-            error = diagnosis.prior_errors.get(name, 0.0)
-            hardly = "; these readings hardly see it" if error > HARDLY else ""
-            rows.append((words(name), f"{amount_text(name, rms)} rms{times}{hardly}"))
+            if diagnosis.prior_errors.get(name, 0.0) > HARDLY:
+                times = "; taken, for these readings do not determine it"
+            elif not diagnosis.explains:
+                times = "; what this model does not explain is part of it"
+            rows.append((words(name), f"{amount_text(name, rms)} rms{times}"))
     return rows
 
 
@@ -120,7 +130,7 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return steps_sentence(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.priors:
-        much = "the readings" if diagnosis.unexplained["p_value"] >= MUCH_MORE else "much, not all"
+        much = "the readings" if diagnosis.explains else "much, not all"
         everywhere = f"Small errors all along the ring explain {much}"
         return f"{everywhere}; no single fault stands out among them."
     if diagnosis.verdict == "distributed":
@@ -204,6 +214,8 @@ def advice(diagnosis: Diagnosis) -> str:
     )
     if diagnosis.verdict == "distributed" and diagnosis.steps:
         return everywhere
+    if diagnosis.verdict == "distributed" and diagnosis.has_reference:
+        return "More shots, with other launches, show a fault that small errors hide."
     if diagnosis.verdict == "distributed" and diagnosis.priors:
         return (
             "A measurement of this machine from before the fault (--reference) shows a fault that "
@@ -256,10 +268,6 @@ def gap_sentence(diagnosis: Diagnosis) -> str:
     rows = gap_rows(diagnosis)
     judges = rows if diagnosis.heldout is None else rows[-1:]
     return "; ".join(f"{name}: from {before} to {after}" for name, before, after in judges)
-
-
-MUCH_MORE = 1e-4
-"""Chance that noise leaves as much, below which what is left is no noise."""
 
 
 def left_text(diagnosis: Diagnosis) -> str:

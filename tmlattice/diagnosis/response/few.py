@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.findings import findings_of, verdict_of
+from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.dense import DenseFit, Step
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen
@@ -307,6 +307,7 @@ def _told(
     most: int,
     judgement: Judgement,
 ) -> Few:
+    found = finished(found)
     causes = found.fit.causes
     p_value = float(chi2.sf(found.fit.chi2, count - len(causes)))
     findings = findings_of(data.ring, found, (), judgement)

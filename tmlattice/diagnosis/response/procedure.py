@@ -65,7 +65,6 @@ from tmlattice.observe.response_noise import overstated
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
-from tmlattice.speaks import micrometres
 
 Array = NDArray[np.float64]
 
@@ -356,33 +355,28 @@ def _verdict(fit: DenseFit, false_alarm: float) -> str:
 
 def _warnings(fit: DenseFit) -> tuple[str, ...]:
     """What a reader should know."""
-    last, heldout = fit.steps[-1], fit.heldout[1]
+    heldout = fit.heldout[1]
     said = []
-    if last.heldout_chi2_per_dof > MISSING:
-        said.append(
-            f"On held-out readings {micrometres(last.heldout_rms_in_plane)} are left, "
-            f"{np.sqrt(last.heldout_chi2_per_dof):.1f} times the noise: an effect is missing."
-        )
     left = {
         name: own
         for name, own in _six(fit_chi2(fit.state), heldout).items()
-        if own.per_reading > MISSING and chi2.sf(own.total, own.readings) < DEFAULT.false_alarm
-        and name != "held-out, in-plane"
-    }  # fmt: skip
+        if own.per_reading > MISSING
+        and chi2.sf(own.total, own.readings) < DEFAULT.false_alarm / len(BLOCKS)
+    }
     rf = f"held-out, {BLOCKS[-1]}"
-    known = rf_known_to(fit.state) if rf in left else float("nan")
-    if heldout.dispersion < AS_KNOWN * known:
-        del left[rf]
-        said.append(
-            "The RF's orbit at monitors that did not fit it is missed by "
-            f"{1e6 * heldout.dispersion:.2g} µm, and the others know it to {1e6 * known:.2g} µm: "
-            "that is no sign of an effect."
-        )
+    if rf in left and heldout.dispersion < AS_KNOWN * rf_known_to(fit.state):
+        del left[rf]  # the other BPMs determine it no better
     if left:
         how = ", ".join(f"{name} {np.sqrt(own.per_reading):.1f}" for name, own in left.items())
         refused = "; ".join(step.effect for step in fit.refused)
+        fitted = any(name.startswith("fitted") for name in left)
+        why = (
+            "an effect is missing" if fitted else
+            "the fitted ones do not determine the ring better, or hide an effect that is missing"
+        )  # fmt: skip
         said.append(
-            f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
+            f"{'The result leaves' if fitted else 'Held-out readings are left with'} more than the "
+            f"noise (times the noise: {how}): {why}"
             + (f", or is one of those refused ({refused})." if refused else ".")
         )
     said += dispersion_by_kicks(fit.state.values, fit.state.data)
@@ -407,7 +401,8 @@ def _gap(fit: DenseFit, noise: float) -> Gap:
 
 
 def _unexplained(fit: DenseFit) -> dict[str, Any]:
-    """What stays of the fitted correctors' readings, in their own plane."""
+    """What stays of the fitted correctors' readings: whether it is noise in both planes and for
+    the RF, and the patterns of what is in their own plane."""
     state, data = fit.state, fit.state.data
     shares = []
     total, count = 0.0, 0
@@ -419,9 +414,10 @@ def _unexplained(fit: DenseFit) -> dict[str, Any]:
         size = np.linalg.svd(miss, compute_uv=False) ** 2
         shares.append(float(size[:PATTERNS].sum() / max(size.sum(), 1e-300)))
         total += float(np.sum((miss / data.noise[state.good, p]) ** 2))
-        count += miss.size
+        count += int(seen.sum())
+    chances = [chi2.sf(own.total, own.readings) for own in fit_chi2(state) if own.readings]
     return {
-        "p_value": float(chi2.sf(total, count)),
+        "p_value": min(len(chances) * min(chances), 1.0),
         "places": [],
         "patterns": {"chi2_per_dof": total / max(count, 1), "low_rank": shares},
     }

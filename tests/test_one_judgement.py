@@ -1,0 +1,117 @@
+"""Sentences of one page that exclude one another: a judgement is made once, and stated once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tmlattice import Cause, diagnose, simulate
+from tmlattice.diagnosis.doctor import check_data
+from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.machine.response import simulate_response
+from tmlattice.report.tables import notes, optics_rows
+from tmlattice.report.text import closed_text, left_text, small_rows, to_do, verdict_sentence
+
+BACKGROUND = {"all": None}
+
+
+def page(diagnosis):
+    """All sentences."""
+    told = [text for _, text in notes(diagnosis, diagnosis.provenance)]
+    return " ".join([
+        verdict_sentence(diagnosis), *to_do(diagnosis), closed_text(diagnosis),
+        left_text(diagnosis), *told, *(text for _, text in small_rows(diagnosis)),
+    ])  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def imperfect(small_ring):
+    """First turns of a machine with the usual small errors."""
+    return simulate(small_ring, background=BACKGROUND, shots=6, seed=1, machine_seed=5)
+
+
+@pytest.fixture(scope="module")
+def diagnosis(small_ring, imperfect):
+    return diagnose(small_ring, imperfect.measurement())
+
+
+def noise_of(ring, data):
+    return {check.name: check for check in check_data(ring, data).checks}["noise"]
+
+
+def test_a_noise_far_below_what_neighbours_leave_is_not_just_ok(small_ring, imperfect):
+    """Two shots do not tell noise from errors of the machine; eight do, from shot to shot."""
+    data = replace(imperfect.measurement(), noise=np.full((35, 2), 2e-6))
+    two = noise_of(small_ring, data.select(shots=[0, 1]))
+    assert two.status == "note"
+    assert "2 shots do not show which" in two.sentence
+    exact = simulate(
+        small_ring, background=BACKGROUND, shots=8, seed=1, machine_seed=5, noise=2e-6
+    ).measurement()  # fmt: skip
+    eight = noise_of(small_ring, exact)
+    assert eight.status == "fine"
+    assert "errors of the machine" in eight.sentence
+
+
+def test_sizes_that_the_readings_do_not_determine_have_no_ratio(diagnosis):
+    rows = small_rows(diagnosis)
+    assert rows
+    for _, text in rows:
+        assert ("times the usual" in text) != ("do not determine it" in text)
+
+
+def test_sizes_of_a_model_that_leaves_more_than_noise_are_no_errors_of_the_ring(diagnosis):
+    """They have taken up what is missing: 50 times the usual one is no size of an error."""
+    poor = replace(
+        diagnosis, unexplained={"p_value": 1e-9, "places": []},
+        priors={name: 50 * rms for name, rms in diagnosis.priors.items()},
+    )  # fmt: skip
+    assert "times" not in page(poor)
+
+
+def test_nobody_is_asked_for_the_reference_that_was_given(small_ring, imperfect, diagnosis):
+    assert "--reference" in page(diagnosis)
+    before = imperfect.measurement()
+    after = simulate(
+        small_ring, [Cause("quadrupole_gradient", "QD::5", -2e-3)], background=BACKGROUND,
+        shots=6, seed=2, machine_seed=5,
+    ).measurement()  # fmt: skip
+    found = diagnose(small_ring, after, reference=before)
+    assert "eference from before" not in page(found)
+    assert "--reference" not in page(found)
+
+
+def test_a_closed_orbit_stands_where_an_error_makes_one(small_ring):
+    def names(cause):
+        found = diagnose(small_ring, simulate(small_ring, [cause], shots=4, seed=1).measurement())
+        assert found.causes
+        return [name for name, *_ in optics_rows(found)]
+
+    assert not any("orbit" in n for n in names(Cause("quadrupole_gradient", "QD::5", -0.1)))
+    assert any("orbit" in n for n in names(Cause("corrector_kick_y", "v5", 1e-4)))
+
+
+def test_a_gap_that_falls_is_not_called_none(diagnosis):
+    def text(before, after):
+        misfits = Misfit(before, (before / 2e-5) ** 2), Misfit(after, (after / 2e-5) ** 2)
+        return closed_text(
+            replace(diagnosis, heldout=Gap(misfits, np.zeros((0, 0, 0)), None, None))
+        )
+
+    assert "none to close" in text(2.1e-5, 2.0e-5)
+    assert "none to close" not in text(2.434e-3, 3e-5)
+    assert "2434" in text(2.434e-3, 3e-5)
+
+
+def test_what_is_left_is_no_noise_where_an_effect_is_missing(small_ring):
+    """Coupling is looked for by no effect that may be the cause: in their own plane the readings
+    are left with noise alone."""
+    measured = simulate_response(
+        small_ring, [Cause("skew_gradient", "QD::5", 0.02)], engine="ocelot", seed=1
+    ).measured
+    found = diagnose(small_ring, measured, effects=["quadrupole_gradient"])
+    assert any("an effect is missing" in warning for warning in found.warnings)
+    assert "What is left is noise" not in left_text(found)
+    healthy = diagnose(small_ring, simulate_response(small_ring, engine="ocelot", seed=1).measured)
+    assert "What is left is noise" in left_text(healthy)
+    assert not any("missing" in warning for warning in healthy.warnings)
