@@ -205,21 +205,12 @@ def verdict_of(
     judgement: Judgement,
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
     """The least certain of the findings', the findings that stand, and what is to be said."""
-    more, far_more = judgement.noise
+    _, far_more = judgement.noise
     if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
-        said = (
-            f"{many} not explain the data; a reference from before the fault would cancel what was "
-            "there anyway"
-        )
-        return "distributed", (), (said,)
+        return "distributed", (), (f"{many} not explain the data",)
     clean = "nothing" if p_value >= far_more or estimated else "distributed"
-    worst = least_certain(findings, clean)
-    if not findings:
-        return worst, (), ()
-    if p_value < more and not estimated:
-        return worst, findings, ("what is left is more than the noise: see 'unexplained'",)
-    return worst, findings, ()
+    return least_certain(findings, clean), findings, ()
 
 
 def unexplained(ring: Ring, left: FreeScan, p_value: float, judgement: Judgement) -> dict[str, Any]:

@@ -3,10 +3,12 @@ errors, the gap, and the file format."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
@@ -14,6 +16,7 @@ from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
 from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
@@ -25,6 +28,14 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis.response.pulled_apart import PulledApart
     from tmlattice.diagnosis.response.reasons import Reasons
     from tmlattice.diagnosis.suspects import Suspect
+
+_MEASURES = {
+    "closed_orbit": ("closed_orbit",),
+    "turn_by_turn": ("closed_orbit", "tunes"),
+    "dispersion": ("dispersion",),
+    "tunes": ("tunes",),
+}
+"""Quantities of the stored beam that a kind of measurement holds."""
 
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
@@ -188,6 +199,7 @@ class Diagnosis(ShownDiagnosis):
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
         dispersion: beside that of the ring as found, for `write_calibration`.
+        compared: blocks of readings with what the result predicts of them.
     """
 
     verdict: str
@@ -221,6 +233,37 @@ class Diagnosis(ShownDiagnosis):
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
+    compared: tuple[Block, ...] = ()
+
+    @cached_property
+    def assessment(self) -> Assessment:
+        """Whether the remainder is noise, a gap is closed, an effect is missing: each once."""
+        options = self.provenance["options"]
+        return assess(
+            self.verdict,
+            self.compared,
+            self.heldout,
+            amounts=len(self.steps) > 1 if self.by_steps else bool(self.causes or self.priors),
+            findings=bool(self.findings),
+            places=self.unexplained["places"],
+            noise_estimated=self.noise_estimated,
+            families=self.by_steps,
+            rejected=[step.effect for step in self.refused],
+            small_errors=bool(self.priors) and not self.by_steps,
+            reference=bool(options.get("reference")),
+            change=self.since_reference,
+            measured=self.measured,
+            false_alarm=options.get("false_alarm", DEFAULT.false_alarm),
+        )
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Quantities of the stored beam that were measured."""
+        kinds = {part.kind for part in self.parts} or {self.kind}
+        found = {quantity for kind in kinds for quantity in _MEASURES.get(kind, ())}
+        if self.by_steps and np.isfinite(self.response.data[-1]).any():
+            found.add("dispersion")
+        return tuple(sorted(found))
 
     @property
     def kind(self) -> str:
@@ -361,6 +404,7 @@ class Diagnosis(ShownDiagnosis):
             "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
+            "assessment": self.assessment.as_json(),
             "gap": self.gap,
             "suspects": [suspect.as_json() for suspect in self.suspects],
             "unexplained": {"patterns": None, **self.unexplained},

@@ -17,11 +17,9 @@ from tmlattice.report.tables import (
 )
 from tmlattice.report.text import (
     advice,
-    closed_text,
     columns,
     finding_rows,
     gap_rows,
-    left_text,
     noise_text,
     sensitivity_rows,
     small_rows,
@@ -62,8 +60,8 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
     if more:
         lines += ["", *wrapped(more, "Next: ", width)]
     lines += ["", *_gap_table(diagnosis)]
-    lines += wrapped(closed_text(diagnosis) + ".", "", width)
-    lines += wrapped(left_text(diagnosis), "", width)
+    for topic in ("gap", "remainder"):
+        lines += wrapped(diagnosis.assessment.sentence(topic), "", width)
     small = small_rows(diagnosis)
     if small:
         lines += ["", "Small errors everywhere:"]

@@ -14,7 +14,8 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE, Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.amounts import all_of, amount_text, numbers, scaled, words
-from tmlattice.report.text import HARDLY, NOT_HELD_OUT
+from tmlattice.report.remedies import SETTLED
+from tmlattice.report.text import times_usual
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
 """By the group of an effect; all other elements are magnets."""
@@ -121,8 +122,11 @@ def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """The stored beam by the design and as found, of the energy that the magnets are set for
-    whatever it has: (what, design, found)."""
+    whatever it has: (what, design, found). The closed orbit only where it was measured or errors
+    that were found move it."""
     told = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
+    moved = told.found is not None and max(told.found.orbit_rms) > SETTLED.orbit_rms[0]
+    orbit = moved or "closed_orbit" in diagnosis.assessment.measured
 
     def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
         if values is None:
@@ -136,10 +140,10 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     tunes = pair(told.design, 1, 5), pair(None if told.found is None else told.found.tunes, 1, 5)
     return [
         ("fractional tunes, x / y", *tunes),
-        row("beta beat, rms [%]", "beta_beat_rms", 100, 2),
-        row("beta beat, largest [%]", "beta_beat_max", 100, 2),
-        row("dispersion off the design's, rms [mm]", "dispersion_rms", 1e3, 1),
-        row("closed orbit, rms [µm]", "orbit_rms", 1e6, 1),
+        row("beta beating, rms [%]", "beta_beat_rms", 100, 2),
+        row("beta beating, largest [%]", "beta_beat_max", 100, 2),
+        row("change of the dispersion, rms [mm]", "dispersion_rms", 1e3, 1),
+        *([row("closed orbit, rms [µm]", "orbit_rms", 1e6, 1)] if orbit else []),
     ]
 
 
@@ -182,16 +186,16 @@ def large_text(diagnosis: Diagnosis) -> str:
     if diagnosis.by_steps:
         return ""
     large = []
-    for name, rms in diagnosis.priors.items():
-        usual = CATALOGUE[name].background if name in CATALOGUE else None
-        if usual and rms > LARGE * usual and diagnosis.prior_errors.get(name, 0.0) < HARDLY:
-            large.append(f"{words(name)} ({rms / usual:.2g} times)")
+    for name in diagnosis.priors:
+        times = times_usual(diagnosis, name)
+        if times is not None and times > LARGE:
+            large.append(f"{words(name)} ({times:.2g} times)")
     if not large:
         return ""
-    return (
-        f"{', '.join(large)}: faults may hide among them; a measurement of this machine from "
-        "before (--reference) would show them"
-    )
+    text = f"{', '.join(large)}: they can hide faults"
+    if diagnosis.assessment.reference:
+        return text
+    return f"{text}, which a measurement of this machine from before (--reference) would show"
 
 
 LARGE_TITLE = "small errors larger than usual"
@@ -206,9 +210,6 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
     """
     for warning in diagnosis.warnings:
         yield "warning", warning
-    if diagnosis.heldout is None:
-        what, _, judges = NOT_HELD_OUT.partition(": ")
-        yield what.lower(), judges
     if large := large_text(diagnosis):
         yield LARGE_TITLE, large
     if diagnosis.bad_monitors:

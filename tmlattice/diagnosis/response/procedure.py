@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
 from tmlattice.diagnosis.families.family import Told
@@ -39,13 +40,12 @@ from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
 from tmlattice.diagnosis.response.few import few_causes, knows_more
 from tmlattice.diagnosis.response.first_guess import FAR, strange
-from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.response.odd_steps import beside
 from tmlattice.diagnosis.response.pulled_apart import pulled_apart
 from tmlattice.diagnosis.response.reasons import explain_gradients
-from tmlattice.diagnosis.response.rf_by_others import rf_known_to
+from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.strangers import ODD, Strangers, reversed_ones, strangers
@@ -65,12 +65,9 @@ from tmlattice.observe.response_noise import overstated
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
-from tmlattice.speaks import micrometres
 
 Array = NDArray[np.float64]
 
-MISSING = 1.5
-"""Chi2 per reading of the result above which an effect is missing."""
 PATTERNS = 8
 """The strongest patterns of what is left."""
 LARGE = 60_000
@@ -79,9 +76,6 @@ for each of them."""
 TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
 TYPICAL = 6
 """Columns of a plane that say what a design leaves of the typical one."""
-BLOCKS = ("in-plane", "coupling", "RF")
-AS_KNOWN = 1.5
-"""So many times what a fit knows of the RF's orbit where it did not fit it is no sign of more."""
 
 
 def diagnose_response(
@@ -265,12 +259,16 @@ def as_diagnosis(
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     causes = tuple(cause for cause, _ in found)
     repaired = apply(ring, within)
+    blocks = remainder(fit.state)
     return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
         heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
         heldout_shots=(),
-        unexplained=_unexplained(fit),
+        compared=blocks,
+        unexplained={
+            "p_value": combined_p_value(blocks), "places": [], "patterns": _patterns(fit),
+        },
         tunes={
             "before": ring_tunes(ring, data.energy),
             "after": ring_tunes(repaired, data.energy + fit.state.at.errors.energy),
@@ -335,53 +333,17 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
     return [trial for trial in kept if trial.families]
 
 
-def _six(fit: tuple[Chi2, Chi2, Chi2], heldout: Score) -> dict[str, Chi2]:
-    """What fitted readings and held-out ones say of one model, by name."""
-    said = {f"fitted, {name}": own for name, own in zip(BLOCKS, fit, strict=True)}
-    held = zip(BLOCKS, heldout.chi2, strict=True)
-    return said | {f"held-out, {name}": own for name, own in held}
-
-
 def _verdict(fit: DenseFit, false_alarm: float) -> str:
     """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
     the RF's response; else `distributed`: many small errors."""
-    said = _six(fit_chi2(fit.design), fit.heldout[0])
-    chances = [chi2.sf(own.total, own.readings) for own in said.values() if own.readings]
+    said = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
+    chances = [chi2.sf(own.total, own.readings) for own in said if own.readings]
     return "nothing" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
 def _warnings(fit: DenseFit) -> tuple[str, ...]:
     """What a reader should know."""
-    last, heldout = fit.steps[-1], fit.heldout[1]
-    said = []
-    if last.heldout_chi2_per_dof > MISSING:
-        said.append(
-            f"On held-out readings {micrometres(last.heldout_rms_in_plane)} are left, "
-            f"{np.sqrt(last.heldout_chi2_per_dof):.1f} times the noise: an effect is missing."
-        )
-    left = {
-        name: own
-        for name, own in _six(fit_chi2(fit.state), heldout).items()
-        if own.per_reading > MISSING and chi2.sf(own.total, own.readings) < DEFAULT.false_alarm
-        and name != "held-out, in-plane"
-    }  # fmt: skip
-    rf = f"held-out, {BLOCKS[-1]}"
-    known = rf_known_to(fit.state) if rf in left else float("nan")
-    if heldout.dispersion < AS_KNOWN * known:
-        del left[rf]
-        said.append(
-            "The RF's orbit at monitors that did not fit it is missed by "
-            f"{1e6 * heldout.dispersion:.2g} µm, and the others know it to {1e6 * known:.2g} µm: "
-            "that is no sign of an effect."
-        )
-    if left:
-        how = ", ".join(f"{name} {np.sqrt(own.per_reading):.1f}" for name, own in left.items())
-        refused = "; ".join(step.effect for step in fit.refused)
-        said.append(
-            f"The result leaves more than the noise (times the noise: {how}): an effect is missing"
-            + (f", or is one of those refused ({refused})." if refused else ".")
-        )
-    said += dispersion_by_kicks(fit.state.values, fit.state.data)
+    said = dispersion_by_kicks(fit.state.values, fit.state.data)
     return (*said, *odd_readings(fit.state))
 
 
@@ -399,11 +361,13 @@ def _gap(fit: DenseFit, noise: float) -> Gap:
     before, after = (max(m.rms**2 - noise**2, 0.0) for m in (misfits[0], misfits[-1]))
     seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
     there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
-    return Gap(misfits, np.zeros((0, 0, 0)), 1 - after / before if there else None, None)
+    closed = 1 - after / before if there and len(misfits) > 1 else None
+    return Gap(misfits, np.zeros((0, 0, 0)), closed, None, 0, seen.readings)
 
 
-def _unexplained(fit: DenseFit) -> dict[str, Any]:
-    """What stays of the fitted correctors' readings, in their own plane."""
+def _patterns(fit: DenseFit) -> dict[str, Any]:
+    """What stays of the fitted correctors' readings: chi-square per reading, and the share of the
+    strongest patterns in each plane."""
     state, data = fit.state, fit.state.data
     shares = []
     total, count = 0.0, 0
@@ -415,9 +379,5 @@ def _unexplained(fit: DenseFit) -> dict[str, Any]:
         size = np.linalg.svd(miss, compute_uv=False) ** 2
         shares.append(float(size[:PATTERNS].sum() / max(size.sum(), 1e-300)))
         total += float(np.sum((miss / data.noise[state.good, p]) ** 2))
-        count += miss.size
-    return {
-        "p_value": float(chi2.sf(total, count)),
-        "places": [],
-        "patterns": {"chi2_per_dof": total / max(count, 1), "low_rank": shares},
-    }
+        count += int(seen.sum())
+    return {"chi2_per_dof": total / max(count, 1), "low_rank": shares}
