@@ -30,6 +30,9 @@ GapState = Literal[
 ]
 
 
+_UNEXPLAINED = ("effect_missing", "above_noise")
+
+
 @dataclass(frozen=True)
 class Block:
     """Readings compared with what the result predicts of them.
@@ -169,7 +172,8 @@ def assess(
         amounts: whether anything with an amount was put into the model.
         findings: whether there are findings.
         places: where the remainder is, with `s_from` and `s_to`, m.
-        noise_estimated, families, rejected, small_errors, reference, change, measured: see `Assessment`.
+        noise_estimated, families, rejected: see `Assessment`.
+        small_errors, reference, change, measured: likewise.
         false_alarm: p-value from which on a remainder is noise.
     """
     p_value = combined_p_value(blocks)
@@ -181,6 +185,7 @@ def assess(
         remainder = "effect_missing"
     elif significant:
         remainder = "unknown" if noise_estimated else "above_noise"
+    held = [block for block in significant if block.name.startswith("held-out")]
     before = after = float("nan")
     series: tuple[float, ...] = ()
     if gap is not None:
@@ -196,7 +201,7 @@ def assess(
         significant=significant,
         places=tuple((place["s_from"], place["s_to"]) for place in places),
         noise_estimated=noise_estimated,
-        gap=_gap(gap, amounts, findings, false_alarm),
+        gap=_gap(gap, amounts, findings, held if remainder in _UNEXPLAINED else (), false_alarm),
         before=before,
         after=after,
         closed=None if gap is None else gap.closed,
@@ -211,18 +216,24 @@ def assess(
     )
 
 
-def _gap(gap: Gap | None, amounts: bool, findings: bool, false_alarm: float) -> GapState:
+def _gap(
+    gap: Gap | None,
+    amounts: bool,
+    findings: bool,
+    left: Sequence[Block],
+    false_alarm: float,
+) -> GapState:
+    """The state of the gap; where nothing was put into the model, it is there if the held-out
+    readings are among the blocks that the result does not explain."""
     if gap is None:
         return "not_held_out"
     if gap.lost:
         return "beam_lost"
+    if not amounts:
+        return ("no_amount" if findings else "nothing_fitted") if left else "none"
     if gap.closed is not None:
         return "closed"
-    if not gap.significant(false_alarm):
-        return "none"
-    if not amounts:
-        return "no_amount" if findings else "nothing_fitted"
-    return "share_unknown"
+    return "share_unknown" if gap.significant(false_alarm) else "none"
 
 
 # --- the sentences --------------------------------------------------------------------------------
@@ -314,7 +325,6 @@ def _asks(own: Assessment) -> bool:
     return own.verdict == "distributed" and not own.families and not own.reference
 
 
-_UNEXPLAINED = ("effect_missing", "above_noise")
 _LEAVES_MORE = tuple(f"remainder_{name}" for name in _UNEXPLAINED)
 
 STATEMENTS = (
@@ -400,11 +410,9 @@ STATEMENTS = (
     ),
     Statement(
         "gap", "gap_none",
-        "the p-value of held-out readings before the correction is at the false-alarm level or "
-        "above",
+        "held-out readings before the correction are not significantly above the noise",
         lambda own: own.gap == "none",
         lambda own: f"{_held(own).capitalize()} show no gap beyond the noise.",
-        ("no_sparse_solution",),
     ),
     Statement(
         "gap", "gap_closed", "a gap on held-out readings, five standard errors or more; the share "

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import Block, combined_p_value, compared_of
+from tmlattice.diagnosis.correlations import correlations_of
 from tmlattice.diagnosis.findings import findings_of, sensitivity, verdict_of, with_consequences
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.left_out import spikes, with_silent
@@ -367,6 +368,10 @@ def _told(
         heldout=heldout,
         heldout_shots=(),
         compared=compared,
+        correlations=correlations_of(
+            [(cause.effect, cause.element) for cause in causes],
+            found.fit.covariance[: len(causes), : len(causes)],
+        ),
         unexplained={"p_value": combined_p_value(compared), "places": []},
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=next_kind(ring, found, [part.kind for part in parts], how, problem.fixed),

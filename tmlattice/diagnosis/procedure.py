@@ -18,6 +18,7 @@ from tmlattice.beam.model import Model
 from tmlattice.diagnosis.assessment import Block, combined_p_value, compared_of
 from tmlattice.diagnosis.background import SmallErrors
 from tmlattice.diagnosis.common import sought_in
+from tmlattice.diagnosis.correlations import correlations_of
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     findings_of,
@@ -143,6 +144,10 @@ def diagnose(
         heldout_shots=() if heldout is None else heldout.shots,
         unexplained=unexplained(told.problem.model.ring, told.left, p_value, judgement),
         compared=compared,
+        correlations=correlations_of(
+            [(cause.effect, cause.element) for cause in told.causes],
+            explanation.fit.covariance[: len(told.causes), : len(told.causes)],
+        ),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=_next(ring, ready, explanation, seed),
         sensitivity=sensitivity(explanation.first, judgement),

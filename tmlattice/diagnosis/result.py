@@ -10,6 +10,7 @@ import numpy as np
 
 from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
+from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
@@ -50,6 +51,7 @@ class Member:
         s: middle of the element, m.
         probability: of this explanation alone.
         remedy: what takes it away, in words.
+        device: what the control system calls the element; None: unknown.
     """
 
     effect: str
@@ -58,10 +60,11 @@ class Member:
     probability: float
     amount: float
     remedy: str
+    device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
-        return dict(vars(self))
+        return {key: value for key, value in vars(self).items() if key != "device" or value}
 
 
 @dataclass(frozen=True, repr=False)
@@ -86,6 +89,8 @@ class Finding(ShownFinding):
         seen_by: share of each measurement in what is known of its amount, where there are several.
         words, to_check, elements: what it is, what to look at, and which elements it is of, where
             that is known and no effect of the catalogue is it; else empty.
+        device: what the control system calls the element; None: unknown.
+        devices: the same of `elements` and `near`, by name.
     """
 
     effect: str | None
@@ -106,6 +111,8 @@ class Finding(ShownFinding):
     words: str = ""
     to_check: str = ""
     elements: tuple[str, ...] = ()
+    device: str | None = None
+    devices: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -153,7 +160,14 @@ class Finding(ShownFinding):
             "consequences": None if self.consequences is None else self.consequences.as_json(),
             **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
             **(told if self.words else {}),
+            **_device(self.device),
+            **({"devices": dict(self.devices)} if self.devices else {}),
         }
+
+
+def _device(name: str | None) -> dict[str, str]:
+    """A row's field of the control system's name; none where it is unknown."""
+    return {} if name is None else {"device": name}
 
 
 def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
@@ -197,9 +211,11 @@ class Diagnosis(ShownDiagnosis):
         reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
         pulled_apart: what the RF's orbit and the correctors' responses disagree about, or None.
         hypotheses: effects that may be missing, weighed; None: not asked.
-        suspects: of a `distributed` verdict on trajectories: where to look first.
+        suspects: where to look first for a fault that was not detected.
         dispersion: beside that of the ring as found, for `write_calibration`.
         compared: blocks of readings with what the result predicts of them.
+        correlations: pairs of amounts that the data hardly separate.
+        devices: what the control system calls elements, by their names.
     """
 
     verdict: str
@@ -234,6 +250,8 @@ class Diagnosis(ShownDiagnosis):
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
     compared: tuple[Block, ...] = ()
+    correlations: tuple[Correlation, ...] = ()
+    devices: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def assessment(self) -> Assessment:
@@ -397,9 +415,16 @@ class Diagnosis(ShownDiagnosis):
             "priors": dict(self.priors),
             "prior_errors": dict(self.prior_errors),
             "errors": [
-                {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
+                {
+                    "effect": c.effect,
+                    "element": c.element,
+                    "amount": c.amount,
+                    "amount_sigma": s,
+                    **_device(self.devices.get(c.element or "")),
+                }
                 for c, s in zip(self.causes, self.errors, strict=True)
             ],
+            "correlations": [pair.as_json() for pair in self.correlations],
             "reasons": None if self.reasons is None else self.reasons.as_json(),
             "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
@@ -413,5 +438,6 @@ class Diagnosis(ShownDiagnosis):
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
             "left_out": [dict(row) for row in self.left_out],
+            **({"devices": dict(self.devices)} if self.devices else {}),
             "provenance": self.provenance,
         }

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
 from tmlattice.importers.columns import Column, read_columns
-from tmlattice.importers.imported import Imported, counted
+from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, TurnByTurn
@@ -97,6 +97,9 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
     read = np.flatnonzero(taken.any(axis=(0, 1, 3)))
     noise = None if told.noise is None else np.full((len(read), 2), told.noise)
     hints = ring.name, ring.energy
+    devices_of = device_names(
+        (names[at], device) for device in devices if (at := monitor.get(device)) in read.tolist()
+    )
     data: Measurement | TurnByTurn = Measurement(
         launches=np.zeros((len(order), 5)),
         readings=readings[:, :, read],
@@ -105,6 +108,7 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
         launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(order), 1)),
         lattice=hints[0],
         energy=hints[1],
+        devices=devices_of,
     )
     of_noise = (
         "no noise is given: a diagnosis estimates it from the readings"
@@ -114,7 +118,7 @@ def bring_readings(path: Path, ring: Ring, told: Told | None = None) -> Imported
     beam = "where the beam was launched is not known"
     if isinstance(data, Measurement) and data.readings.shape[1] >= FEWEST:  # as of other files
         beam = f"{data.readings.shape[1]} turns are those of a stored beam that was kicked before"
-        data = TurnByTurn(data.readings[:, :MOST], data.monitors, noise, (), (), *hints)
+        data = TurnByTurn(data.readings[:, :MOST], data.monitors, noise, (), (), *hints, devices_of)
     said = [of_unit, beam, of_noise, *finder.said]
     if bad:
         said.append(f"bad monitors, left out as told: {counted(bad)}")

@@ -16,8 +16,11 @@ from tmlattice.report.tables import (
     optics_rows,
 )
 from tmlattice.report.text import (
+    CORRELATED,
+    SUSPECTS,
     advice,
     columns,
+    correlation_rows,
     finding_rows,
     gap_rows,
     noise_text,
@@ -34,8 +37,6 @@ WIDTH = 100
 
 MOST = 8
 """Tunes that are listed; the page has all."""
-
-SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 
 
 def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
@@ -56,6 +57,10 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         lines += ["", *wrapped(SUSPECTS, "", width)]
         for kind, place, what in suspect_rows(diagnosis):
             lines += wrapped(f"{place}: {what}", f"   {kind:<13}", width)
+    if diagnosis.correlations:
+        lines += ["", *wrapped(CORRELATED, "", width)]
+        for one, other, correlation in correlation_rows(diagnosis):
+            lines += wrapped(f"{one}; {other}: {correlation}", "   ", width)
     more = next_text(diagnosis) or advice(diagnosis)
     if more:
         lines += ["", *wrapped(more, "Next: ", width)]

@@ -11,9 +11,9 @@ import numpy as np
 
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.effects import CATALOGUE, Cause, find
+from tmlattice.effects import Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
-from tmlattice.report.amounts import all_of, amount_text, numbers, scaled, words
+from tmlattice.report.amounts import labelled, scaled, words
 from tmlattice.report.remedies import SETTLED
 from tmlattice.report.text import times_usual
 
@@ -65,16 +65,18 @@ def _table(diagnosis: Diagnosis, title: str, told: Sequence[tuple[Cause, float]]
         return max(abs(amount) / sigma if sigma > 0 else 0.0 for amount, sigma in own)
 
     names.sort(key=clearest, reverse=True)
+    known_devices = any(name in diagnosis.devices for name in names)
     rows = []
     for name in names:
         cells = [name or "the beam", _number(places.get(name, np.nan), 2)]
+        cells += [diagnosis.devices.get(name, "")] if known_devices else []
         for effect in effects:
             factor, _ = units[effect]
             amount, sigma = known.get((name, effect), (np.nan, np.nan))
             digits = 4 if not 0 < factor * sigma < np.inf else _digits(factor * sigma)
             cells += [_number(factor * value, digits) for value in (amount, sigma)]
         rows.append(tuple(cells))
-    head = ["name", "s [m]"]
+    head = ["name", "s [m]", *(["device"] if known_devices else [])]
     for effect in effects:
         head += [f"{find(effect).label} [{units[effect][1]}]", "error"]
     return Table(title, tuple(head), tuple(rows))
@@ -89,35 +91,8 @@ def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) else ""
 
 
-STANDS_OUT = 5.0
-"""Times the usual scatter of its own effect, and of its own error, from which on an amount of a
-dense fit is suspect."""
-
-ENOUGH, MOST = 8, 8
-"""Amounts of an effect that show a scatter; suspects that are listed."""
-
-
-def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """What stands out of its kind in a dense fit and is no finding: (kind, where, what); the
-    clearest first."""
-    found: list[tuple[float, tuple[str, str, str]]] = []
-    named = {(finding.effect, finding.element) for finding in diagnosis.findings}
-    told = list(zip(diagnosis.causes, diagnosis.errors, strict=True))
-    for effect in dict.fromkeys(cause.effect for cause, _ in told):
-        own = numbers((c, s) for c, s in told if c.effect == effect and c.element is not None)
-        if len(own) < ENOUGH:
-            continue
-        amounts = np.array([places[0].amount for places, _ in own])
-        off = amounts - np.median(amounts)
-        scatter = 1.4826 * float(np.median(abs(off)))
-        for (places, sigma), distance in zip(own, abs(off), strict=True):
-            times = float(distance / max(scatter, sigma, 1e-30))
-            if times > STANDS_OUT and not any((c.effect, c.element) in named for c in places):
-                kind = diagnosis.ring[places[0].element or ""].kind
-                what = f"{words(effect)} {amount_text(effect, places[0].amount, sigma)}"
-                said = f"{what}, {times:.0f} times the scatter of its kind"
-                found.append((times, (kind, all_of(places), said)))
-    return [row for _, row in sorted(found, key=lambda row: -row[0])[:MOST]]
+MOST = 8
+"""Readings left out that a note names."""
 
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
@@ -213,10 +188,11 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
     if large := large_text(diagnosis):
         yield LARGE_TITLE, large
     if diagnosis.bad_monitors:
-        yield "bad monitors, left out", ", ".join(diagnosis.bad_monitors)
+        names = (labelled(name, diagnosis.devices) for name in diagnosis.bad_monitors)
+        yield "rejected BPMs", ", ".join(names)
     if diagnosis.left_out:
         places = [
-            f"{row['monitor']} {row['plane']}"
+            f"{labelled(row['monitor'], diagnosis.devices)} {row['plane']}"
             + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
             for row in diagnosis.left_out
         ]

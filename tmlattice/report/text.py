@@ -10,9 +10,17 @@ import numpy as np
 
 from tmlattice.diagnosis.assessment import chance_text
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
-from tmlattice.report.amounts import amount_text, least_text, probability_text, words
+from tmlattice.report.amounts import (
+    all_of,
+    amount_text,
+    labelled,
+    least_text,
+    probability_text,
+    words,
+)
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.remedies import (
     consequence_text,
@@ -29,17 +37,19 @@ __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  #
 # --- words for parts ------------------------------------------------------------------------------
 def place_text(finding: Finding) -> str:
     """Where a finding sits: metres, and the monitors on both sides."""
+    devices = finding.devices
     if finding.s is None and finding.elements:
-        return f"at {' and '.join(finding.elements)}"
+        return f"at {' and '.join(labelled(name, devices) for name in finding.elements)}"
     if finding.where is None:
         return "no place: the whole beam, or all elements of a kind"
     low, high = finding.where
     span = f"{low:.1f} m to {high:.1f} m"
     between = ""
     if finding.near:
-        between = f" ({', '.join(finding.near)})"
-        if len(finding.near) == 2 and finding.near[0] != finding.near[1]:
-            between = f", between {finding.near[0]} and {finding.near[1]}"
+        near = [labelled(name, devices) for name in finding.near]
+        between = f" ({', '.join(near)})"
+        if len(near) == 2 and near[0] != near[1]:
+            between = f", between {near[0]} and {near[1]}"
     if finding.s is None:
         return f"s = {span}{between}"
     return f"s = {finding.s:.2f} m; from {span}{between}"
@@ -315,29 +325,46 @@ def sensitivity_rows(
     return [(words(name), least_text(name, known[name])) for name in chosen if name in known]
 
 
-def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Where to look first where nothing explains the data: (kind, where, what would explain most).
+SUSPECTS = "Suspects, no findings: where to look first for a fault that was not detected."
 
-    Suspects, not findings.
-    """
-    rows: list[tuple[str, str, str]] = []
-    for one in diagnosis.suspects:
-        low, high = one.where
-        place = one.element
-        if one.kind == "section":
-            place = f"s = {low:.1f} m to {high:.1f} m"
-            place += f", {' to '.join(dict.fromkeys(one.near))}" if one.near else ""
-        what = "something without a name" if one.effect is None else words(one.effect)
-        if one.kind == "section" and one.effect is not None:
-            what += f", {one.element}"
-        rows.append(
-            (
-                one.kind,
-                place,
-                f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})",
-            )
-        )
-    return rows
+
+def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Where to look first for a fault that was not detected: (kind, where, which effect)."""
+    return [(one.kind, _suspected(diagnosis, one), _suspicion(one)) for one in diagnosis.suspects]
+
+
+def _suspected(diagnosis: Diagnosis, one: Suspect) -> str:
+    if one.kind != "section":
+        return all_of(one.elements or (one.element,), diagnosis.devices)
+    low, high = one.where
+    place = f"s = {low:.1f} m to {high:.1f} m"
+    near = [labelled(name, diagnosis.devices) for name in dict.fromkeys(one.near)]
+    return f"{place}, {' to '.join(near)}" if near else place
+
+
+def _suspicion(one: Suspect) -> str:
+    what = "no effect of the catalogue" if one.effect is None else words(one.effect)
+    if one.measure == "scatter" and one.effect is not None and one.amount is not None:
+        amount = amount_text(one.effect, one.amount, one.amount_sigma)
+        return f"{what} {amount}, {one.statistic:.0f} times the scatter of its family"
+    if one.kind == "section" and one.effect is not None:
+        what += f", {one.element}"
+    return f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})"
+
+
+CORRELATED = "Correlated amounts: the data determine a combination of the two better than each."
+
+
+def correlation_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Pairs of amounts that the data hardly separate: (one, other, correlation)."""
+
+    def named(effect: str, element: str | None) -> str:
+        return f"{words(effect)}, {labelled(element or 'the beam', diagnosis.devices)}"
+
+    return [
+        (named(*pair.first), named(*pair.second), f"{pair.correlation:+.3f}")
+        for pair in diagnosis.correlations
+    ]
 
 
 # --- lines of text --------------------------------------------------------------------------------

@@ -52,6 +52,7 @@ from tmlattice.diagnosis.response.strangers import ODD, Strangers, reversed_ones
 from tmlattice.diagnosis.response.told import told
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
@@ -131,10 +132,10 @@ def diagnose_response(
         fit, measured, odd, exchanges = whole
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, degenerate = told(fit.state)
+        found, degenerate, correlated = told(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
-        fit, found, degenerate = few.fit, few.told, ()
+        fit, found, degenerate, correlated = few.fit, few.told, (), ()
         verdict, findings = few.verdict, few.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
@@ -150,6 +151,7 @@ def diagnose_response(
         findings=with_consequences(ring, findings, causes),
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
+        correlations=correlated,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
         pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),
@@ -260,14 +262,18 @@ def as_diagnosis(
     causes = tuple(cause for cause, _ in found)
     repaired = apply(ring, within)
     blocks = remainder(fit.state)
+    errors = tuple(sigma for _, sigma in found)
+    named = [(finding.effect or "", finding.element) for finding in told["findings"]]
     return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
-        heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
+        heldout=_gap(fit),
         heldout_shots=(),
         compared=blocks,
         unexplained={
-            "p_value": combined_p_value(blocks), "places": [], "patterns": _patterns(fit),
+            "p_value": combined_p_value(blocks),
+            "places": [],
+            "patterns": _patterns(fit),
         },
         tunes={
             "before": ring_tunes(ring, data.energy),
@@ -279,7 +285,8 @@ def as_diagnosis(
         ring=ring,
         repaired=repaired,
         causes=causes,
-        errors=tuple(sigma for _, sigma in found),
+        errors=errors,
+        suspects=outliers(ring, causes, errors, named),
         view=_view(fit),
         steps=fit.steps,
         refused=fit.refused,
@@ -356,9 +363,10 @@ def _misfit(fit: DenseFit, read: Array) -> Misfit:
     return Misfit(float(np.sqrt(np.nanmean(miss**2))), float(np.nanmean(pull**2)))
 
 
-def _gap(fit: DenseFit, noise: float) -> Gap:
+def _gap(fit: DenseFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
-    before, after = (max(m.rms**2 - noise**2, 0.0) for m in (misfits[0], misfits[-1]))
+    # in units of each reading's noise: the planes differ in it
+    before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
     seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
     there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
     closed = 1 - after / before if there and len(misfits) > 1 else None

@@ -43,13 +43,12 @@ def _blocks(state: State) -> Iterator[Block]:
     for block in (0, 1):
         there, found, more = _solved(state, block)
         name = BLOCKS[block]
-        columns = [(c, state.good) for c in np.flatnonzero(fitted)]
         own = _Sum(state, block)
-        for c, monitors in columns:
-            own.add(c, monitors)
+        for c in np.flatnonzero(fitted).tolist():
+            own.add(c, state.good)
         yield Block(f"fitted, {name}", own.chi2, own.readings - _numbers(found))
         held = _Sum(state, block, there, found, more)
-        for c in np.flatnonzero(state.split.held[:-1]):
+        for c in np.flatnonzero(state.split.held[:-1]).tolist():
             held.add(c, state.good, free=True)
         yield Block(f"held-out, {name}", held.chi2, held.readings)
         if block == 0:
@@ -60,9 +59,7 @@ def _blocks(state: State) -> Iterator[Block]:
                 yield Block(f"{which}, {BLOCKS[2]}", rf.chi2, rf.readings)
 
 
-def _solved(
-    state: State, block: int
-) -> tuple[Linear | None, Posterior | None, Array | None]:
+def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, Array | None]:
     """The fit of a block, and roots of what unknown prior scales add to its covariance."""
     if not state.of_block(block):
         return None, None, None

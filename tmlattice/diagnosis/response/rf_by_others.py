@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import taken, weight
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.normal import Posterior
 
 Array = NDArray[np.float64]
 
@@ -59,4 +59,3 @@ def rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
     if shared is not None:
         weights -= shared[column, read] @ shared[column, read].T
     return read, weights, state.data.pick(state.at.left)[column, read]
-
