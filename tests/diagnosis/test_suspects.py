@@ -3,6 +3,7 @@
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
+from tmlattice.machine.response import simulate_response
 from tmlattice.report.page import page
 
 SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}
@@ -39,10 +40,32 @@ def test_strong_faults_among_small_errors_are_suspects_and_no_findings(
     assert all(len(some) <= 3 for some in by_kind.values())
 
 
-def test_page_lists_suspects(among_small_errors):
-    html = page(among_small_errors[1], [])
-    assert "Not findings" in html
-    assert "end_3" in html
+def test_text_page_and_json_list_the_same_suspects(among_small_errors):
+    result = among_small_errors[1]
+    html, text, document = page(result, []), result.report(), result.as_json()
+    assert [one["element"] for one in document["suspects"]] == [s.element for s in result.suspects]
+    for said in (html, text):
+        assert "Suspects, no findings" in said
+        for one in result.suspects:
+            assert one.kind == "section" or one.element in said
+
+
+def test_an_outlier_of_a_family_is_a_suspect_everywhere(small_ring):
+    """A gain 20 times the scatter of the others, in a fit that names no single fault."""
+    wrong = Cause("monitor_gain_x", "end_3", 0.4)
+    data = simulate_response(
+        small_ring, [wrong], background={"monitor_gain_x": 0.02, "quadrupole_gradient": 2e-3},
+        engine="ocelot", progress=False,
+    ).measured  # fmt: skip
+    result = diagnose(small_ring, data, effects=["monitor_gain_x", "quadrupole_gradient"],
+                      max_effects=1)  # fmt: skip
+    found = [*result.suspects, *result.findings]
+    assert wrong.element in [one.element for one in found]
+    for one in result.suspects:
+        assert (one.measure, one.elements[0]) == ("scatter", one.element)
+        assert one.statistic > one.threshold
+        for said in (page(result, []), result.report()):
+            assert f"{one.statistic:.0f} times the scatter of its family" in " ".join(said.split())
 
 
 def test_small_errors_that_explain_all_leave_suspects(small_ring):

@@ -14,6 +14,7 @@ import numpy as np
 
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis.absent import in_the_lattice
+from tmlattice.diagnosis.devices import devices_of, with_devices
 from tmlattice.diagnosis.kinds import Measured, kind_of
 from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
@@ -73,8 +74,10 @@ def diagnose(
         said += [f"the {name}: {sentence}" for sentence in more if sentence not in said]
         if options[name] is None:
             del options[name]
+    every = [*(measurement.values() if isinstance(measurement, Mapping) else [measurement])]
     with threadpool_limits(one, "blas"):
         found = _diagnosed(ring, measurement, options)
+    found = with_devices(found, devices_of(ring, every))
     return replace(found, warnings=(*said, *found.warnings)) if said else found
 
 

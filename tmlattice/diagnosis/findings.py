@@ -217,34 +217,16 @@ def verdict_of(
     p_value: float,
     estimated: bool,
     judgement: Judgement,
-    reference: bool = False,
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
-    """The least certain of the findings', the findings that stand, and what is to be said.
-
-    Args:
-        explanation: of the search.
-        findings: its own.
-        p_value: chance that noise leaves as much.
-        estimated: the noise comes from the data.
-        judgement: thresholds.
-        reference: whether one was given.
-    """
-    more, far_more = judgement.noise
+    """The least certain of the findings', the findings that stand, and what is to be said."""
+    _, far_more = judgement.noise
     if findings and (why := _no_solution(explanation)):
         return "distributed", (), (f"no cause is named: {why}",)
     if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
-        said = f"{many} not explain the data"
-        if not reference:
-            said += "; a reference from before the fault would cancel what was there anyway"
-        return "distributed", (), (said,)
+        return "distributed", (), (f"{many} not explain the data",)
     clean = "nothing" if p_value >= far_more or estimated else "distributed"
-    worst = least_certain(findings, clean)
-    if not findings:
-        return worst, (), ()
-    if p_value < more and not estimated:
-        return worst, findings, ("what is left is more than the noise: see 'unexplained'",)
-    return worst, findings, ()
+    return least_certain(findings, clean), findings, ()
 
 
 def _no_solution(explanation: Explanation) -> str:

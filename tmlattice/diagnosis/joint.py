@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.assessment import Block, combined_p_value, compared_of
+from tmlattice.diagnosis.correlations import correlations_of
 from tmlattice.diagnosis.findings import (
     findings_of,
     finished,
@@ -57,7 +59,6 @@ from tmlattice.effects import (
     rare,
 )
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
-from tmlattice.inference import chi2
 from tmlattice.inference.among import MOST, Known, Learnt, small_errors_of
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome, fit
@@ -72,9 +73,6 @@ Array = NDArray[np.float64]
 
 MOST_OF_IT = 0.5
 """Share of the gap that one cause has to make to be put aside before sizes are learnt."""
-
-MISSING = 1.5
-"""Chi-square per held-out reading from which on `nothing` is not said alone."""
 
 CROWDED = 1.5
 """What half of the monitors leave at least of their noise where a few causes with names were tried,
@@ -344,26 +342,23 @@ def _told(
     )
     estimated = any(part.estimated for part in parts)
     findings = findings_of(ring, found, dead, judgement)
-    p_value = float(chi2.sf(result.chi2, freedom(found.problem, result)))
-    verdict, findings, said = verdict_of(
-        found, findings, p_value, estimated, judgement, not all(problem.active)
-    )
+    fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
+    verdict, findings, said = verdict_of(found, findings, fitted.p_value, estimated, judgement)
     if verdict == "nothing" and small is not None and small.errors and all(problem.active):
         verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
     if result.causes and not causes:  # nothing is explained: what is left is what was there
-        p_value = float(chi2.sf(found.before.chi2, freedom(found.problem, found.before)))
+        fitted = Block(fitted.name, found.before.chi2, freedom(found.problem, found.before))
     kept = problem.without(found.dropped)
     stages = stages_of(kept, found, small, causes)
     views = views_of(parts, kept, stages)
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     heldout = held_out(parts, problem.fixed, stages, aside, since)
-    if verdict == "nothing" and heldout and (left := heldout.misfits[-1].chi2_per_dof) > MISSING:
-        said = (*said, f"held-out readings leave {np.sqrt(left):.1f} times the noise: something is "
-                "there that the fitted ones do not see")  # fmt: skip
+    # what small errors leave undetermined is not in the errors of held-out readings
+    compared = compared_of(fitted, heldout if small is None else None)
     told = (f"{part.label}: {one}" for part in parts for one in part.said)
     warnings = [*told, *spikes(parts, problem, found), *said, *too_large(stages)]
     repaired = apply(ring, causes)
@@ -378,7 +373,12 @@ def _told(
         fit_after=misfit_of(pairs_of(parts, kept, stages[-1])),
         heldout=heldout,
         heldout_shots=(),
-        unexplained={"p_value": p_value, "places": []},
+        compared=compared,
+        correlations=correlations_of(
+            [(cause.effect, cause.element) for cause in causes],
+            found.fit.covariance[: len(causes), : len(causes)],
+        ),
+        unexplained={"p_value": combined_p_value(compared), "places": []},
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=next_kind(ring, found, [part.kind for part in parts], how, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),

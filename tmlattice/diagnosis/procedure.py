@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
+from tmlattice.diagnosis.assessment import Block, combined_p_value, compared_of
 from tmlattice.diagnosis.background import SmallErrors
 from tmlattice.diagnosis.common import sought_in
+from tmlattice.diagnosis.correlations import correlations_of
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     findings_of,
@@ -35,7 +37,6 @@ from tmlattice.diagnosis.suspects import suspects
 from tmlattice.diagnosis.views import TrajectoryView
 from tmlattice.effects import Cause, apply, background_rms
 from tmlattice.errors import BeamLostError, TmlatticeError
-from tmlattice.inference import chi2
 from tmlattice.inference.judge import Gap, held_out_gap, misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome
@@ -117,7 +118,7 @@ def diagnose(
     if heldout is None:
         measurement, heldout = measurement.split(holdout, seed)
         if heldout is None and holdout > 0:
-            said.append("one shot: none is held out, so nobody judges the gap")
+            said.append("one shot was measured, so none is held out")
     progress("model")
     rms = None if background is None else background_rms(background)
     ready, found = sought_in(
@@ -133,6 +134,8 @@ def diagnose(
     repaired = apply(ring, told.causes)
     noise = _noise(ready, small)
     left_out = _left_out(ready.problem, explanation, measurement.shots)
+    compared = compared_of(told.fitted, gap)
+    p_value = combined_p_value(compared)
     return Diagnosis(
         verdict=told.verdict,
         findings=with_consequences(ring, told.findings, told.causes),
@@ -140,7 +143,12 @@ def diagnose(
         fit_after=misfit(told.residuals[-1], told.problem.data.sigma),
         heldout=gap,
         heldout_shots=() if heldout is None else heldout.shots,
-        unexplained=unexplained(told.problem.model.ring, told.left, told.p_value, judgement),
+        unexplained=unexplained(told.problem.model.ring, told.left, p_value, judgement),
+        compared=compared,
+        correlations=correlations_of(
+            [(cause.effect, cause.element) for cause in told.causes],
+            explanation.fit.covariance[: len(told.causes), : len(told.causes)],
+        ),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=_next(ring, ready, explanation, seed),
         sensitivity=sensitivity(explanation.first, judgement),
@@ -181,7 +189,7 @@ class _Told:
         verdict, findings, causes: that stand.
         problem: the readings that they are judged on.
         left: the scan of free kicks about what stands.
-        p_value: chance that noise leaves as much.
+        fitted: the readings of the fit, compared with what stands.
         estimates: the likeliest small errors before and after, empty without a background.
         residuals: readings less model before and after, NaN where there is none.
         said: what a reader should know.
@@ -192,7 +200,7 @@ class _Told:
     causes: tuple[Cause, ...]
     problem: FirstTurns
     left: FreeScan
-    p_value: float
+    fitted: Block
     estimates: list[list[Cause]]
     residuals: list[Array]
     said: tuple[str, ...]
@@ -207,10 +215,10 @@ def _told(
 ) -> _Told:
     result, problem, left = explanation.fit, turns_of(explanation), explanation.left
     findings = findings_of(ring, explanation, ready.dead, judgement)
-    p_value = float(chi2.sf(result.chi2, freedom(problem, result)))
     alone = bool(problem.data.active.all())
+    fitted = Block("fitted readings", result.chi2, freedom(problem, result))
     verdict, standing, said = verdict_of(
-        explanation, findings, p_value, ready.estimated, judgement, not alone
+        explanation, findings, fitted.p_value, ready.estimated, judgement
     )
     learnt = small is not None and small.evidence is not None
     if verdict == "nothing" and learnt and alone:
@@ -218,7 +226,7 @@ def _told(
     if verdict == "distributed":  # nothing is explained: what was found stands no longer
         result, left = explanation.before, explanation.first_kicks
         problem = ready.problem if small is None else small.problem
-        p_value = float(chi2.sf(result.chi2, freedom(problem, result)))
+        fitted = Block(fitted.name, result.chi2, freedom(problem, result))
     elif result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     fits = [explanation.before, result] if result.causes or result.kicks else [explanation.before]
@@ -233,7 +241,7 @@ def _told(
         difference = problem.data.readings - one.point.view.readings - made
         residuals.append(np.where(there, difference, np.nan))
     return _Told(
-        verdict, standing, result.causes, problem, left, p_value, estimates, residuals, said
+        verdict, standing, result.causes, problem, left, fitted, estimates, residuals, said
     )
 
 
@@ -274,7 +282,7 @@ def _held_out(
         try:
             unknown = small.unknown(one, seen, problem(errors, ()), errors)
         except BeamLostError as error:
-            said.append(f"{error}: the held-out shots do not judge the gap")
+            said.append(f"{error}: the held-out shots do not validate the result")
             return None
         scored.append(judged(problem(errors, one.causes), unknown))
     return held_out_gap(scored, since=max(len(scored) - 2, 0))

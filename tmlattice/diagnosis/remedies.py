@@ -49,6 +49,7 @@ class Remedy:
         probability: of all explanations that share it.
         mechanisms: their effects with their probabilities, the likeliest first.
         strength: of the magnet, designed and found, where the effect scales one.
+        device: what the control system calls the element; None: unknown.
     """
 
     effect: str
@@ -60,6 +61,7 @@ class Remedy:
     probability: float
     mechanisms: tuple[tuple[str, float], ...]
     strength: Strength | None
+    device: str | None = None
 
     @property
     def cause(self) -> Cause:
@@ -87,6 +89,7 @@ class Remedy:
             "strength": None if self.strength is None else dict(vars(self.strength)),
             "probability": min(self.probability, 1.0),  # a sum of shares
             "mechanisms": [{"effect": e, "probability": p} for e, p in self.mechanisms],
+            **({} if self.device is None else {"device": self.device}),
         }
 
 

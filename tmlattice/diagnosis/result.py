@@ -3,17 +3,21 @@ errors, the gap, and the file format."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
+from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
 from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
@@ -26,11 +30,16 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis.response.reasons import Reasons
     from tmlattice.diagnosis.suspects import Suspect
 
+_MEASURES = {
+    "closed_orbit": ("closed_orbit",),
+    "turn_by_turn": ("closed_orbit", "tunes"),
+    "dispersion": ("dispersion",),
+    "tunes": ("tunes",),
+}
+"""Quantities of the stored beam that a kind of measurement holds."""
+
 VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
 """From the most certain to the least."""
-
-MUCH_MORE = 1e-4
-"""Chance that noise leaves as much, below which what is left is no noise."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +51,7 @@ class Member:
         s: middle of the element, m.
         probability: of this explanation alone.
         remedy: what takes it away, in words.
+        device: what the control system calls the element; None: unknown.
     """
 
     effect: str
@@ -50,10 +60,11 @@ class Member:
     probability: float
     amount: float
     remedy: str
+    device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
-        return dict(vars(self))
+        return {key: value for key, value in vars(self).items() if key != "device" or value}
 
 
 @dataclass(frozen=True, repr=False)
@@ -78,6 +89,8 @@ class Finding(ShownFinding):
         seen_by: share of each measurement in what is known of its amount, where there are several.
         words, to_check, elements: what it is, what to look at, and which elements it is of, where
             that is known and no effect of the catalogue is it; else empty.
+        device: what the control system calls the element; None: unknown.
+        devices: the same of `elements` and `near`, by name.
     """
 
     effect: str | None
@@ -98,6 +111,8 @@ class Finding(ShownFinding):
     words: str = ""
     to_check: str = ""
     elements: tuple[str, ...] = ()
+    device: str | None = None
+    devices: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -145,7 +160,14 @@ class Finding(ShownFinding):
             "consequences": None if self.consequences is None else self.consequences.as_json(),
             **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
             **(told if self.words else {}),
+            **_device(self.device),
+            **({"devices": dict(self.devices)} if self.devices else {}),
         }
+
+
+def _device(name: str | None) -> dict[str, str]:
+    """A row's field of the control system's name; none where it is unknown."""
+    return {} if name is None else {"device": name}
 
 
 def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
@@ -189,10 +211,13 @@ class Diagnosis(ShownDiagnosis):
         reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
         pulled_apart: what the RF's orbit and the correctors' responses disagree about, or None.
         hypotheses: effects that may be missing, weighed; None: not asked.
-        suspects: of a `distributed` verdict on trajectories: where to look first.
+        suspects: where to look first for a fault that was not detected.
         dispersion: beside that of the ring as found, for `write_calibration`.
         rejected: channels that the model cannot describe: (monitor, "x" or "y"), or (corrector,
             None).
+        compared: blocks of readings with what the result predicts of them.
+        correlations: pairs of amounts that the data hardly separate.
+        devices: what the control system calls elements, by their names.
     """
 
     verdict: str
@@ -227,6 +252,40 @@ class Diagnosis(ShownDiagnosis):
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
     rejected: tuple[tuple[str, str | None], ...] = ()
+    compared: tuple[Block, ...] = ()
+    correlations: tuple[Correlation, ...] = ()
+    devices: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def assessment(self) -> Assessment:
+        """Whether the remainder is noise, a gap is closed, an effect is missing: each once."""
+        options = self.provenance["options"]
+        return assess(
+            self.verdict,
+            self.compared,
+            self.heldout,
+            amounts=len(self.steps) > 1 if self.by_steps else bool(self.causes or self.priors),
+            findings=bool(self.findings),
+            places=self.unexplained["places"],
+            noise_estimated=self.noise_estimated,
+            families=self.by_steps,
+            rejected=[step.effect for step in self.refused],
+            small_errors=bool(self.priors) and not self.by_steps,
+            reference=bool(options.get("reference")),
+            change=self.since_reference,
+            measured=self.measured,
+            model=self.ring.model,
+            false_alarm=options.get("false_alarm", DEFAULT.false_alarm),
+        )
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Quantities of the stored beam that were measured."""
+        kinds = {part.kind for part in self.parts} or {self.kind}
+        found = {quantity for kind in kinds for quantity in _MEASURES.get(kind, ())}
+        if self.by_steps and np.isfinite(self.response.data[-1]).any():
+            found.add("dispersion")
+        return tuple(sorted(found))
 
     @property
     def kind(self) -> str:
@@ -249,11 +308,6 @@ class Diagnosis(ShownDiagnosis):
     def has_reference(self) -> bool:
         """Whether a measurement from before was given."""
         return bool(self.provenance["options"].get("reference"))
-
-    @property
-    def explains(self) -> bool:
-        """Whether what was found leaves little more than the noise."""
-        return bool(self.unexplained["p_value"] >= MUCH_MORE)
 
     @property
     def parts(self) -> tuple[PartView, ...]:
@@ -376,13 +430,21 @@ class Diagnosis(ShownDiagnosis):
             "priors": dict(self.priors),
             "prior_errors": dict(self.prior_errors),
             "errors": [
-                {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
+                {
+                    "effect": c.effect,
+                    "element": c.element,
+                    "amount": c.amount,
+                    "amount_sigma": s,
+                    **_device(self.devices.get(c.element or "")),
+                }
                 for c, s in zip(self.causes, self.errors, strict=True)
             ],
+            "correlations": [pair.as_json() for pair in self.correlations],
             "reasons": None if self.reasons is None else self.reasons.as_json(),
             "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
+            "assessment": self.assessment.as_json(),
             "gap": self.gap,
             "suspects": [suspect.as_json() for suspect in self.suspects],
             "unexplained": {"patterns": None, **self.unexplained},
@@ -391,5 +453,6 @@ class Diagnosis(ShownDiagnosis):
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
             "left_out": [dict(row) for row in self.left_out],
+            **({"devices": dict(self.devices)} if self.devices else {}),
             "provenance": self.provenance,
         }

@@ -17,6 +17,7 @@ from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.among import Among, Learnt
 from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import settled
 from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
@@ -176,11 +177,12 @@ def held_out(
             pairs.append((there, there.at((), gives.nuisances)))
             among.append(scored)
         misfits.append(misfit_of(pairs, among))
+    readings = sum(int((judge.valid & own).sum()) for judge, own in zip(judges, among, strict=True))
+    gap = Gap(tuple(misfits), np.zeros((0, 0, 0)), None, None, since, readings)
     before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
-    there_is = before > GAP and since < len(misfits) - 1
-    return Gap(
-        tuple(misfits), np.zeros((0, 0, 0)), 1 - after / before if there_is else None, None, since
-    )
+    if before > GAP and since < len(misfits) - 1 and gap.significant(DEFAULT.false_alarm):
+        return replace(gap, closed=1 - after / before)
+    return gap
 
 
 def seen_by(

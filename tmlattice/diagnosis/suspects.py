@@ -1,22 +1,25 @@
-"""Where to look first when no few causes explain the data: suspects, not findings.
+"""Suspects: where to look first for a fault that was not detected.
 
-On a `distributed` verdict what the search found stands no longer, or small errors everywhere
-explain the data and nothing stands out; yet what the scan sees most of is where a fault would be,
-if there is one among them.
+On a `distributed` verdict what the search found is rejected, or small errors everywhere explain the
+data; a fault among them is most probably where the scan's statistic is largest. In a fit of
+families of errors it is an amount that is an outlier of its family.
 
 >>> [(one.kind, one.element) for one in suspects(ring, explanation, judgement)]
+>>> [(one.element, one.amount) for one in outliers(ring, causes, errors, findings)]
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from tmlattice.diagnosis.places import between
+from tmlattice.effects import Cause
 from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
-from tmlattice.lattice import Ring
+from tmlattice.lattice import Element, Ring
 
 MOST = 3
 """Suspects of each kind."""
@@ -24,12 +27,19 @@ MOST = 3
 FLOOR = 9.0
 """Fall of chi-square from which on a hypothesis is suspect: 3 sigma of one looked at alone."""
 
-SuspectKind = Literal["monitor", "corrector", "section"]
+SuspectKind = Literal["monitor", "corrector", "magnet", "section"]
+
+OUTLIER = 5.0
+"""Distance from the median of its family, in units of the family's robust scatter and of its own
+error, above which an amount is an outlier."""
+
+ENOUGH, SHOWN = 8, 8
+"""Amounts of a family that show a scatter; outliers that are listed."""
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A monitor, a corrector, or what stands between two monitors.
+    """A monitor, a corrector, a magnet, or a section between two monitors.
 
     Attributes:
         kind: which of them.
@@ -37,9 +47,14 @@ class Suspect:
         element: the monitor, the corrector, or the element of the section that explains most.
         where: from the last monitor before to the first one behind, m.
         near: the names of those monitors.
-        statistic: fall of chi-square by it.
-        threshold: of the whole scan. What exceeds it and is no finding is less likely to be a fault
-            than a large one of the small errors everywhere.
+        statistic: fall of chi-square by it; or, of an outlier of a family, its distance from the
+            median in units of the family's scatter.
+        threshold: of the whole scan; what exceeds it and is no finding is less probably a fault
+            than a large one of the small errors everywhere. Or `OUTLIER`.
+        measure: "chi2" or "scatter": of which the statistic is.
+        elements: all that share the amount.
+        amount, amount_sigma: in the effect's unit; None of a scan's.
+        device: what the control system calls the element; None: unknown.
     """
 
     kind: SuspectKind
@@ -49,6 +64,11 @@ class Suspect:
     near: tuple[str, ...]
     statistic: float
     threshold: float
+    measure: Literal["chi2", "scatter"] = "chi2"
+    elements: tuple[str, ...] = ()
+    amount: float | None = None
+    amount_sigma: float | None = None
+    device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -60,6 +80,11 @@ class Suspect:
             "near": list(self.near),
             "statistic": self.statistic,
             "threshold": self.threshold,
+            "measure": self.measure,
+            "elements": list(self.elements or (self.element,)),
+            "amount": self.amount,
+            "amount_sigma": self.amount_sigma,
+            **({} if self.device is None else {"device": self.device}),
         }
 
 
@@ -83,15 +108,68 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
             continue  # the beam, or a family: no place to look at
         element = places[name]
         where, near = between(ring, [element.s])
-        kind: SuspectKind = "section"
-        key: object = where
-        if element.kind == "monitor":
-            kind, key = "monitor", name
-        elif element.kind in ("hcorrector", "vcorrector"):
-            kind, key = "corrector", name
+        kind = _kind(element)
+        key: object = name
+        if kind == "magnet":
+            kind, key = "section", where
         if (kind, key) not in found and sum(k == kind for k, _ in found) < MOST:
             found[kind, key] = Suspect(kind, effect, name, where, near, statistic, threshold)
     return tuple(found.values())
+
+
+def _kind(element: Element) -> SuspectKind:
+    if element.kind == "monitor":
+        return "monitor"
+    return "corrector" if element.kind in ("hcorrector", "vcorrector") else "magnet"
+
+
+def outliers(
+    ring: Ring, causes: Sequence[Cause], errors: Sequence[float], named: Iterable[Hypothesis]
+) -> tuple[Suspect, ...]:
+    """Amounts of a fit of families that are outliers of their family and no findings; the largest
+    distance first.
+
+    Args:
+        ring: the design.
+        causes, errors: of the fit, with the standard error of each amount.
+        named: effect and element of the findings.
+    """
+    found: list[Suspect] = []
+    known, told = set(named), list(zip(causes, errors, strict=True))
+    for effect in dict.fromkeys(cause.effect for cause in causes):
+        own = numbers((c, s) for c, s in told if c.effect == effect and c.element is not None)
+        if len(own) < ENOUGH:
+            continue
+        amounts = np.array([places[0].amount for places, _ in own])
+        off = np.abs(amounts - np.median(amounts))
+        scatter = 1.4826 * float(np.median(off))
+        for (places, sigma), distance in zip(own, off, strict=True):
+            times = float(distance / max(scatter, sigma, 1e-30))
+            if times > OUTLIER and not any((c.effect, c.element) in known for c in places):
+                elements = tuple(c.element for c in places if c.element is not None)
+                element = ring[elements[0]]
+                found.append(
+                    Suspect(
+                        _kind(element), effect, element.name, *between(ring, [element.s]), times,
+                        OUTLIER, "scatter", elements, places[0].amount, sigma,
+                    )
+                )  # fmt: skip
+    return tuple(sorted(found, key=lambda one: -one.statistic)[:SHOWN])
+
+
+def numbers(told: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:
+    """Amounts with their errors, those that are one number of several places (a magnet's pieces,
+    all dipoles of a type) together."""
+    found: dict[tuple[float, float], list[Cause]] = {}
+    sigmas: list[float] = []
+    for cause, sigma in told:
+        one = bool(cause.amount) and sigma > 0
+        own = (round(cause.amount / sigma, 9), sigma) if one else (float(len(found)), -1.0)
+        if own not in found:
+            found[own] = []
+            sigmas.append(sigma)
+        found[own].append(cause)
+    return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
 
 
 def _candidates(ring: Ring, explanation: Explanation) -> Iterator[Candidate]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported, numbers
+from tmlattice.importers.imported import Imported, device_names, numbers
 from tmlattice.importers.lattices import Elements
 from tmlattice.importers.matlab_ring import Roles, ring_of_elements
 from tmlattice.lattice.mat_file import check_hdf5
@@ -129,6 +129,7 @@ def bring_hdf5(
         rf=rf,
         lattice="lattice.json",
         energy=placed.ring.energy,
+        devices=device_names((placed.correctors[mapping[name]], name) for name in names),
     )
     said = (
         "monitors stand in the order of the lattice, x then y; inputs are found by the table of "

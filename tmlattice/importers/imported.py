@@ -1,6 +1,6 @@
 """What an importer makes of files: a measurement, the lattice where they hold one, and words."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -77,6 +77,20 @@ def counted(names: Sequence[str], most: int = 8) -> str:
     """Names in a sentence, the first few of many."""
     shown = ", ".join(f"'{name}'" for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def device_names(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Names of the control system by names of the lattice; those that are the same are left out.
+
+    Args:
+        pairs: name in the lattice, name in the control system; several of one element are joined.
+    """
+    found: dict[str, list[str]] = {}
+    for name, device in pairs:
+        own = found.setdefault(name, [])
+        if device and device.casefold() != name.casefold() and device not in own:
+            own.append(device)
+    return {name: ", ".join(own) for name, own in found.items() if own}
 
 
 def described(brought: Imported) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported, counted, is_number, numbers
+from tmlattice.importers.imported import Imported, counted, device_names, is_number, numbers
 from tmlattice.importers.loco_forms import usual_form
 from tmlattice.importers.matlab_ring import Placed, Roles, ring_of_elements
 from tmlattice.measurement import OrbitResponse
@@ -106,6 +106,7 @@ def bring_loco(
         rf=_rf(data, lattice, reads, good, placed),
         lattice="lattice.json",
         energy=placed.ring.energy,
+        devices=_device_names(data, reads, kickers, placed),
     )
     return Imported(
         measured,
@@ -317,6 +318,35 @@ def _columns(
         "response": response[take],
         "noise": noise,
     }
+
+
+LISTS = (
+    ("x", "monitor", ("HBPM", "BPMx")),
+    ("y", "monitor", ("VBPM", "BPMy")),
+    ("x", "corrector", ("HCM",)),
+    ("y", "corrector", ("VCM",)),
+)
+"""Plane and kind of the Middle Layer's device lists in LocoMeasData, by their names."""
+
+
+def _device_names(
+    data: Fields, reads: Mapping[str, Indices], kickers: Mapping[str, Indices], placed: Placed
+) -> dict[str, str]:
+    """Names of the Middle Layer, family and device such as `HCM(1,2)`, by names of the lattice;
+    lists that are missing, or of another length, are passed over."""
+    pairs: list[tuple[str, str]] = []
+    for plane, kind, known in LISTS:
+        lists = (data[name] for name in known if isinstance(data.get(name), Mapping))
+        own: Fields = next(lists, {})
+        index = (reads if kind == "monitor" else kickers)[plane].tolist()
+        devices = np.atleast_2d(np.asarray(own.get("DeviceList", ()), dtype=float))
+        if devices.shape != (len(index), 2) or not np.isfinite(devices).all():
+            continue
+        family = str(own.get("FamilyName") or known[0])
+        for place, (sector, number) in zip(index, devices.astype(int).tolist(), strict=True):
+            name = placed.monitors[place] if kind == "monitor" else placed.correctors[place, plane]
+            pairs.append((name, f"{family}({sector},{number})"))
+    return device_names(pairs)
 
 
 def _steps(correctors: Fields, letter: str, count: int) -> Array:

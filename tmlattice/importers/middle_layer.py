@@ -98,6 +98,7 @@ def bring_middle_layer(
         rf=_rf(beside, reads, model),
         lattice=model.lattice,
         energy=model.energy,
+        devices=model.devices,
     )
     said = [
         f"devices are those of '{path.name}', and kicks go by its step in the hardware's unit",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
 from tmlattice.importers.columns import Column, read_columns
-from tmlattice.importers.imported import Imported, counted
+from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, TurnByTurn
@@ -119,6 +119,9 @@ def bring_readings(
     read = np.flatnonzero(taken[..., :SUM].any(axis=(0, 1, 3)))
     noise = None if told.noise is None else np.full((len(read), 2), told.noise)
     hints = (None, None) if ring is None else (ring.name, ring.energy)
+    devices_of = device_names(
+        (names[at], device) for device in devices if (at := monitor.get(device)) in read.tolist()
+    )
     data: Measurement | TurnByTurn = Measurement(
         launches=np.zeros((len(order), 5)),
         readings=readings[:, :, read],
@@ -127,6 +130,7 @@ def bring_readings(
         launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(order), 1)),
         lattice=hints[0],
         energy=hints[1],
+        devices=devices_of,
     )
     of_noise = (
         "no noise is given: a diagnosis estimates it from the readings"
@@ -136,7 +140,14 @@ def bring_readings(
     beam = "where the beam was launched is not known"
     if isinstance(data, Measurement) and data.readings.shape[1] >= FEWEST:  # as of other files
         beam = f"{data.readings.shape[1]} turns are those of a stored beam that was kicked before"
-        data = TurnByTurn(data.readings[:, :MOST], data.monitors, noise, (), (), *hints)
+        data = TurnByTurn(
+            data.readings[:, :MOST],
+            data.monitors,
+            noise,
+            lattice=hints[0],
+            energy=hints[1],
+            devices=devices_of,
+        )
     sums = about_sums(both[..., SUM], silent, before, names)
     said = [of_unit, beam, of_noise, *finder.said, *sums]
     if bad:

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from tmlattice.inference import chi2
 
 Array = NDArray[np.float64]
 
@@ -113,6 +116,7 @@ class Gap:
             last one itself, or has no gap beyond the noise.
         interval: of `closed`, 95 %.
         since: index of the model with which the last one is compared.
+        readings: how many are scored.
     """
 
     misfits: tuple[Misfit, ...]
@@ -120,6 +124,16 @@ class Gap:
     closed: float | None
     interval: tuple[float, float] | None
     since: int = 0
+    readings: int = 0
+
+    def significant(self, false_alarm: float) -> bool:
+        """Whether model `since` leaves more of these readings than it expects.
+
+        Args:
+            false_alarm: probability of such a remainder by chance, below which it is significant.
+        """
+        square = self.readings * self.misfits[self.since].chi2_per_dof
+        return bool(chi2.sf(square, self.readings) < false_alarm)
 
     @property
     def lost(self) -> bool:
@@ -141,7 +155,9 @@ def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
     closed, interval = None, None
     if since < len(judged) - 1 and judged[since].parts and judged[-1].parts:
         closed, interval = _closed(judged[since].parts, judged[-1].parts)
-    return Gap(misfits, np.array([model.residuals for model in judged]), closed, interval, since)
+    residuals = np.array([model.residuals for model in judged])
+    readings = int(np.isfinite(residuals[since]).sum())
+    return Gap(misfits, residuals, closed, interval, since, readings)
 
 
 def misfit(residual: Array, sigma: Array) -> Misfit:
@@ -157,32 +173,31 @@ def _misfit(parts: Sequence[Left]) -> Misfit:
     count = sum(len(part.residual) for part in parts)
     if not count:
         return Misfit(np.nan, np.nan)
-    square = chi2 = expected = 0.0
+    square = weighed = expected = 0.0
     for part in parts:
         covariance = part.noise if part.covariance is None else part.covariance
         square += float(part.residual @ part.residual)
-        chi2 += float(part.residual @ np.linalg.solve(covariance, part.residual))
+        weighed += float(part.residual @ np.linalg.solve(covariance, part.residual))
         expected += float(np.trace(covariance))
-    return Misfit(float(np.sqrt(square / count)), chi2 / count, float(np.sqrt(expected / count)))
+    return Misfit(float(np.sqrt(square / count)), weighed / count, float(np.sqrt(expected / count)))
 
 
 def _closed(
     before: Sequence[Left], after: Sequence[Left]
 ) -> tuple[float | None, tuple[float, float] | None]:
     """The noise is the same in both, so that much of it goes out of their ratio."""
-    top = bottom = spread_top = spread_bottom = shared = 0.0
-    for one, other in zip(before, after, strict=True):
-        if len(one.residual) != len(other.residual):
-            return None, None  # the beam is lost in one of them
-        V = other.noise
-        twice = float(np.vdot(V, V))
-        moved_one, moved_other = V @ one.residual, V @ other.residual
-        bottom += float(one.residual @ one.residual - np.trace(one.noise))
-        top += float(other.residual @ other.residual - np.trace(V))
-        # of what is left without noise, the noise being taken out of its estimate
-        spread_bottom += 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
-        spread_top += 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
-        shared += 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
+    one, other = _together(before), _together(after)
+    if len(one.residual) != len(other.residual):
+        return None, None  # the beam is lost in one of them
+    V = other.noise
+    twice = float(np.vdot(V, V))
+    moved_one, moved_other = V @ one.residual, V @ other.residual
+    bottom = float(one.residual @ one.residual - np.trace(one.noise))
+    top = float(other.residual @ other.residual - np.trace(V))
+    # of what is left without noise, the noise being taken out of its estimate
+    spread_bottom = 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
+    spread_top = 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
+    shared = 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
     if bottom < 5 * np.sqrt(spread_bottom):
         return None, None
     left = max(top, 0.0) / bottom
@@ -190,3 +205,9 @@ def _closed(
     width = 1.96 * float(np.sqrt(max(variance, 0.0)))
     closed = 1 - left
     return float(closed), (float(closed - width), float(min(closed + width, 1.0)))
+
+
+def _together(parts: Sequence[Left]) -> Left:
+    """All parts as one: two models may group the same readings differently."""
+    residual = np.concatenate([part.residual for part in parts])
+    return Left(residual, block_diag(*(part.noise for part in parts)))

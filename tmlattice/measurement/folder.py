@@ -144,6 +144,7 @@ def _trajectory(
             shots=shots,
             lattice=document.get("lattice"),
             energy=document.get("energy_gev"),
+            devices=document.get("devices") or {},
         )
 
 
@@ -223,4 +224,5 @@ def _orbit_response(
             ),
             lattice=document.get("lattice"),
             energy=document.get("energy_gev"),
+            devices=document.get("devices") or {},
         )  # fmt: skip

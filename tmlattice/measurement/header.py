@@ -28,6 +28,7 @@ def header(kind: str, source: Any) -> dict[str, Any]:
         "lattice": source.lattice,
         "energy_gev": None if source.energy is None else float(source.energy),
         "noise": _write_noise(getattr(source, "noise", None), monitors),
+        "devices": dict(getattr(source, "devices", {})) or None,
     }
     return {key: value for key, value in stated.items() if value is not None}
 

@@ -1,7 +1,7 @@
 """The change of the stored beam's closed orbit for a step of one corrector at a time."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,8 @@ class OrbitResponse(Shown):
             (x, y), or a mapping of pairs by monitor, is taken too.
         rf: the RF's step, or None.
         lattice, energy: what the data say of them (GeV); hints.
+        devices: names that the control system has for monitors and correctors, by the names here;
+            empty: unknown.
 
     Raises:
         MeasurementError: shapes that do not fit, or numbers that cannot be.
@@ -80,6 +82,7 @@ class OrbitResponse(Shown):
     rf: RfStep | None = None
     lattice: str | None = None
     energy: float | None = None
+    devices: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         def keep(**values: Any) -> None:

@@ -49,6 +49,7 @@ def _turn_by_turn(file: Path, document: Document, monitors: Known) -> TurnByTurn
             monitors=names,
             settings=settings,
             shots=shots,
+            devices=document.get("devices") or {},
             **_common(document, names, monitors),
         )
 

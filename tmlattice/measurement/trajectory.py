@@ -1,7 +1,7 @@
 """Trajectories as the monitors read them: the first turn, or turn by turn."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,8 @@ class Measurement(Shown):
         shots: their ids; () for 0, 1, ...
         lattice: what the data say of the lattice; a hint.
         energy: what the data say of the beam energy, GeV; a hint.
+        devices: names that the control system has for monitors and correctors, by the names here;
+            empty: unknown.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
@@ -81,6 +83,7 @@ class Measurement(Shown):
     shots: tuple[int, ...] = ()
     lattice: str | None = None
     energy: float | None = None
+    devices: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         def keep(**values: Any) -> None:

@@ -1,6 +1,7 @@
 """Turns of the stored beam after a kick."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -35,6 +36,8 @@ class TurnByTurn(Shots):
         settings: of each shot, see `Measurement`; () for the design's in every shot.
         shots: their ids; () for 0, 1, ...
         lattice, energy: what the data say of them (GeV); hints.
+        devices: names that the control system has for monitors and correctors, by the names here;
+            empty: unknown.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, no reading at all, or
@@ -50,6 +53,7 @@ class TurnByTurn(Shots):
     shots: tuple[int, ...] = ()
     lattice: str | None = None
     energy: float | None = None
+    devices: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         readings, monitors = np.asarray(self.readings, dtype=float), tuple(self.monitors)

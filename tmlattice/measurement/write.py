@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -65,7 +65,9 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
             _write_signed(temporary, document, table)
         return
     m = measurement
-    with measurement_writer(folder, m.monitors, m.noise, m.lattice, m.energy, force) as writer:
+    with measurement_writer(
+        folder, m.monitors, m.noise, m.lattice, m.energy, force, m.devices
+    ) as writer:
         for i, shot in enumerate(m.shots):
             writer.add(
                 shot,
@@ -152,7 +154,7 @@ class MeasurementWriter:
 
     Attributes:
         monitors: names, in the order of the readings.
-        noise, lattice, energy: as in `Measurement`.
+        noise, lattice, energy, devices: as in `Measurement`.
     """
 
     def __init__(
@@ -163,10 +165,11 @@ class MeasurementWriter:
         energy: float | None,
         document: TextIO,
         table: TextIO,
+        devices: Mapping[str, str] | None = None,
     ) -> None:
         self.monitors = Names("monitor", monitors).names
         self.noise = noise_table(noise, self.monitors)
-        self.lattice, self.energy = lattice, energy
+        self.lattice, self.energy, self.devices = lattice, energy, devices or {}
         self._shots: set[int] = set()
         self._some = False
         self._document, self._table = document, table
@@ -257,6 +260,7 @@ def measurement_writer(
     lattice: str | None = None,
     energy: float | None = None,
     force: bool = False,
+    devices: Mapping[str, str] | None = None,
 ) -> Iterator[MeasurementWriter]:
     """A writer of a trajectory's folder, shot by shot, with memory flat in their number.
 
@@ -269,6 +273,7 @@ def measurement_writer(
         lattice: name or path, a hint for the reader.
         energy: GeV.
         force: a measurement that is there already is replaced.
+        devices: names of the control system, see `Measurement`.
 
     Raises:
         OutputError: it cannot be written.
@@ -282,6 +287,6 @@ def measurement_writer(
             (temporary / "measurement.json").open("w", encoding="utf-8") as document,
             (temporary / "readings.csv").open("w", encoding="utf-8", newline="") as table,
         ):
-            writer = MeasurementWriter(monitors, noise, lattice, energy, document, table)
+            writer = MeasurementWriter(monitors, noise, lattice, energy, document, table, devices)
             yield writer
             writer.close()

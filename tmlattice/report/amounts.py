@@ -1,10 +1,10 @@
 """Amounts, probabilities and effects in words."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tmlattice.effects import CATALOGUE, Cause, find
+from tmlattice.effects import CATALOGUE, find
 
 _SCALES = {
     "relative": ((0.0, 100.0, "%"),),
@@ -62,24 +62,17 @@ def probability_text(probability: float) -> str:
     return f"{100 * probability:.1f} %" if probability > 0.001 else "< 0.1 %"
 
 
-def numbers(
-    told: Iterable[tuple[Cause, float]],
-) -> list[tuple[tuple[Cause, ...], float]]:
-    """Amounts with their errors, those that are one number of several places (a magnet's pieces,
-    all dipoles of a type) together."""
-    found: dict[tuple[float, float], list[Cause]] = {}
-    sigmas: list[float] = []
-    for cause, sigma in told:
-        one = bool(cause.amount) and sigma > 0
-        own = (round(cause.amount / sigma, 9), sigma) if one else (float(len(found)), -1.0)
-        if own not in found:
-            found[own] = []
-            sigmas.append(sigma)
-        found[own].append(cause)
-    return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
+def labelled(name: str, devices: Mapping[str, str]) -> str:
+    """An element with what the control system calls it, where that is known."""
+    return f"{name} [{devices[name]}]" if name in devices else name
 
 
-def all_of(places: Sequence[Cause]) -> str:
-    """What a number is of, in words."""
-    first = places[0].element or "the beam"
+def all_of(places: Sequence[str | None], devices: Mapping[str, str]) -> str:
+    """The elements that share a number, in words.
+
+    Args:
+        places: their names; None: the beam.
+        devices: names of the control system.
+    """
+    first = labelled(places[0] or "the beam", devices)
     return first if len(places) == 1 else f"{first} and {len(places) - 1} alike"

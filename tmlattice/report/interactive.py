@@ -35,7 +35,6 @@ from tmlattice.plots.diagnosis import (
 from tmlattice.plots.names import plural
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings
 from tmlattice.report.amounts import amount_text, words
-from tmlattice.report.tables import standouts
 from tmlattice.speaks import micrometres
 
 Figure = dict[str, Any]
@@ -191,7 +190,6 @@ def plan(diagnosis: Diagnosis) -> Figure:
                        "line": {"width": 3}},
         })  # fmt: skip
     suspected = [suspect.element for suspect in diagnosis.suspects]
-    suspected += [name for _, name, _ in standouts(diagnosis)] if diagnosis.steps else []
     if suspected:
         x, y = view.at(suspected).T
         trace = _trace(x, y, "suspects", "@amber", mode="markers", size=14,

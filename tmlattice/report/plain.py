@@ -16,13 +16,14 @@ from tmlattice.report.tables import (
     optics_rows,
 )
 from tmlattice.report.text import (
+    CORRELATED,
+    SUSPECTS,
     advice,
-    closed_text,
     columns,
+    correlation_rows,
     finding_rows,
     gap_head,
     gap_rows,
-    left_text,
     noise_text,
     sensitivity_rows,
     small_rows,
@@ -37,8 +38,6 @@ WIDTH = 100
 
 MOST = 8
 """Tunes that are listed; the page has all."""
-
-SUSPECTS = "Suspects, not findings: what the scan sees most of, and where to look first."
 
 
 def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
@@ -59,12 +58,16 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         lines += ["", *wrapped(SUSPECTS, "", width)]
         for kind, place, what in suspect_rows(diagnosis):
             lines += wrapped(f"{place}: {what}", f"   {kind:<13}", width)
+    if diagnosis.correlations:
+        lines += ["", *wrapped(CORRELATED, "", width)]
+        for one, other, correlation in correlation_rows(diagnosis):
+            lines += wrapped(f"{one}; {other}: {correlation}", "   ", width)
     more = next_text(diagnosis) or advice(diagnosis)
     if more:
         lines += ["", *wrapped(more, "Next: ", width)]
     lines += ["", *_gap_table(diagnosis)]
-    lines += wrapped(closed_text(diagnosis) + ".", "", width)
-    lines += wrapped(left_text(diagnosis), "", width)
+    for topic in ("gap", "remainder"):
+        lines += wrapped(diagnosis.assessment.sentence(topic), "", width)
     small = small_rows(diagnosis)
     if small:
         lines += ["", "Small errors everywhere:"]

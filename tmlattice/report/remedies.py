@@ -28,7 +28,8 @@ def subject(remedy: Remedy) -> str:
     family = " family" if remedy.effect.startswith("family") else ""
     others = [name for name in remedy.pieces if name != remedy.element]
     magnet = f" (one magnet with {', '.join(others)})" if others else ""
-    return f"{kind}{family} {remedy.element}{magnet}"
+    device = f" [{remedy.device}]" if remedy.device else ""
+    return f"{kind}{family} {remedy.element}{device}{magnet}"
 
 
 def remedy_text(remedy: Remedy) -> str:
@@ -134,9 +135,9 @@ def _beam_text(beam: Beam | None, told: Consequences) -> str:
     said = [f"tunes {x:.4f}, {y:.4f} (model {told.design[0]:.4f}, {told.design[1]:.4f})"]
     if max(beam.beta_beat_max) > SETTLED.beta_beat_max[0]:
         rms, most = _pair(beam.beta_beat_rms, 100, 2), _pair(beam.beta_beat_max, 100, 2)
-        said.append(f"beta beat {rms} % rms, {most} % at most")
+        said.append(f"beta beating {rms} % rms, {most} % at most")
     if max(beam.dispersion_rms) > SETTLED.dispersion_rms[0]:
-        said.append(f"dispersion off by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms")
+        said.append(f"dispersion changed by {_pair(beam.dispersion_rms, 1e3, 1)} mm rms")
     if max(beam.orbit_rms) > SETTLED.orbit_rms[0]:
         said.append(f"closed orbit {_pair(beam.orbit_rms, 1e6, 1)} µm rms")
     return "; ".join(said)

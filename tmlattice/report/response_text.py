@@ -7,8 +7,9 @@ import numpy as np
 from tmlattice.diagnosis.response.dense import Step
 from tmlattice.diagnosis.response.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.suspects import numbers
 from tmlattice.effects import Cause
-from tmlattice.report.amounts import all_of, amount_text, numbers, words
+from tmlattice.report.amounts import all_of, amount_text, labelled, words
 from tmlattice.report.text import columns, wrapped
 
 SHOWN = 8
@@ -71,7 +72,8 @@ def largest(result: Diagnosis, effect: str) -> list[str]:
     """The errors of an effect that are furthest from zero, with their posterior rms."""
     rows = sorted(_numbers_of(result, effect), key=lambda row: -abs(row[0][0].amount))
     return [
-        f"{all_of(places)} {amount_text(effect, places[0].amount, sigma)}"
+        f"{all_of([place.element for place in places], result.devices)} "
+        f"{amount_text(effect, places[0].amount, sigma)}"
         for places, sigma in rows[:SHOWN]
     ]
 
@@ -202,18 +204,18 @@ def pulled_apart_texts(result: Diagnosis) -> list[str]:
 
 
 def left_sentence(result: Diagnosis) -> str:
-    """What stays: noise, or patterns."""
-    left = result.unexplained["patterns"]
-    x, y = left["low_rank"]
+    """How many patterns hold the remaining residual."""
+    x, y = result.unexplained["patterns"]["low_rank"]
     return (
-        f"Of the fitted readings {np.sqrt(left['chi2_per_dof']):.1f} times the noise is left; "
-        f"eight patterns hold {100 * x:.0f} % of it in x and {100 * y:.0f} % in y."
+        f"Eight patterns hold {100 * x:.0f} % of the remaining residual of fitted readings in x "
+        f"and {100 * y:.0f} % in y."
     )
 
 
 def bad_monitors_text(result: Diagnosis) -> str:
     """Their names."""
-    return f"Bad monitors, left out: {', '.join(result.bad_monitors) or 'none'}"
+    names = [labelled(name, result.devices) for name in result.bad_monitors]
+    return f"Rejected BPMs: {', '.join(names) or 'none'}"
 
 
 def steps_text(result: Diagnosis, width: int) -> list[str]:

@@ -11,11 +11,11 @@ import numpy as np
 
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.effects import CATALOGUE, Cause, find
+from tmlattice.effects import Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
-from tmlattice.report.amounts import all_of, amount_text, numbers, scaled, words
+from tmlattice.report.amounts import labelled, scaled, words
 from tmlattice.report.remedies import SETTLED
-from tmlattice.report.text import HARDLY, NOT_HELD_OUT
+from tmlattice.report.text import times_usual
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
 """By the group of an effect; all other elements are magnets."""
@@ -65,16 +65,18 @@ def _table(diagnosis: Diagnosis, title: str, told: Sequence[tuple[Cause, float]]
         return max(abs(amount) / sigma if sigma > 0 else 0.0 for amount, sigma in own)
 
     names.sort(key=clearest, reverse=True)
+    known_devices = any(name in diagnosis.devices for name in names)
     rows = []
     for name in names:
         cells = [name or "the beam", _number(places.get(name, np.nan), 2)]
+        cells += [diagnosis.devices.get(name, "")] if known_devices else []
         for effect in effects:
             factor, _ = units[effect]
             amount, sigma = known.get((name, effect), (np.nan, np.nan))
             digits = 4 if not 0 < factor * sigma < np.inf else _digits(factor * sigma)
             cells += [_number(factor * value, digits) for value in (amount, sigma)]
         rows.append(tuple(cells))
-    head = ["name", "s [m]"]
+    head = ["name", "s [m]", *(["device"] if known_devices else [])]
     for effect in effects:
         head += [f"{find(effect).label} [{units[effect][1]}]", "error"]
     return Table(title, tuple(head), tuple(rows))
@@ -89,41 +91,17 @@ def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) else ""
 
 
-STANDS_OUT = 5.0
-"""Times the usual scatter of its own effect, and of its own error, from which on an amount of a
-dense fit is suspect."""
-
-ENOUGH, MOST = 8, 8
-"""Amounts of an effect that show a scatter; suspects that are listed."""
-
-
-def standouts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """What stands out of its kind in a dense fit and is no finding: (kind, where, what); the
-    clearest first."""
-    found: list[tuple[float, tuple[str, str, str]]] = []
-    named = {(finding.effect, finding.element) for finding in diagnosis.findings}
-    told = list(zip(diagnosis.causes, diagnosis.errors, strict=True))
-    for effect in dict.fromkeys(cause.effect for cause, _ in told):
-        own = numbers((c, s) for c, s in told if c.effect == effect and c.element is not None)
-        if len(own) < ENOUGH:
-            continue
-        amounts = np.array([places[0].amount for places, _ in own])
-        off = amounts - np.median(amounts)
-        scatter = 1.4826 * float(np.median(abs(off)))
-        for (places, sigma), distance in zip(own, abs(off), strict=True):
-            times = float(distance / max(scatter, sigma, 1e-30))
-            if times > STANDS_OUT and not any((c.effect, c.element) in named for c in places):
-                kind = diagnosis.ring[places[0].element or ""].kind
-                what = f"{words(effect)} {amount_text(effect, places[0].amount, sigma)}"
-                said = f"{what}, {times:.0f} times the scatter of its kind"
-                found.append((times, (kind, all_of(places), said)))
-    return [row for _, row in sorted(found, key=lambda row: -row[0])[:MOST]]
+MOST = 8
+"""Readings left out that a note names."""
 
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """The stored beam by the design and as found, of the energy that the magnets are set for
-    whatever it has: (what, design, found)."""
+    whatever it has: (what, design, found). The closed orbit only where it was measured or errors
+    that were found move it."""
     told = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
+    moved = told.found is not None and max(told.found.orbit_rms) > SETTLED.orbit_rms[0]
+    orbit = moved or "closed_orbit" in diagnosis.assessment.measured
 
     def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
         if values is None:
@@ -135,15 +113,13 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         return name, "", pair(None if found is None else getattr(found, field), factor, digits)
 
     tunes = pair(told.design, 1, 5), pair(None if told.found is None else told.found.tunes, 1, 5)
-    rows = [
+    return [
         ("fractional tunes, x / y", *tunes),
-        row("beta beat, rms [%]", "beta_beat_rms", 100, 2),
-        row("beta beat, largest [%]", "beta_beat_max", 100, 2),
+        row("beta beating, rms [%]", "beta_beat_rms", 100, 2),
+        row("beta beating, largest [%]", "beta_beat_max", 100, 2),
         row("change of the dispersion, rms [mm]", "dispersion_rms", 1e3, 1),
+        *([row("closed orbit, rms [µm]", "orbit_rms", 1e6, 1)] if orbit else []),
     ]
-    if told.found is None or max(told.found.orbit_rms) > SETTLED.orbit_rms[0]:
-        rows.append(row("closed orbit of these errors, rms [µm]", "orbit_rms", 1e6, 1))
-    return rows
 
 
 def optics_head(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -185,19 +161,19 @@ LARGE = 3.0
 
 def large_text(diagnosis: Diagnosis) -> str:
     """Small errors that are larger than a sound ring's: single faults may pass for them."""
-    if diagnosis.by_steps or not diagnosis.explains:
+    if diagnosis.by_steps:
         return ""
     large = []
-    for name, rms in diagnosis.priors.items():
-        usual = CATALOGUE[name].background if name in CATALOGUE else None
-        if usual and rms > LARGE * usual and diagnosis.prior_errors.get(name, 0.0) < HARDLY:
-            large.append(f"{words(name)} ({rms / usual:.2g} times)")
+    for name in diagnosis.priors:
+        times = times_usual(diagnosis, name)
+        if times is not None and times > LARGE:
+            large.append(f"{words(name)} ({times:.2g} times)")
     if not large:
         return ""
-    hide = f"{', '.join(large)}: faults may hide among them"
-    if diagnosis.has_reference:
-        return hide
-    return f"{hide}; a measurement of this machine from before (--reference) would show them"
+    text = f"{', '.join(large)}: they can hide faults"
+    if diagnosis.assessment.reference:
+        return text
+    return f"{text}, which a measurement of this machine from before (--reference) would show"
 
 
 LARGE_TITLE = "small errors larger than usual"
@@ -212,16 +188,14 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
     """
     for warning in diagnosis.warnings:
         yield "warning", warning
-    if diagnosis.heldout is None:
-        what, _, judges = NOT_HELD_OUT.partition(": ")
-        yield what.lower(), judges
     if large := large_text(diagnosis):
         yield LARGE_TITLE, large
     if diagnosis.bad_monitors:
-        yield "bad monitors, left out", ", ".join(diagnosis.bad_monitors)
+        names = (labelled(name, diagnosis.devices) for name in diagnosis.bad_monitors)
+        yield "rejected BPMs", ", ".join(names)
     if diagnosis.left_out:
         places = [
-            f"{row['monitor']} {row['plane']}"
+            f"{labelled(row['monitor'], diagnosis.devices)} {row['plane']}"
             + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
             for row in diagnosis.left_out
         ]

@@ -8,10 +8,19 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from tmlattice.diagnosis.result import MUCH_MORE, Diagnosis, Finding
+from tmlattice.diagnosis.assessment import chance_text
+from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
-from tmlattice.report.amounts import amount_text, least_text, probability_text, words
+from tmlattice.report.amounts import (
+    all_of,
+    amount_text,
+    labelled,
+    least_text,
+    probability_text,
+    words,
+)
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.remedies import (
     consequence_text,
@@ -28,94 +37,61 @@ __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  #
 # --- words for parts ------------------------------------------------------------------------------
 def place_text(finding: Finding) -> str:
     """Where a finding sits: metres, and the monitors on both sides."""
+    devices = finding.devices
     if finding.s is None and finding.elements:
-        return f"at {' and '.join(finding.elements)}"
+        return f"at {' and '.join(labelled(name, devices) for name in finding.elements)}"
     if finding.where is None:
         return "no place: the whole beam, or all elements of a kind"
     low, high = finding.where
     span = f"{low:.1f} m to {high:.1f} m"
     between = ""
     if finding.near:
-        between = f" ({', '.join(finding.near)})"
-        if len(finding.near) == 2 and finding.near[0] != finding.near[1]:
-            between = f", between {finding.near[0]} and {finding.near[1]}"
+        near = [labelled(name, devices) for name in finding.near]
+        between = f" ({', '.join(near)})"
+        if len(near) == 2 and near[0] != near[1]:
+            between = f", between {near[0]} and {near[1]}"
     if finding.s is None:
         return f"s = {span}{between}"
     return f"s = {finding.s:.2f} m; from {span}{between}"
 
 
-LARGER = 1.5
-"""Times what is left after, from which what was left before is no noise."""
-
-NOT_HELD_OUT = "Nothing was held out: nobody but the fit judges the gap"
-
-
-def closed_text(diagnosis: Diagnosis) -> str:
-    """How much of the gap is closed on held-out shots."""
-    gap = diagnosis.heldout
-    if gap is None:
-        return NOT_HELD_OUT
-    if diagnosis.by_steps and len(diagnosis.steps) < 2:
-        return "Nothing was put into the model, so the gap stays"
-    if diagnosis.findings and not diagnosis.causes:
-        return (
-            "What has no name cannot be put into the lattice, so the gap of the held-out shots "
-            "stays"
-        )
-    if gap.closed is None and gap.lost:
-        return (
-            "The beam of held-out shots is lost in one of the models, so they do not judge the gap"
-        )
-    before, after = gap.misfits[gap.since], gap.misfits[-1]
-    if gap.closed is None and before.rms > LARGER * after.rms:
-        return (
-            f"Held-out readings are left with {micrometres(before.rms)} before and "
-            f"{micrometres(after.rms)} after; their launches leave open how much of that is closed"
-        )
-    if gap.closed is None:
-        return "Held-out readings show no gap beyond the noise, so there is none to close"
-    text = f"{100 * gap.closed:.1f} % of the gap beyond the noise is closed on held-out readings"
-    if gap.interval is not None:
-        low, high = gap.interval
-        text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
-    if diagnosis.priors and after.expected is not None:
-        rms = [f"{1e6 * step.rms:.3g}" for step in gap.misfits]
-        added = [f"the {diagnosis.ring.model}", "with small errors", "with what was found"]
-        text += ": " + ", ".join(f"{a} {b} µm" for a, b in zip(added, rms, strict=False))
-        text += f"; {1e6 * after.expected:.3g} µm are to be expected of it"
-    return text
-
-
 HARDLY = 0.5
-"""Relative error of a size of small errors from which on it is more a guess."""
+"""Relative error of the rms of small errors above which the readings do not determine it."""
 
 
 def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Small errors everywhere: (effect, rms and how many times the usual one)."""
+    """Small errors everywhere: (effect, rms; and, where the readings determine it, how many times
+    the usual one)."""
     rows = []
     for name, rms in diagnosis.priors.items():
         if name in CATALOGUE and not diagnosis.by_steps:
-            usual = CATALOGUE[name].background
-            times = f", {rms / usual:.2g} times the usual one" if usual else ""
-            if diagnosis.prior_errors.get(name, 0.0) > HARDLY:
-                times = "; taken, for these readings do not determine it"
-            elif not diagnosis.explains:
-                times = "; what this model does not explain is part of it"
-            rows.append((words(name), f"{amount_text(name, rms)} rms{times}"))
+            times = times_usual(diagnosis, name)
+            ratio = ", not determined by these readings"
+            if name not in diagnosis.prior_errors:
+                ratio = ", as stated"
+            elif times is not None:
+                ratio = f", {times:.2g} times the usual one"
+            rows.append((words(name), f"{amount_text(name, rms)} rms{ratio}"))
     return rows
+
+
+def times_usual(diagnosis: Diagnosis, name: str) -> float | None:
+    """The rms of small errors of an effect over the usual one; None where that is not determined:
+    its relative error is too large, or the model lacks an effect, which they would take up."""
+    usual = CATALOGUE[name].background if name in CATALOGUE else None
+    error = diagnosis.prior_errors.get(name, np.inf)
+    if not usual or error > HARDLY or diagnosis.assessment.remainder == "effect_missing":
+        return None
+    return diagnosis.priors[name] / usual
 
 
 # --- the sentences --------------------------------------------------------------------------------
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
-    if not diagnosis.since_reference:
-        return _verdict_sentence(diagnosis)
-    if diagnosis.verdict == "nothing":
-        return (
-            "Nothing changed since the reference but what monitors, correctors and magnets drift "
-            "by anyway."
-        )
-    return f"Since the reference: {_verdict_sentence(diagnosis)}"
+    text = diagnosis.assessment.sentence("verdict") or _verdict_sentence(diagnosis)
+    if not diagnosis.since_reference or diagnosis.verdict == "nothing":
+        return text
+    return f"Since the reference: {text}"
 
 
 def _verdict_sentence(diagnosis: Diagnosis) -> str:
@@ -127,18 +103,7 @@ def _verdict_sentence(diagnosis: Diagnosis) -> str:
         return "; ".join(_open(finding) for finding in found) + "."
     if diagnosis.verdict == "located":
         return _located_sentence(diagnosis)
-    if diagnosis.verdict == "distributed" and diagnosis.steps:
-        return steps_sentence(diagnosis)
-    if diagnosis.verdict == "distributed" and diagnosis.priors:
-        much = "the readings" if diagnosis.explains else "much, not all"
-        everywhere = f"Small errors all along the ring explain {much}"
-        return f"{everywhere}; no single fault stands out among them."
-    if diagnosis.verdict == "distributed":
-        return (
-            "The data differ from the model all along the ring; no single place, and no few "
-            "places, explain it."
-        )
-    return f"No error is seen: the {diagnosis.ring.model} explains the readings within their noise."
+    return steps_sentence(diagnosis)
 
 
 def _located_sentence(diagnosis: Diagnosis) -> str:
@@ -203,36 +168,25 @@ def _open(finding: Finding) -> str:
     also = [remedy_text(remedy) for remedy in others[:SAID]]
     also += [f"{more} more"] if more > 0 else []
     chance = probability_text(finding.probability)
-    return f"likeliest ({chance}) {text}; the data do not exclude " + ", or ".join(also)
+    return f"most probable ({chance}) {text}; alternatives: " + ", or ".join(also)
 
 
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
     everywhere = (
-        "Look at what stands out of its kind, set the gradients that --repaired-out writes, and "
-        "measure again."
+        "Inspect the suspects, set the gradients that --repaired-out writes, and measure again."
     )
-    if diagnosis.verdict == "distributed" and diagnosis.steps:
+    if diagnosis.verdict == "distributed" and diagnosis.by_steps:
         return everywhere
-    if diagnosis.verdict == "distributed" and diagnosis.has_reference:
-        return "More shots, with other launches, show a fault that small errors hide."
-    if diagnosis.verdict == "distributed" and diagnosis.priors:
-        return (
-            "A measurement of this machine from before the fault (--reference) shows a fault that "
-            "small errors hide."
-        )
-    if diagnosis.verdict == "distributed":
-        return (
-            "Small errors everywhere look like this: state them (--background all), or give a "
-            "measurement of this machine from before the fault (--reference)."
-        )
+    if text := diagnosis.assessment.sentence("reference"):
+        return text
     checks = dict.fromkeys(f.to_check for f in diagnosis.findings if f.to_check)
     if diagnosis.verdict == "located" and checks:
         return " ".join([*checks, *([everywhere] if _errors_in_steps(diagnosis) else [])])
     if diagnosis.verdict == "located":
         return (
-            "Look at what stands there: hardware, apertures, cables of the monitors. More launches "
-            "tell whether it is constant, linear or not, or changes from shot to shot."
+            "Inspect this section: hardware, apertures, cables of the BPMs. More launches show "
+            "whether the kick is constant, linear or nonlinear, or changes from shot to shot."
         )
     return ""
 
@@ -264,25 +218,10 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 
 
 def gap_sentence(diagnosis: Diagnosis) -> str:
-    """How far the gap falls, on the readings that judge."""
+    """How far the gap falls on the validation set."""
     rows = gap_rows(diagnosis)
     judges = rows if diagnosis.heldout is None else rows[-1:]
     return "; ".join(f"{name}: from {before} to {after}" for name, before, after in judges)
-
-
-def left_text(diagnosis: Diagnosis) -> str:
-    """What is left when all that was found is in the model."""
-    p_value = diagnosis.unexplained["p_value"]
-    places = diagnosis.unexplained["places"]
-    how = "noise" if p_value >= 0.01 else "slightly more than the noise"
-    how = how if p_value >= MUCH_MORE else "more than the noise"
-    text = f"What is left is {how} ({_chance(p_value)})"
-    if diagnosis.noise_estimated:
-        text += "; the noise was taken from the same data, which weakens this check"
-    if places:
-        spans = "; ".join(f"{p['s_from']:.1f} m to {p['s_to']:.1f} m" for p in places)
-        text += f". It sits at s = {spans}"
-    return text + "."
 
 
 # --- the rows -------------------------------------------------------------------------------------
@@ -317,11 +256,7 @@ def _seen_text(finding: Finding) -> str:
     if not np.isfinite(found.statistic):
         return "in the readings themselves, before any fit"
     text = f"statistic {found.statistic:.4g}, threshold {found.threshold:.3g}"
-    return f"{text}, {_chance(found.p_value)} for the whole scan"
-
-
-def _chance(p_value: float) -> str:
-    return "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
+    return f"{text}, {chance_text(found.p_value)} for the whole scan"
 
 
 MOST = 6
@@ -361,11 +296,11 @@ def _misfit_text(misfit: Misfit) -> str:
 
 
 def heldout_text(diagnosis: Diagnosis) -> str:
-    """Who judges."""
+    """Which readings are held out."""
     if diagnosis.kind == "trajectory":
         return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
     if not diagnosis.by_steps:
-        return "at half of the monitors"
+        return "at half of the BPMs"
     return f"{int(diagnosis.response.held.sum())} correctors"
 
 
@@ -400,29 +335,46 @@ def sensitivity_rows(
     return [(words(name), least_text(name, known[name])) for name in chosen if name in known]
 
 
-def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Where to look first where nothing explains the data: (kind, where, what would explain most).
+SUSPECTS = "Suspects, no findings: where to look first for a fault that was not detected."
 
-    Suspects, not findings.
-    """
-    rows: list[tuple[str, str, str]] = []
-    for one in diagnosis.suspects:
-        low, high = one.where
-        place = one.element
-        if one.kind == "section":
-            place = f"s = {low:.1f} m to {high:.1f} m"
-            place += f", {' to '.join(dict.fromkeys(one.near))}" if one.near else ""
-        what = "something without a name" if one.effect is None else words(one.effect)
-        if one.kind == "section" and one.effect is not None:
-            what += f", {one.element}"
-        rows.append(
-            (
-                one.kind,
-                place,
-                f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})",
-            )
-        )
-    return rows
+
+def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Where to look first for a fault that was not detected: (kind, where, which effect)."""
+    return [(one.kind, _suspected(diagnosis, one), _suspicion(one)) for one in diagnosis.suspects]
+
+
+def _suspected(diagnosis: Diagnosis, one: Suspect) -> str:
+    if one.kind != "section":
+        return all_of(one.elements or (one.element,), diagnosis.devices)
+    low, high = one.where
+    place = f"s = {low:.1f} m to {high:.1f} m"
+    near = [labelled(name, diagnosis.devices) for name in dict.fromkeys(one.near)]
+    return f"{place}, {' to '.join(near)}" if near else place
+
+
+def _suspicion(one: Suspect) -> str:
+    what = "no effect of the catalogue" if one.effect is None else words(one.effect)
+    if one.measure == "scatter" and one.effect is not None and one.amount is not None:
+        amount = amount_text(one.effect, one.amount, one.amount_sigma)
+        return f"{what} {amount}, {one.statistic:.0f} times the scatter of its family"
+    if one.kind == "section" and one.effect is not None:
+        what += f", {one.element}"
+    return f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})"
+
+
+CORRELATED = "Correlated amounts: the data determine a combination of the two better than each."
+
+
+def correlation_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Pairs of amounts that the data hardly separate: (one, other, correlation)."""
+
+    def named(effect: str, element: str | None) -> str:
+        return f"{words(effect)}, {labelled(element or 'the beam', diagnosis.devices)}"
+
+    return [
+        (named(*pair.first), named(*pair.second), f"{pair.correlation:+.3f}")
+        for pair in diagnosis.correlations
+    ]
 
 
 # --- lines of text --------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
 from tmlattice.diagnosis.families.family import Told
@@ -39,19 +40,19 @@ from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
 from tmlattice.diagnosis.response.few import few_causes, knows_more
 from tmlattice.diagnosis.response.first_guess import FAR, strange
-from tmlattice.diagnosis.response.judges import Chi2, Score
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.response.odd_steps import beside
 from tmlattice.diagnosis.response.pulled_apart import pulled_apart
 from tmlattice.diagnosis.response.reasons import explain_gradients
-from tmlattice.diagnosis.response.rf_by_others import rf_known_to
+from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.strangers import ODD, Strangers, reversed_ones, strangers
 from tmlattice.diagnosis.response.told import told
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
@@ -68,8 +69,6 @@ from tmlattice.optics import ring_tunes
 
 Array = NDArray[np.float64]
 
-MISSING = 1.5
-"""Chi2 per reading of the result above which an effect is missing."""
 PATTERNS = 8
 """The strongest patterns of what is left."""
 LARGE = 60_000
@@ -78,9 +77,6 @@ for each of them."""
 TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
 TYPICAL = 6
 """Columns of a plane that say what a design leaves of the typical one."""
-BLOCKS = ("in-plane", "coupling", "RF")
-AS_KNOWN = 1.5
-"""So many times what a fit knows of the RF's orbit where it did not fit it is no sign of more."""
 
 
 def diagnose_response(
@@ -138,10 +134,10 @@ def diagnose_response(
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         rejected = tuple(exchanges.rejected)
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, degenerate = told(fit.state)
+        found, degenerate, correlated = told(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
-        fit, found, degenerate = few.fit, few.told, ()
+        fit, found, degenerate, correlated = few.fit, few.told, (), ()
         verdict, findings = few.verdict, few.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
@@ -158,6 +154,7 @@ def diagnose_response(
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
         rejected=rejected,
+        correlations=correlated,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
         pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),
@@ -268,12 +265,20 @@ def as_diagnosis(
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     causes = tuple(cause for cause, _ in found)
     repaired = apply(ring, within)
+    blocks = remainder(fit.state)
+    errors = tuple(sigma for _, sigma in found)
+    named = [(finding.effect or "", finding.element) for finding in told["findings"]]
     return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
-        heldout=_gap(fit, float(np.hypot(noise_x, noise_y) / np.sqrt(2))),
+        heldout=_gap(fit),
         heldout_shots=(),
-        unexplained=_unexplained(fit),
+        compared=blocks,
+        unexplained={
+            "p_value": combined_p_value(blocks),
+            "places": [],
+            "patterns": _patterns(fit),
+        },
         tunes={
             "before": ring_tunes(ring, data.energy),
             "after": ring_tunes(repaired, data.energy + fit.state.at.errors.energy),
@@ -284,7 +289,8 @@ def as_diagnosis(
         ring=ring,
         repaired=repaired,
         causes=causes,
-        errors=tuple(sigma for _, sigma in found),
+        errors=errors,
+        suspects=outliers(ring, causes, errors, named),
         view=_view(fit),
         steps=fit.steps,
         refused=fit.refused,
@@ -338,48 +344,17 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
     return [trial for trial in kept if trial.families]
 
 
-def _six(fit: tuple[Chi2, Chi2, Chi2], heldout: Score) -> dict[str, Chi2]:
-    """What fitted readings and held-out ones say of one model, by name."""
-    said = {f"fitted, {name}": own for name, own in zip(BLOCKS, fit, strict=True)}
-    held = zip(BLOCKS, heldout.chi2, strict=True)
-    return said | {f"held-out, {name}": own for name, own in held}
-
-
 def _verdict(fit: DenseFit, false_alarm: float) -> str:
     """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
     the RF's response; else `distributed`: many small errors."""
-    said = _six(fit_chi2(fit.design), fit.heldout[0])
-    chances = [chi2.sf(own.total, own.readings) for own in said.values() if own.readings]
+    said = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
+    chances = [chi2.sf(own.total, own.readings) for own in said if own.readings]
     return "nothing" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
 def _warnings(fit: DenseFit) -> tuple[str, ...]:
     """What a reader should know."""
-    heldout = fit.heldout[1]
-    said = []
-    left = {
-        name: own
-        for name, own in _six(fit_chi2(fit.state), heldout).items()
-        if own.per_reading > MISSING
-        and chi2.sf(own.total, own.readings) < DEFAULT.false_alarm / len(BLOCKS)
-    }
-    rf = f"held-out, {BLOCKS[-1]}"
-    if rf in left and heldout.dispersion < AS_KNOWN * rf_known_to(fit.state):
-        del left[rf]  # the other BPMs determine it no better
-    if left:
-        how = ", ".join(f"{name} {np.sqrt(own.per_reading):.1f}" for name, own in left.items())
-        refused = "; ".join(step.effect for step in fit.refused)
-        fitted = any(name.startswith("fitted") for name in left)
-        why = (
-            "an effect is missing" if fitted else
-            "the fitted ones do not determine the ring better, or hide an effect that is missing"
-        )  # fmt: skip
-        said.append(
-            f"{'The result leaves' if fitted else 'Held-out readings are left with'} more than the "
-            f"noise (times the noise: {how}): {why}"
-            + (f", or is one of those refused ({refused})." if refused else ".")
-        )
-    said += dispersion_by_kicks(fit.state.values, fit.state.data)
+    said = dispersion_by_kicks(fit.state.values, fit.state.data)
     return (*said, *odd_readings(fit.state))
 
 
@@ -392,17 +367,19 @@ def _misfit(fit: DenseFit, read: Array) -> Misfit:
     return Misfit(float(np.sqrt(np.nanmean(miss**2))), float(np.nanmean(pull**2)))
 
 
-def _gap(fit: DenseFit, noise: float) -> Gap:
+def _gap(fit: DenseFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
-    before, after = (max(m.rms**2 - noise**2, 0.0) for m in (misfits[0], misfits[-1]))
+    # in units of each reading's noise: the planes differ in it
+    before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
     seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
     there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
-    return Gap(misfits, np.zeros((0, 0, 0)), 1 - after / before if there else None, None)
+    closed = 1 - after / before if there and len(misfits) > 1 else None
+    return Gap(misfits, np.zeros((0, 0, 0)), closed, None, 0, seen.readings)
 
 
-def _unexplained(fit: DenseFit) -> dict[str, Any]:
-    """What stays of the fitted correctors' readings: whether it is noise in both planes and for
-    the RF, and the patterns of what is in their own plane."""
+def _patterns(fit: DenseFit) -> dict[str, Any]:
+    """What stays of the fitted correctors' readings: chi-square per reading, and the share of the
+    strongest patterns in each plane."""
     state, data = fit.state, fit.state.data
     shares = []
     total, count = 0.0, 0
@@ -415,9 +392,4 @@ def _unexplained(fit: DenseFit) -> dict[str, Any]:
         shares.append(float(size[:PATTERNS].sum() / max(size.sum(), 1e-300)))
         total += float(np.sum((miss / data.noise[state.good, p]) ** 2))
         count += int(seen.sum())
-    chances = [chi2.sf(own.total, own.readings) for own in fit_chi2(state) if own.readings]
-    return {
-        "p_value": min(len(chances) * min(chances), 1.0),
-        "places": [],
-        "patterns": {"chi2_per_dof": total / max(count, 1), "low_rank": shares},
-    }
+    return {"chi2_per_dof": total / max(count, 1), "low_rank": shares}

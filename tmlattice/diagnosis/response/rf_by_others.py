@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import taken, weight
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.normal import Posterior
 
 Array = NDArray[np.float64]
 
@@ -59,20 +59,3 @@ def rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
     if shared is not None:
         weights -= shared[column, read] @ shared[column, read].T
     return read, weights, state.data.pick(state.at.left)[column, read]
-
-
-def rf_known_to(state: State) -> float:
-    """How well the fit knows the RF's orbit at monitors that did not fit it, noise of their
-    readings included, rms, m; NaN where there are none, or nothing is fitted."""
-    judges = (
-        state.good & ~state.split.half[-1] & np.isfinite(state.data.pick(state.data.orbits)[-1])
-    )
-    if not state.of_block(0) or not judges.any():
-        return float("nan")
-    there = linear(state, 0)
-    found = solve(there.normal, there.groups, there.start, rounds=0)
-    column = len(state.data.plane) - 1
-    rows = there.of_column(column, np.flatnonzero(judges), int(state.data.plane[column]))
-    unknown = solve_triangular(found.factor, (rows @ found.spread).T, lower=True)
-    noise = state.data.noise_of(0)[column, judges]
-    return float(np.sqrt(np.mean((unknown**2).sum(axis=0) + noise**2)))

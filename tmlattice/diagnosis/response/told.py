@@ -1,19 +1,28 @@
 """What a dense fit of an orbit response found, as causes with errors."""
 
-import numpy as np
+from collections.abc import Iterable
 
-from tmlattice.diagnosis.families.family import Told
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.correlations import Correlation, correlations_of
+from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import stated
 from tmlattice.errors import first_of
 from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.problem import Hypothesis
+
+Array = NDArray[np.float64]
 
 
-def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
-    """What is wrong as causes, with errors; and what the data alone do not settle, in words."""
+def told(state: State) -> tuple[list[Told], tuple[str, ...], tuple[Correlation, ...]]:
+    """What is wrong as causes, with errors; what the data alone do not settle, in words; and the
+    amounts that they hardly separate."""
     found: list[Told] = []
     said: tuple[str, ...] = ()
+    pairs: list[Correlation] = []
     for block in (0, 1):
         families = {f.variable: f for f in state.of_block(block)}
         if not families:
@@ -24,9 +33,32 @@ def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
         for name, family in families.items():
             own = sigma[there.where[name]]
             found += family.told(state.at.errors, state.values[name], own, state.data)
+        pairs += _correlated(state, families.values(), there, posterior)
         if block == 0:
             said = _degenerate(state, there, posterior)
-    return [row for row in found if row[0].amount != 0 or row[1] != 0], said
+    return [row for row in found if row[0].amount != 0 or row[1] != 0], said, tuple(pairs)
+
+
+def _correlated(
+    state: State, families: Iterable[Family], there: Linear, posterior: Posterior
+) -> tuple[Correlation, ...]:
+    """Amounts of the magnets' families that the readings hardly separate; each number is named for
+    the first that it moves."""
+    amounts: list[Hypothesis] = []
+    rows: list[Array] = []
+    spread = posterior.spread
+    for family in families:
+        if family.per == "ring":
+            moved = family.moves(state.data)
+            own = zip(moved, spread[there.where[family.variable]], strict=True)
+            for moves, row in own:
+                if moves:
+                    amounts.append(next(iter(moves)))
+                    rows.append(row)
+    if not rows:
+        return ()
+    root = np.array(rows)
+    return correlations_of(amounts, root @ posterior.covariance @ root.T)
 
 
 def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:

@@ -1,0 +1,470 @@
+"""The judgements of a diagnosis, each computed once, and the sentences that state them.
+
+Text, page, JSON and figures take these sentences from here. `STATEMENTS` is the table of every
+sentence with the condition that it requires; `docs/diagnose.md` shows it.
+
+>>> diagnosis.assessment.remainder, diagnosis.assessment.gap
+('noise', 'closed')
+>>> diagnosis.assessment.sentence("remainder")
+'The remaining residual is noise (p = 0.35).'
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from tmlattice.inference import chi2
+from tmlattice.inference.judge import Gap
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.speaks import micrometres
+
+MISSING = 1.5
+"""Chi-square per degree of freedom above which a significant remainder is a missing effect: a rms
+of 1.2 times the expected one, more than the error of a usual noise estimate."""
+
+Remainder = Literal["noise", "above_noise", "effect_missing", "unknown"]
+GapState = Literal[
+    "not_held_out", "nothing_fitted", "no_amount", "beam_lost", "none", "closed", "share_unknown"
+]
+
+
+_UNEXPLAINED = ("effect_missing", "above_noise")
+
+
+@dataclass(frozen=True)
+class Block:
+    """Readings compared with what the result predicts of them.
+
+    Attributes:
+        name: which readings.
+        chi2: sum of squares in the expected covariance: noise, and for held-out readings what the
+            fit leaves undetermined.
+        freedom: degrees of freedom.
+    """
+
+    name: str
+    chi2: float
+    freedom: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi-square."""
+        return float(chi2.sf(self.chi2, self.freedom))
+
+    @property
+    def ratio(self) -> float:
+        """Rms of the residual over the expected rms."""
+        return float(np.sqrt(self.chi2 / self.freedom))
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {**vars(self), "p_value": self.p_value, "ratio": self.ratio}
+
+
+def compared_of(fitted: Block, gap: Gap | None) -> tuple[Block, ...]:
+    """The readings of the fit, and the held-out ones with the last model of the gap."""
+    square = np.nan if gap is None else gap.readings * gap.misfits[-1].chi2_per_dof
+    if gap is None or gap.lost or not square > 0:
+        return (fitted,)
+    return fitted, Block("held-out readings", square, gap.readings)
+
+
+def combined_p_value(blocks: Sequence[Block]) -> float:
+    """Probability that the smallest p-value of so many blocks is as small (Bonferroni); NaN of
+    none."""
+    if not blocks:
+        return float("nan")
+    return min(1.0, len(blocks) * min(block.p_value for block in blocks))
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What a diagnosis concludes of its own fit.
+
+    Attributes:
+        verdict: of the diagnosis.
+        remainder: whether the residual of the result is noise.
+        p_value: of the remainder, over all blocks.
+        blocks: the readings that were compared.
+        significant: of those, the ones that leave more than expected.
+        places: where the remainder is, (from, to) in m.
+        noise_estimated: whether the noise comes from the same readings.
+        gap: whether held-out readings show a gap, and whether it is closed.
+        before, after: rms of held-out readings, m.
+        closed, interval: share of the gap that is closed, and its 95 % interval.
+        series: rms of the held-out readings of each model, and what the last one expects, m; empty
+            without small errors.
+        families: whether families of errors were fitted step by step.
+        rejected: families that were tried and are not in the result.
+        small_errors: whether small errors everywhere are in the model.
+        reference: whether a reference measurement was given.
+        change: whether the findings are changes since that reference.
+        measured: quantities of the stored beam that were measured.
+        model: what the lattice is of the machine, such as "design".
+    """
+
+    verdict: str
+    remainder: Remainder
+    p_value: float
+    blocks: tuple[Block, ...]
+    significant: tuple[Block, ...]
+    places: tuple[tuple[float, float], ...]
+    noise_estimated: bool
+    gap: GapState
+    before: float
+    after: float
+    closed: float | None
+    interval: tuple[float, float] | None
+    series: tuple[float, ...]
+    families: bool
+    rejected: tuple[str, ...]
+    small_errors: bool
+    reference: bool
+    change: bool
+    measured: frozenset[str]
+    model: str = "design"
+
+    @property
+    def statements(self) -> tuple["Statement", ...]:
+        """Those whose condition holds: one of each topic at most."""
+        return tuple(one for one in STATEMENTS if one.holds(self))
+
+    def sentence(self, topic: str) -> str:
+        """The sentence about a topic; empty where none holds."""
+        return next((one.text(self) for one in self.statements if one.topic == topic), "")
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {
+            "remainder": self.remainder,
+            "p_value": self.p_value,
+            "blocks": [block.as_json() for block in self.blocks],
+            "gap": self.gap,
+            "reference": self.reference,
+            "measured": sorted(self.measured),
+            "statements": {one.name: one.text(self) for one in self.statements},
+        }
+
+
+def assess(
+    verdict: str,
+    blocks: Sequence[Block],
+    gap: Gap | None,
+    *,
+    amounts: bool,
+    findings: bool,
+    places: Sequence[Mapping[str, float]] = (),
+    noise_estimated: bool,
+    families: bool = False,
+    rejected: Sequence[str] = (),
+    small_errors: bool = False,
+    reference: bool = False,
+    change: bool = False,
+    measured: Sequence[str] = (),
+    model: str = "design",
+    false_alarm: float = DEFAULT.false_alarm,
+) -> Assessment:
+    """The judgements of a result.
+
+    Args:
+        verdict: of the diagnosis.
+        blocks: readings compared with what the result predicts.
+        gap: of held-out readings; None: none were held out.
+        amounts: whether anything with an amount was put into the model.
+        findings: whether there are findings.
+        places: where the remainder is, with `s_from` and `s_to`, m.
+        noise_estimated, families, rejected: see `Assessment`.
+        small_errors, reference, change, measured, model: likewise.
+        false_alarm: p-value from which on a remainder is noise.
+    """
+    p_value = combined_p_value(blocks)
+    significant = tuple(b for b in blocks if len(blocks) * b.p_value < false_alarm)
+    remainder: Remainder = "noise"
+    if not blocks:
+        remainder = "unknown"
+    elif any(block.ratio**2 > MISSING for block in significant):
+        remainder = "effect_missing"
+    elif significant:
+        remainder = "unknown" if noise_estimated else "above_noise"
+    held = [block for block in significant if block.name.startswith("held-out")]
+    before = after = float("nan")
+    series: tuple[float, ...] = ()
+    if gap is not None:
+        before, after = gap.misfits[gap.since].rms, gap.misfits[-1].rms
+        expected = gap.misfits[-1].expected
+        if small_errors and expected is not None:
+            series = (*(misfit.rms for misfit in gap.misfits), expected)
+    return Assessment(
+        verdict=verdict,
+        remainder=remainder,
+        p_value=p_value,
+        blocks=tuple(blocks),
+        significant=significant,
+        places=tuple((place["s_from"], place["s_to"]) for place in places),
+        noise_estimated=noise_estimated,
+        gap=_gap(gap, amounts, findings, held if remainder in _UNEXPLAINED else (), false_alarm),
+        before=before,
+        after=after,
+        closed=None if gap is None else gap.closed,
+        interval=None if gap is None else gap.interval,
+        series=series,
+        families=families,
+        rejected=tuple(rejected),
+        small_errors=small_errors,
+        reference=reference,
+        change=change,
+        measured=frozenset(measured),
+        model=model,
+    )
+
+
+def _gap(
+    gap: Gap | None,
+    amounts: bool,
+    findings: bool,
+    left: Sequence[Block],
+    false_alarm: float,
+) -> GapState:
+    """The state of the gap; where nothing was put into the model, it is there if the held-out
+    readings are among the blocks that the result does not explain."""
+    if gap is None:
+        return "not_held_out"
+    if gap.lost:
+        return "beam_lost"
+    if not amounts:
+        return ("no_amount" if findings else "nothing_fitted") if left else "none"
+    if gap.closed is not None:
+        return "closed"
+    return "share_unknown" if gap.significant(false_alarm) else "none"
+
+
+# --- the sentences --------------------------------------------------------------------------------
+class Statement(NamedTuple):
+    """One sentence of a report.
+
+    Attributes:
+        topic: at most one sentence of a topic is stated.
+        name: of the sentence.
+        requires: its condition in words.
+        holds: the condition.
+        text: the sentence.
+        excludes: names of sentences of other topics that contradict it.
+    """
+
+    topic: str
+    name: str
+    requires: str
+    holds: Callable[[Assessment], bool]
+    text: Callable[[Assessment], str]
+    excludes: tuple[str, ...] = ()
+
+
+def chance_text(p_value: float) -> str:
+    """A p-value in words."""
+    return "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
+
+
+def _where(own: Assessment) -> str:
+    spans = "; ".join(f"{low:.1f} m to {high:.1f} m" for low, high in own.places)
+    return f" It is largest at s = {spans}." if spans else ""
+
+
+def _blocks(own: Assessment) -> str:
+    worst = sorted(own.significant, key=lambda block: -block.ratio)
+    return ", ".join(f"{block.name} {block.ratio:.2g}" for block in worst)
+
+
+def _noise(own: Assessment) -> str:
+    weak = ""
+    if own.noise_estimated:
+        weak = " The noise is estimated from the same readings, which weakens this test."
+    return f"The remaining residual is noise ({chance_text(own.p_value)}).{weak}"
+
+
+def _above(own: Assessment) -> str:
+    return (
+        f"The remaining residual is larger than the noise ({chance_text(own.p_value)}; rms over "
+        f"expected rms: {_blocks(own)}).{_where(own)}"
+    )
+
+
+def _missing(own: Assessment) -> str:
+    text = (
+        f"The model lacks an effect: the remaining residual is larger than expected "
+        f"({chance_text(own.p_value)}; rms over expected rms: {_blocks(own)}).{_where(own)}"
+    )
+    if own.rejected:
+        text += f" It can be one of the rejected families: {'; '.join(own.rejected)}."
+    return text
+
+
+def _closed(own: Assessment) -> str:
+    text = f"On {_held(own)} {100 * (own.closed or 0.0):.1f} % of the gap is closed"
+    if own.interval is not None:
+        low, high = own.interval
+        text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
+    if own.series:
+        *rms, expected = own.series
+        added = (f"the {own.model}", "with small errors", "with the findings")
+        steps = ", ".join(f"{a} {micrometres(b)}" for a, b in zip(added, rms, strict=False))
+        text += f": {steps}; {micrometres(expected)} are expected"
+    return text + "."
+
+
+def _held(own: Assessment) -> str:
+    return "held-out in-plane readings" if own.families else "held-out readings"
+
+
+def _falls(own: Assessment) -> str:
+    return f"from {micrometres(own.before)} to {micrometres(own.after)}"
+
+
+def _everywhere(own: Assessment) -> bool:
+    return own.verdict == "distributed" and own.small_errors and not own.families
+
+
+def _asks(own: Assessment) -> bool:
+    return own.verdict == "distributed" and not own.families and not own.reference
+
+
+_LEAVES_MORE = tuple(f"remainder_{name}" for name in _UNEXPLAINED)
+
+STATEMENTS = (
+    Statement(
+        "verdict", "no_change",
+        "verdict nothing; the findings are changes since a reference",
+        lambda own: own.verdict == "nothing" and own.change,
+        lambda own: "Nothing changed since the reference beyond the usual drifts of monitors, "
+        "correctors and magnets.",
+    ),
+    Statement(
+        "verdict", "no_error",
+        "verdict nothing, no reference; the remainder is noise or cannot be tested",
+        lambda own: own.verdict == "nothing" and not own.change
+        and own.remainder not in _UNEXPLAINED,
+        lambda own: f"No error is detected: the {own.model} explains the readings within "
+        "their noise.",
+        _LEAVES_MORE,
+    ),
+    Statement(
+        "verdict", "not_located",
+        "verdict nothing, no reference; the remainder is larger than the noise",
+        lambda own: own.verdict == "nothing" and not own.change and own.remainder in _UNEXPLAINED,
+        lambda own: f"No error is located, but the {own.model} does not explain all readings "
+        "within their noise.",
+        ("remainder_noise",),
+    ),
+    Statement(
+        "verdict", "small_errors_explain",
+        "verdict distributed; small errors are in the model; the remainder is noise or cannot be "
+        "tested",
+        lambda own: _everywhere(own) and own.remainder not in _UNEXPLAINED,
+        lambda own: "Small errors all along the ring explain the readings; no single fault is "
+        "detected among them.",
+        _LEAVES_MORE,
+    ),
+    Statement(
+        "verdict", "small_errors_explain_part",
+        "verdict distributed; small errors are in the model; the remainder is larger than the "
+        "noise",
+        lambda own: _everywhere(own) and own.remainder in _UNEXPLAINED,
+        lambda own: "Small errors all along the ring explain a part of the readings; no single "
+        "fault is detected among them.",
+        ("remainder_noise",),
+    ),
+    Statement(
+        "verdict", "no_sparse_solution",
+        "verdict distributed; neither small errors nor families of errors are in the model",
+        lambda own: own.verdict == "distributed" and not own.small_errors and not own.families,
+        lambda own: "The readings differ from the model all along the ring; no sparse set of "
+        "errors explains them.",
+        ("gap_closed",),
+    ),
+    Statement(
+        "remainder", "remainder_noise", "p-value over all blocks of readings at the false-alarm "
+        "level or above",
+        lambda own: own.remainder == "noise", _noise,
+        _LEAVES_MORE,
+    ),
+    Statement(
+        "remainder", "remainder_above_noise",
+        f"p-value below the false-alarm level, chi² per degree of freedom {MISSING} at most, the "
+        "noise is stated",
+        lambda own: own.remainder == "above_noise", _above,
+    ),
+    Statement(
+        "remainder", "remainder_effect_missing",
+        f"p-value below the false-alarm level in a block whose chi² per degree of freedom is above "
+        f"{MISSING}",
+        lambda own: own.remainder == "effect_missing", _missing,
+    ),
+    Statement(
+        "remainder", "remainder_unknown",
+        f"p-value below the false-alarm level, chi² per degree of freedom {MISSING} at most, the "
+        "noise is estimated from the same readings; or no reading was compared",
+        lambda own: own.remainder == "unknown",
+        lambda own: "Whether the remaining residual is noise is unknown: the noise is estimated "
+        "from the same readings.",
+    ),
+    Statement(
+        "gap", "gap_not_held_out", "no reading was held out",
+        lambda own: own.gap == "not_held_out",
+        lambda own: "No reading was held out: the reduction of the gap is not validated.",
+    ),
+    Statement(
+        "gap", "gap_none",
+        "held-out readings before the correction are not significantly above the noise",
+        lambda own: own.gap == "none",
+        lambda own: f"{_held(own).capitalize()} show no gap beyond the noise.",
+    ),
+    Statement(
+        "gap", "gap_closed", "a gap on held-out readings, five standard errors or more; the share "
+        "that is closed is determined",
+        lambda own: own.gap == "closed", _closed,
+    ),
+    Statement(
+        "gap", "gap_share_unknown", "a gap on held-out readings that is significant in chi²; its "
+        "size is determined to less than five standard errors",
+        lambda own: own.gap == "share_unknown",
+        lambda own: f"The rms residual of {_held(own)} falls {_falls(own)}; the share of the "
+        "gap that is closed is not determined by so few readings.",
+    ),
+    Statement(
+        "gap", "gap_nothing_fitted", "a gap on held-out readings; nothing was put into the model",
+        lambda own: own.gap == "nothing_fitted",
+        lambda own: f"Nothing was put into the model, so the gap of {_held(own)} stays.",
+        ("no_error", "small_errors_explain"),
+    ),
+    Statement(
+        "gap", "gap_no_amount", "a gap on held-out readings; the findings have no effect of the "
+        "catalogue, and no amount",
+        lambda own: own.gap == "no_amount",
+        lambda own: "A finding without an effect of the catalogue has no amount, so the gap of "
+        "held-out readings stays.",
+        ("no_error", "small_errors_explain"),
+    ),
+    Statement(
+        "gap", "gap_beam_lost", "the beam of held-out readings is lost in one of the models",
+        lambda own: own.gap == "beam_lost",
+        lambda own: "The beam of held-out shots is lost in one of the models, so they do not "
+        "validate the result.",
+    ),
+    Statement(
+        "reference", "reference_shows_faults",
+        "verdict distributed by small errors; no reference was given",
+        lambda own: _asks(own) and own.small_errors,
+        lambda own: "A measurement of this machine from before the fault (--reference) shows "
+        "faults that small errors hide.",
+    ),
+    Statement(
+        "reference", "reference_or_background",
+        "verdict distributed without small errors in the model; no reference was given",
+        lambda own: _asks(own) and not own.small_errors,
+        lambda own: "Small errors everywhere look like this: state them (--background all), or "
+        "give a measurement of this machine from before the fault (--reference).",
+    ),
+)  # fmt: skip
+"""Every sentence about the fit as a whole, with its condition; the first that holds of a topic is
+stated by text, page and JSON."""

@@ -1,0 +1,154 @@
+"""What a fit of an orbit response leaves, compared with what it predicts of the readings.
+
+Fitted readings are compared with their noise, and the numbers that were fitted count as lost
+degrees of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman
+et al., Bayesian Data Analysis, ch. 6): the noise, and what the fit leaves undetermined of the ring,
+of the monitors and of the held-out corrector's own calibration and roll. The kick of a held-out
+corrector is free.
+
+>>> [(block.name, block.ratio) for block in remainder(state)]
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from tmlattice.diagnosis.assessment import Block
+from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.stated import of_sizes
+from tmlattice.inference.normal import Posterior, solve
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+BLOCKS = ("in-plane", "coupling", "RF")
+
+
+def remainder(state: State) -> tuple[Block, ...]:
+    """Fitted and held-out readings of a state that has settled: in-plane, coupling, and the RF's
+    orbit; those without a reading are left out.
+
+    Args:
+        state: with its priors as learnt.
+    """
+    return tuple(block for block in _blocks(state) if block.freedom >= 1)
+
+
+def _blocks(state: State) -> Iterator[Block]:
+    fitted, half = ~state.split.held[:-1], state.split.half[-1]
+    last = len(state.data.plane) - 1
+    for block in (0, 1):
+        there, found, more = _solved(state, block)
+        name = BLOCKS[block]
+        own = _Sum(state, block)
+        for c in np.flatnonzero(fitted).tolist():
+            own.add(c, state.good)
+        yield Block(f"fitted, {name}", own.chi2, own.readings - _numbers(found))
+        held = _Sum(state, block, there, found, more)
+        for c in np.flatnonzero(state.split.held[:-1]).tolist():
+            held.add(c, state.good, free=True)
+        yield Block(f"held-out, {name}", held.chi2, held.readings)
+        if block == 0:
+            for which, monitors in (("fitted", half), ("held-out", ~half)):
+                fit = (there, found, more) if which == "held-out" else ()
+                rf = _Sum(state, block, *fit)
+                rf.add(last, state.good & monitors)
+                yield Block(f"{which}, {BLOCKS[2]}", rf.chi2, rf.readings)
+
+
+def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, Array | None]:
+    """The fit of a block, and roots of what unknown prior scales add to its covariance."""
+    if not state.of_block(block):
+        return None, None, None
+    there = linear(state, block)
+    found = solve(there.normal, there.groups, there.start, rounds=0)
+    return there, found, of_sizes(state, block, there)
+
+
+def _numbers(found: Posterior | None) -> float:
+    """Effective number of parameters: 1 of each that the data determine, 0 of each that its prior
+    holds."""
+    if found is None:
+        return 0.0
+    return float(len(found.prior) - np.trace(found.covariance))
+
+
+class _Sum:
+    """Chi-square of readings column by column, in the covariance of their noise and, of held-out
+    ones, of the fit's posterior (by Woodbury's identity).
+
+    Args:
+        state, block: of the readings.
+        there, found, more: the fit, see `_solved`; None: their noise alone.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        block: int,
+        there: Linear | None = None,
+        found: Posterior | None = None,
+        more: Array | None = None,
+    ) -> None:
+        self.state, self.block = state, block
+        self.there, self.found, self.more = there, found, more
+        data = state.data
+        self.left = data.pick(state.at.left, block)
+        # outliers count in the fit, and here, as if their noise were larger
+        share = np.ones_like(self.left) if state.share is None else state.share[block].copy()
+        if state.rf_share is not None:
+            share[-1] *= state.rf_share[block]
+        with np.errstate(divide="ignore"):
+            self.noise = data.noise_of(block) / np.sqrt(share)
+        self.square, self.readings = 0.0, 0
+        size = 0 if found is None or more is None else len(found.prior) + more.shape[1]
+        self.vector, self.matrix = np.zeros(size), np.eye(size)
+
+    def add(self, column: int, monitors: NDArray[np.bool_], free: bool = False) -> None:
+        """The readings of a column at some monitors; with its kick free or as it is."""
+        read = np.flatnonzero(
+            monitors & np.isfinite(self.left[column]) & np.isfinite(self.noise[column])
+        )
+        if not len(read):
+            return
+        sigma = self.noise[column, read]
+        rows = np.column_stack([self.left[column, read], *self._slopes(column, read)])
+        rows /= sigma[:, None]
+        if self.state.jitter is not None:
+            orbits = self.state.jitter[self._plane(column)][:, read].T / sigma[:, None]
+            lower = np.linalg.cholesky(np.eye(len(read)) + orbits @ orbits.T)
+            rows = solve_triangular(lower, rows, lower=True)
+        if free:
+            kick = self.state.at.seen(self.state.at.beam)
+            slope = self.state.data.pick(kick, self.block)[column, read] / sigma
+            if self.block == 0 and slope.any():
+                slope /= np.linalg.norm(slope)
+                rows -= np.outer(slope, slope @ rows)
+                self.readings -= 1
+        left, slopes = rows[:, 0], rows[:, 1:]
+        self.square += float(left @ left)
+        self.readings += len(read)
+        self.vector += slopes.T @ left
+        self.matrix += slopes.T @ slopes
+
+    def _plane(self, column: int) -> int:
+        """In which the block's readings of a column are."""
+        return int(self.state.data.plane_of(self.block)[column])
+
+    def _slopes(self, column: int, read: Indices) -> list[Array]:
+        """Roots of the posterior covariance of the readings, m, [reading, number]."""
+        if self.there is None or self.found is None or self.more is None:
+            return []
+        rows = self.there.of_column(column, read, self._plane(column))
+        spread = np.asarray((rows @ self.found.spread).T)
+        return [solve_triangular(self.found.factor, spread, lower=True).T, rows @ self.more]
+
+    @property
+    def chi2(self) -> float:
+        """Of all readings together."""
+        if not len(self.vector):
+            return self.square
+        return self.square - float(self.vector @ np.linalg.solve(self.matrix, self.vector))
