@@ -20,7 +20,7 @@ def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
             continue
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
-        sigma = stated(state, block, there, posterior)
+        sigma = stated(state, block, there, posterior).sigma
         for name, family in families.items():
             own = sigma[there.where[name]]
             found += family.told(state.at.errors, state.values[name], own, state.data)
