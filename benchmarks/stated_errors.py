@@ -23,19 +23,16 @@ import numpy as np
 
 from tmlattice import Cause, Ring, diagnose, load_ring
 from tmlattice.diagnosis import Diagnosis
-from tmlattice.effects import CATALOGUE
+from tmlattice.effects import background_rms
 from tmlattice.lattice.supplies import magnets
 from tmlattice.machine import draw_background
-from tmlattice.machine.response import simulate_response
+from tmlattice.machine.response import rf_step_of, simulate_response
 
 FAULT = 0.03
-KICK, NOISE = 1e-4, 2e-6
-"""rad and m: a kick of usual size, and BPMs of light sources."""
-EFFECTS = (
-    "quadrupole_gradient", "monitor_gain_x", "monitor_gain_y", "corrector_calibration",
-    "monitor_roll", "monitor_coupling", "corrector_roll",
-)  # fmt: skip
-"""Usual errors, each with the catalogue's rms."""
+KICK, NOISE, RF = 2e-5, 4e-7, 0.1
+"""rad, m, and a share of the usual RF step: steps that are linear, and BPMs of light sources."""
+ORBIT = ("dipole", "quadrupole_offset", "sextupole_offset")
+"""Errors that make a closed orbit, which a machine corrects: their effects begin so."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +59,11 @@ def cases() -> list[Case]:
     return [case for case in rings if case.path.is_file()]
 
 
-def machine(ring: Ring, seed: int) -> tuple[list[Cause], str]:
+def machine(ring: Ring, seed: int, orbit: bool = False) -> tuple[list[Cause], str]:
     """Usual errors with one faulty quadrupole, and its name."""
-    sizes = {name: float(CATALOGUE[name].background) for name in EFFECTS}
+    sizes = background_rms({"all": None})
+    if not orbit:
+        sizes = {name: size for name, size in sizes.items() if not name.startswith(ORBIT)}
     rng = np.random.default_rng([seed, 47])
     powered = magnets(ring, ("quadrupole",), powered=True)
     faulty = powered[rng.integers(len(powered))]
@@ -87,8 +86,9 @@ def study(case: Case, seed: int) -> dict:
     """The pulls of one machine."""
     ring = load_ring(case.path, **case.options)
     causes, faulty = machine(ring, seed)
+    step = RF * rf_step_of(ring)
     measured = simulate_response(
-        ring, causes, kick=KICK, noise=NOISE, seed=seed, progress=False
+        ring, causes, kick=KICK, rf_step=step, noise=NOISE, seed=seed, progress=False
     ).measured
     begun = time.process_time()
     found = diagnose(ring, measured, seed=seed)
@@ -101,12 +101,16 @@ def study(case: Case, seed: int) -> dict:
 
 
 def pulls(found: Diagnosis, causes: list[Cause]) -> list[dict]:
-    """Of every number that was fitted and whose truth is known."""
+    """Of every number that was fitted (held-out correctors are not) and whose truth is known."""
     true = {(cause.effect, cause.element): cause.amount for cause in causes}
+    heldout = {
+        name for name, out in zip(found.response.measured.correctors, found.response.held,
+                                  strict=False) if out
+    }  # fmt: skip
     rows = []
     for own in found.as_json()["errors"]:
         at = own["effect"], own["element"]
-        if at in true and own["amount_sigma"] > 0:
+        if at in true and own["amount_sigma"] > 0 and own["element"] not in heldout:
             pull = (own["amount"] - true[at]) / own["amount_sigma"]
             rows.append({**own, "truth": true[at], "pull": pull})
     return rows
@@ -139,7 +143,8 @@ def summary(rows: list[dict]) -> dict:
         "rms_pull_not_determined": of(numbers, False),
         "rms_pull_gradients": of(gradients),
         "rms_pull_by_effect": {
-            name: of([own for own in numbers if own["effect"] == name]) for name in EFFECTS
+            name: of([own for own in numbers if own["effect"] == name])
+            for name in dict.fromkeys(own["effect"] for own in numbers)
         },
         "faulty": [
             {key: own.get(key) for key in

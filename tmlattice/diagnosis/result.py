@@ -11,6 +11,7 @@ from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
+from tmlattice.diagnosis.support import FREE, Support
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
 from tmlattice.inference.judge import Gap, Misfit
@@ -188,6 +189,8 @@ class Diagnosis(ShownDiagnosis):
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: of a `distributed` verdict on trajectories: where to look first.
         dispersion: beside that of the ring as found, for `write_calibration`.
+        supports: how much of each cause comes from the data, the same length; empty where all do,
+            because their priors are log-uniform.
     """
 
     verdict: str
@@ -221,6 +224,13 @@ class Diagnosis(ShownDiagnosis):
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
+    supports: tuple[Support, ...] = field(default=(), repr=False)
+
+    @property
+    def supported(self) -> "tuple[tuple[Cause, float, Support], ...]":
+        """The causes, with their errors and how much of each comes from the data."""
+        supports = self.supports or (FREE,) * len(self.causes)
+        return tuple(zip(self.causes, self.errors, supports, strict=True))
 
     @property
     def kind(self) -> str:
@@ -274,6 +284,17 @@ class Diagnosis(ShownDiagnosis):
         """What monitors and correctors do, for `write_calibration`."""
         bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
         return (*(c for c in self.causes if c.effect in CALIBRATES), *bad)
+
+    def support(self, effect: str, element: str | None) -> Support:
+        """How much of the amount of a cause comes from the data.
+
+        Raises:
+            KeyError: it is not among the causes.
+        """
+        for cause, _, support in self.supported:
+            if (cause.effect, cause.element) == (effect, element):
+                return support
+        raise KeyError((effect, element))
 
     def error(self, effect: str, element: str | None) -> tuple[float, float]:
         """Amount and standard error of a cause.
@@ -354,9 +375,15 @@ class Diagnosis(ShownDiagnosis):
             "priors": dict(self.priors),
             "prior_errors": dict(self.prior_errors),
             "errors": [
-                {"effect": c.effect, "element": c.element, "amount": c.amount, "amount_sigma": s}
-                for c, s in zip(self.causes, self.errors, strict=True)
-            ],
+                {
+                    "effect": c.effect,
+                    "element": c.element,
+                    "amount": c.amount,
+                    "amount_sigma": s,
+                    **support.as_json(),
+                }
+                for c, s, support in self.supported
+            ],  # fmt: skip
             "reasons": None if self.reasons is None else self.reasons.as_json(),
             "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],

@@ -172,7 +172,7 @@ class Group:
             core = self.rms * np.sqrt(self.freedom / chi2.ppf(quantiles, self.freedom))
         chances = np.full(len(core), 1 / len(core))
         members, least = self.basis.shape[1], BEYOND * self.rms
-        faulty = max(1 / members, COMMONEST)
+        faulty = max(1 / max(members, 1), COMMONEST)
         if self.fixed and self.largest:
             core, least, faulty = np.full(1, SMALLEST), self.largest * SELECTED, COMMONEST
         elif self.fixed or members < 2 or not least < self.largest:

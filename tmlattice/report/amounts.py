@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from tmlattice.diagnosis.support import Support
 from tmlattice.effects import CATALOGUE, Cause, find
 
 _SCALES = {
@@ -77,6 +78,16 @@ def numbers(
             sigmas.append(sigma)
         found[own].append(cause)
     return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
+
+
+def degenerate_text(support: Support) -> str:
+    """What a number that the data do not determine is degenerate with."""
+    if not support.degenerate_with:
+        return "the data hardly depend on it"
+    return "degenerate with " + ", ".join(
+        f"{words(effect)} of {element or 'the beam'} ({correlation:+.2f})"
+        for effect, element, correlation in support.degenerate_with
+    )
 
 
 def all_of(places: Sequence[Cause]) -> str:

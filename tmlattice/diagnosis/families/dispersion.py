@@ -64,6 +64,7 @@ def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
 class _Kicks(Family):
     per, trust = "ring", 1e-3
     plane: ClassVar[int]
+
     @property
     def largest(self) -> float:
         """Patterns have none: a single kick makes all of them."""

@@ -137,10 +137,10 @@ def diagnose_response(
         fit, measured, odd, exchanges = whole
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, degenerate = told(fit.state)
+        found, supports, degenerate = told(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
-        fit, found, degenerate = few.fit, few.told, ()
+        fit, found, supports, degenerate = few.fit, few.told, (), ()
         verdict, findings = few.verdict, few.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
@@ -156,6 +156,7 @@ def diagnose_response(
         findings=with_consequences(ring, findings, causes),
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
+        supports=supports,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
         pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),

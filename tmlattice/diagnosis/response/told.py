@@ -1,18 +1,32 @@
-"""What a dense fit of an orbit response found, as causes with errors."""
+"""What a hierarchical fit of an orbit response found, as causes with errors."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import stated
+from tmlattice.diagnosis.support import Support
 from tmlattice.errors import first_of
 from tmlattice.inference.normal import Posterior, solve
+from tmlattice.observe.orbit_response import Hypothesis
+
+Array = NDArray[np.float64]
 
 
-def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
-    """What is wrong as causes, with errors; and what the data alone do not settle, in words."""
+AGAINST, SHOWN = 0.4, 3
+"""Posterior correlation from which on numbers are degenerate, and how many are named."""
+
+
+def told(state: State) -> tuple[list[Told], tuple[Support, ...], tuple[str, ...]]:
+    """Causes with stated errors; how much of each comes from the data; and what the data alone do
+    not settle, in words."""
     found: list[Told] = []
+    supports: list[Support] = []
     said: tuple[str, ...] = ()
     for block in (0, 1):
         families = {f.variable: f for f in state.of_block(block)}
@@ -20,13 +34,57 @@ def told(state: State) -> tuple[list[Told], tuple[str, ...]]:
             continue
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
-        sigma = stated(state, block, there, posterior).sigma
+        known = stated(state, block, there, posterior)
+        numbers = _numbers(state, families.values(), there)
         for name, family in families.items():
-            own = sigma[there.where[name]]
-            found += family.told(state.at.errors, state.values[name], own, state.data)
+            own, values = there.where[name], state.values[name]
+            rows = family.told(state.at.errors, values, known.sigma[own], state.data)
+            # the errors before the data in the units of the causes
+            before = family.told(state.at.errors, values, known.prior[own], state.data)
+            for row, (_, prior) in zip(rows, before, strict=True):
+                if row[0].amount == 0 and row[1] == 0:
+                    continue
+                found.append(row)
+                supports.append(_support(row, prior, own, known.covariance, numbers))
         if block == 0:
             said = _degenerate(state, there, posterior)
-    return [row for row in found if row[0].amount != 0 or row[1] != 0], said
+    return found, tuple(supports), said
+
+
+Hypotheses = Mapping[int, Mapping[Hypothesis, float]]
+
+
+def _numbers(state: State, families: Iterable[Family], there: Linear) -> Hypotheses:
+    """What each number of the fit is of the catalogue's effects, by its place in the fit."""
+    numbers: dict[int, Mapping[Hypothesis, float]] = {}
+    for family in families:
+        first = there.where[family.variable].start
+        numbers |= {first + i: own for i, own in enumerate(family.moves(state.data)) if own}
+    return numbers
+
+
+def _support(
+    row: Told, prior: float, own: slice, covariance: Array, numbers: Hypotheses
+) -> Support:
+    """Of one cause, with its error before the data; `own` are its family's numbers."""
+    cause, sigma = row
+    share = 1 - (sigma / prior) ** 2 if prior > 0 else 0.0
+    support = Support(min(max(share, 0.0), 1.0))
+    if support.determined:
+        return support
+    here = (cause.effect, cause.element)
+    mine = [i for i in range(own.start, own.stop) if here in numbers.get(i, {})]
+    width = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    near: dict[int, float] = {}
+    for i in mine:
+        correlation = covariance[i] / (width[i] * width)
+        for j in np.argsort(-np.abs(correlation))[: SHOWN + len(mine)].tolist():
+            if j not in mine and j in numbers and abs(correlation[j]) > AGAINST:
+                near[j] = max(near.get(j, 0.0), float(correlation[j]), key=abs)
+    order = sorted(near, key=lambda j: -abs(near[j]))[:SHOWN]
+    return replace(
+        support, degenerate_with=tuple((*next(iter(numbers[j])), near[j]) for j in order)
+    )
 
 
 def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
