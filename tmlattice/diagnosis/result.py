@@ -11,7 +11,7 @@ from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
-from tmlattice.diagnosis.support import FREE, Support
+from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
 from tmlattice.inference.judge import Gap, Misfit
@@ -127,6 +127,7 @@ class Finding(ShownFinding):
             "s": self.s,
             "amount": self.amount,
             "amount_sigma": self.amount_sigma,
+            "share_from_data": share_of_fault(self.effect, self.amount_sigma),
             "unit": self.unit,
             "probability": self.probability,
             "detection": {
@@ -383,7 +384,7 @@ class Diagnosis(ShownDiagnosis):
                     **support.as_json(),
                 }
                 for c, s, support in self.supported
-            ],  # fmt: skip
+            ],
             "reasons": None if self.reasons is None else self.reasons.as_json(),
             "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],

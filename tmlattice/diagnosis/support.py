@@ -7,6 +7,8 @@
 from dataclasses import dataclass
 from typing import Any
 
+from tmlattice.effects import find
+
 DETERMINED = 0.5
 """Share of a number from the data below which they do not determine it: the prior then knows more
 of it than they do (1 - posterior variance / prior variance is the data's share of the posterior
@@ -40,6 +42,28 @@ class Support:
                 for effect, element, correlation in self.degenerate_with
             ],
         }
+
+
+def share_from_data(sigma: float, prior: float) -> float:
+    """Return 1 - posterior variance / prior variance, from 0 to 1.
+
+    Args:
+        sigma, prior: posterior and prior rms, in one unit.
+    """
+    return min(max(1 - (sigma / prior) ** 2, 0.0), 1.0) if prior > 0 else 0.0
+
+
+def share_of_fault(effect: str | None, sigma: float | None) -> float | None:
+    """Return the share from the data of a fault, which before them may be as large as the largest
+    of its effect; None for an amount without an error.
+
+    Args:
+        effect: of the catalogue.
+        sigma: standard error, in the effect's unit.
+    """
+    if effect is None or sigma is None:
+        return None
+    return share_from_data(sigma, find(effect).largest)
 
 
 FREE = Support(1.0)

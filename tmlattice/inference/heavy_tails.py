@@ -9,6 +9,7 @@ two members, either may be faulty, and both have errors that say so.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +21,14 @@ from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
 
-SWEEPS = 60
+SWEEPS = 100
 """Sweeps at most."""
-DAMPING = 0.5
-"""Share of each update that is applied; all members are updated at once."""
+DAMPING, LARGEST = 0.3, 0.5
+"""Share of each update that is applied, of a precision in its logarithm, and the largest step of
+that: all members are updated at once, and two that stand for each other would oscillate."""
+CLEAR = 1e3
+"""Times what the narrowest component of a prior says of its member, from which on the data alone
+count."""
 SETTLED = 1e-2
 """Largest change of a mean, in standard deviations, or of the logarithm of a variance in a sweep
 after which none is made."""
@@ -49,10 +54,15 @@ class _Mixtures:
         for own, (chances, scales) in zip(size, each, strict=True):
             begin, end = end, end + own
             self.log_chance[begin:end, : len(chances)] = np.log(chances)
+            self.square[begin:end] = scales[0] ** 2
             self.square[begin:end, : len(chances)] = scales**2
         self.variance = np.sum(np.exp(self.log_chance) * self.square, axis=1)
-        there = np.isfinite(self.log_chance)
-        self.largest = np.where(there, self.square, 0.0).max(axis=1)
+
+    def some(self, members: NDArray[np.bool_]) -> "_Mixtures":
+        """Those of some members."""
+        made = copy(self)
+        made.log_chance, made.square = self.log_chance[members], self.square[members]
+        return made
 
     def times(self, precision: Array, pull: Array) -> tuple[Array, Array]:
         """Mean and variance of each prior times exp(pull x - precision x^2 / 2)."""
@@ -82,7 +92,24 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
     A[np.diag_indices(len(A))] *= 1 + ROUNDING
     b = unit * (basis.T @ (normal.vector + normal.matrix @ start))
     priors.square /= priors.variance[:, None]
-    least = priors.variance / priors.largest  # a site is no wider than the widest component
+    precision, pull = np.ones(len(A)), np.zeros(len(A))
+    rest = 1 / np.diag(_gaussian(A, b, precision, pull)[1]) - 1
+    open_ = rest * priors.square.min(axis=1) < CLEAR  # of the others no prior says anything
+    if open_.any():
+        follow = np.linalg.solve(
+            A[np.ix_(~open_, ~open_)] + np.eye(int((~open_).sum())), A[np.ix_(~open_, open_)]
+        )
+        within = A[np.ix_(open_, open_)] - A[np.ix_(open_, ~open_)] @ follow
+        precision[open_], pull[open_] = _sites(
+            (within + within.T) / 2, b[open_] - follow.T @ b[~open_], priors.some(open_)
+        )
+    mean, covariance = _gaussian(A, b, precision, pull)
+    scaled = basis * unit
+    return Moments(scaled @ mean, scaled @ covariance @ scaled.T)
+
+
+def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
+    """Precisions and pulls of the Gaussians in place of the priors."""
     precision, pull = np.ones(len(A)), np.zeros(len(A))
     for _ in range(SWEEPS):
         mean, covariance = _gaussian(A, b, precision, pull)
@@ -90,28 +117,18 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
         rest = np.maximum(1 / variance - precision, 0.0)
         others = mean / variance - pull
         center, spread = priors.times(rest, others)
-        wanted = np.maximum(1 / spread - rest, least)
+        wanted = np.maximum(1 / spread - rest, 1.0)  # no wider than the prior itself
         drawn = center * (rest + wanted) - others
         changed = max(
             np.abs((center - mean) / np.sqrt(variance)).max(),
-            np.abs(np.log(wanted + rest) + np.log(variance)).max(),
+            np.abs(np.log((wanted + rest) * variance)).max(),
         )
         if changed < SETTLED:
             break
-        precision = precision + DAMPING * (wanted - precision)
+        step = DAMPING * np.log(wanted / precision)
+        precision = precision * np.exp(np.clip(step, -LARGEST, LARGEST))
         pull = pull + DAMPING * (drawn - pull)
-    mean, covariance = _gaussian(A, b, precision, pull)
-    scaled = basis * unit
-    along = scaled @ covariance
-    # a member with two likely values has more variance than any Gaussian prior gives it
-    variance = np.diag(covariance)
-    rest = np.maximum(1 / variance - precision, 0.0)
-    center, spread = priors.times(rest, mean / variance - pull)
-    more = along * (np.sqrt(np.maximum(spread - variance, 0.0)) / variance)
-    return Moments(
-        scaled @ mean + along @ ((center - mean) / variance),
-        along @ scaled.T + more @ more.T,
-    )
+    return precision, pull
 
 
 def _gaussian(A: Array, b: Array, precision: Array, pull: Array) -> tuple[Array, Array]:

@@ -158,10 +158,10 @@ class Group:
     def mixture(self) -> tuple[Array, Array]:
         """Prior of one member if any of them may be the faulty one, as a mixture of Gaussians.
 
-        Sound members have the group's own distribution. A faulty one has a scale that is log-uniform
-        from there up to the largest fault (West, Biometrika 74 (1987) 646, for such mixtures). A
-        group with a fixed scale and a largest fault is one selected fault: another one may be there
-        instead of it.
+        Sound members have the group's own distribution. A faulty one has a scale that is
+        log-uniform from there up to the largest fault (West, Biometrika 74 (1987) 646, for such
+        mixtures). A group with a fixed scale and a largest fault is one selected fault: another one
+        may be there instead of it.
 
         Returns:
             Probabilities and rms of the components, [component].

@@ -80,13 +80,14 @@ def numbers(
     return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
 
 
-def degenerate_text(support: Support) -> str:
-    """What a number that the data do not determine is degenerate with."""
+def degenerate_text(effect: str, support: Support) -> str:
+    """What a number of an effect that the data do not determine is degenerate with."""
     if not support.degenerate_with:
         return "the data hardly depend on it"
     return "degenerate with " + ", ".join(
-        f"{words(effect)} of {element or 'the beam'} ({correlation:+.2f})"
-        for effect, element, correlation in support.degenerate_with
+        f"{'' if other == effect else find(other).label + ' '}{element or 'of the beam'} "
+        f"({correlation:+.2f})"
+        for other, element, correlation in support.degenerate_with
     )
 
 

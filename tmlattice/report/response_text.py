@@ -92,7 +92,7 @@ def undetermined(result: Diagnosis, effect: str) -> str:
     ]
     if not names:
         return ""
-    said = [f"{name} ({degenerate_text(own)})" for name, own in names[:SHOWN]]
+    said = [f"{name} ({degenerate_text(effect, own)})" for name, own in names[:SHOWN]]
     more = f"; and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{NOT_DETERMINED}: {'; '.join(said)}{more}"
 

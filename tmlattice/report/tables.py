@@ -81,7 +81,7 @@ def _table(diagnosis: Diagnosis, title: str, told: Sequence[Supported]) -> Table
             digits = 4 if not 0 < factor * sigma < np.inf else _digits(factor * sigma)
             if not support.determined:
                 amount = np.nan
-                open_.append(f"{words(effect)}: {degenerate_text(support)}")
+                open_.append(f"{find(effect).label}: {degenerate_text(effect, support)}")
             cells += [_number(factor * value, digits) for value in (amount, sigma)]
             cells.append(f"{100 * support.share_from_data:.0f}")
         rows.append((*cells, "; ".join(open_)))

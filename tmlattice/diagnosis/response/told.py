@@ -10,8 +10,7 @@ from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import stated
-from tmlattice.diagnosis.support import Support
-from tmlattice.errors import first_of
+from tmlattice.diagnosis.support import Support, share_from_data
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.observe.orbit_response import Hypothesis
 
@@ -68,8 +67,7 @@ def _support(
 ) -> Support:
     """Of one cause, with its error before the data; `own` are its family's numbers."""
     cause, sigma = row
-    share = 1 - (sigma / prior) ** 2 if prior > 0 else 0.0
-    support = Support(min(max(share, 0.0), 1.0))
+    support = Support(share_from_data(sigma, prior))
     if support.determined:
         return support
     here = (cause.effect, cause.element)
@@ -88,7 +86,7 @@ def _support(
 
 
 def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
-    """Directions that the prior holds and not the data."""
+    """The scale that gains and calibrations share."""
     said = []
     columns, monitors = state.data.shape
     m = 2 * monitors
@@ -104,16 +102,4 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
             f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
             f"{both:+.2f}"
         )
-    for family in state.families:
-        own = [g for g in there.groups if g.name == family.name]
-        if family.per != "ring" or family.block or not own or len(own[0].scale) < 2:
-            continue
-        loose = np.flatnonzero(posterior.sigma[there.where[family.variable]] > 0.5 * own[0].scale)
-        moves = family.moves(state.data)  # of each number; a cause is one of its pieces
-        names = [place for i in loose for _, place in list(moves[i])[:1] if place]
-        if names:
-            said.append(
-                f"{len(names)} of {family.title} that the prior holds more than the data: "
-                + first_of(names, 12)
-            )
     return tuple(said)
