@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.support import share_of_fault
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.effects.effect import FamilyEffect, StrengthEffect
 from tmlattice.lattice import Element, Kind, Ring
@@ -85,6 +86,7 @@ class Remedy:
             "quantity": effect.quantity or effect.words,
             "amount": self.amount,
             "amount_sigma": self.amount_sigma,
+            "share_from_data": share_of_fault(self.effect, self.amount_sigma),
             "unit": effect.unit,
             "strength": None if self.strength is None else dict(vars(self.strength)),
             "probability": min(self.probability, 1.0),  # a sum of shares

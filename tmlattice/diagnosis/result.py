@@ -14,6 +14,7 @@ from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
+from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
 from tmlattice.inference.judge import Gap, Misfit
@@ -144,6 +145,7 @@ class Finding(ShownFinding):
             "s": self.s,
             "amount": self.amount,
             "amount_sigma": self.amount_sigma,
+            "share_from_data": share_of_fault(self.effect, self.amount_sigma),
             "unit": self.unit,
             "probability": self.probability,
             "detection": {
@@ -218,6 +220,8 @@ class Diagnosis(ShownDiagnosis):
         compared: blocks of readings with what the result predicts of them.
         correlations: pairs of amounts that the data hardly separate.
         devices: what the control system calls elements, by their names.
+        supports: how much of each cause comes from the data, the same length; empty where all do,
+            because their priors are log-uniform.
     """
 
     verdict: str
@@ -255,6 +259,7 @@ class Diagnosis(ShownDiagnosis):
     compared: tuple[Block, ...] = ()
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
+    supports: tuple[Support, ...] = field(default=(), repr=False)
 
     @cached_property
     def assessment(self) -> Assessment:
@@ -286,6 +291,12 @@ class Diagnosis(ShownDiagnosis):
         if self.by_steps and np.isfinite(self.response.data[-1]).any():
             found.add("dispersion")
         return tuple(sorted(found))
+
+    @property
+    def supported(self) -> "tuple[tuple[Cause, float, Support], ...]":
+        """The causes, with their errors and how much of each comes from the data."""
+        supports = self.supports or (FREE,) * len(self.causes)
+        return tuple(zip(self.causes, self.errors, supports, strict=True))
 
     @property
     def kind(self) -> str:
@@ -348,6 +359,17 @@ class Diagnosis(ShownDiagnosis):
         swaps = (Cause(f.effect, f.element, 1.0) for f in self.findings
                  if f.effect == "monitor_swap" and self.by_steps)  # fmt: skip
         return (*own, *swaps, *bad)
+
+    def support(self, effect: str, element: str | None) -> Support:
+        """How much of the amount of a cause comes from the data.
+
+        Raises:
+            KeyError: it is not among the causes.
+        """
+        for cause, _, support in self.supported:
+            if (cause.effect, cause.element) == (effect, element):
+                return support
+        raise KeyError((effect, element))
 
     def error(self, effect: str, element: str | None) -> tuple[float, float]:
         """Amount and standard error of a cause.
@@ -435,9 +457,10 @@ class Diagnosis(ShownDiagnosis):
                     "element": c.element,
                     "amount": c.amount,
                     "amount_sigma": s,
+                    **support.as_json(),
                     **_device(self.devices.get(c.element or "")),
                 }
-                for c, s in zip(self.causes, self.errors, strict=True)
+                for c, s, support in self.supported
             ],
             "correlations": [pair.as_json() for pair in self.correlations],
             "reasons": None if self.reasons is None else self.reasons.as_json(),

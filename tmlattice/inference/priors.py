@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln
+from scipy.stats import chi2
 
 from tmlattice.effects import Cause, find
 
@@ -103,6 +104,17 @@ GUESSED = 2.0
 """rms of the logarithm of a scale about its first guess: a factor of seven."""
 BOLD = 1.5
 """Largest step of that logarithm."""
+COMMONEST = 0.01
+"""Share of the members of a large group that are faulty: one in a hundred. Of a smaller group one
+member is."""
+DECADE = 4
+"""Scales of faulty members in a power of ten, log-uniform."""
+CORE = 5
+"""Scales that stand for the distribution of sound members."""
+SELECTED = 1e-3
+"""Share of the largest fault from which on a selected fault has its scale."""
+BEYOND = 3.0
+"""Times the scale of sound members from which on an amount is a fault."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +131,7 @@ class Group:
         each: prior rms of every parameter, as last found; None: `rms`.
         first: rms that was guessed; None: `rms`.
         guessed: rms of the logarithm of the scale about that.
+        largest: largest fault of one member, in the unit of the parameters; 0: no member is faulty.
     """
 
     name: str
@@ -130,6 +143,7 @@ class Group:
     each: Array | None = None
     first: float | None = None
     guessed: float = GUESSED
+    largest: float = 0.0
 
     @property
     def guess(self) -> float:
@@ -140,6 +154,32 @@ class Group:
     def scale(self) -> Array:
         """Prior rms of every parameter."""
         return np.full(self.basis.shape[1], self.rms) if self.each is None else self.each
+
+    def mixture(self) -> tuple[Array, Array]:
+        """Prior of one member if any of them may be the faulty one, as a mixture of Gaussians.
+
+        Sound members have the group's own distribution. A faulty one has a scale that is
+        log-uniform from there up to the largest fault (West, Biometrika 74 (1987) 646, for such
+        mixtures). A group with a fixed scale and a largest fault is one selected fault: another one
+        may be there instead of it.
+
+        Returns:
+            Probabilities and rms of the components, [component].
+        """
+        core = np.full(1, self.rms)
+        if np.isfinite(self.freedom):
+            quantiles = (np.arange(CORE) + 0.5) / CORE
+            core = self.rms * np.sqrt(self.freedom / chi2.ppf(quantiles, self.freedom))
+        chances = np.full(len(core), 1 / len(core))
+        members, least = self.basis.shape[1], BEYOND * self.rms
+        faulty = max(1 / max(members, 1), COMMONEST)
+        if self.fixed and self.largest:
+            core, least, faulty = np.full(1, SMALLEST), self.largest * SELECTED, COMMONEST
+        elif self.fixed or members < 2 or not least < self.largest:
+            return chances, core
+        count = int(np.ceil(DECADE * np.log10(self.largest / least))) + 1
+        chances = np.concatenate([(1 - faulty) * chances, np.full(count, faulty / count)])
+        return chances, np.concatenate([core, np.geomspace(least, self.largest, count)])
 
     def share(self, squares: Array, rms: float) -> Array:
         """By which a parameter of this expected square counts: 1 for Gauss, less in the tails."""

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from tmlattice.diagnosis.support import Support
 from tmlattice.effects import CATALOGUE, find
 
 _SCALES = {
@@ -65,6 +66,17 @@ def probability_text(probability: float) -> str:
 def labelled(name: str, devices: Mapping[str, str]) -> str:
     """An element with what the control system calls it, where that is known."""
     return f"{name} [{devices[name]}]" if name in devices else name
+
+
+def degenerate_text(effect: str, support: Support) -> str:
+    """What a number of an effect that the data do not determine is degenerate with."""
+    if not support.degenerate_with:
+        return "the data hardly depend on it"
+    return "degenerate with " + ", ".join(
+        f"{'' if other == effect else find(other).label + ' '}{element or 'of the beam'} "
+        f"({correlation:+.2f})"
+        for other, element, correlation in support.degenerate_with
+    )
 
 
 def all_of(places: Sequence[str | None], devices: Mapping[str, str]) -> str:

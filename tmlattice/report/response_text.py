@@ -7,9 +7,10 @@ import numpy as np
 from tmlattice.diagnosis.response.dense import Step
 from tmlattice.diagnosis.response.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import numbers
 from tmlattice.effects import Cause
-from tmlattice.report.amounts import all_of, amount_text, labelled, words
+from tmlattice.report.amounts import all_of, amount_text, degenerate_text, labelled, words
 from tmlattice.report.text import columns, wrapped
 
 SHOWN = 8
@@ -69,13 +70,41 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
 
 
 def largest(result: Diagnosis, effect: str) -> list[str]:
-    """The errors of an effect that are furthest from zero, with their posterior rms."""
-    rows = sorted(_numbers_of(result, effect), key=lambda row: -abs(row[0][0].amount))
+    """The errors of an effect that the data determine, those furthest from zero, with their
+    posterior rms and how much of each comes from the data."""
+    supports = _supports_of(result, effect)
+    rows = [row for row in _numbers_of(result, effect) if supports[row[0][0].element].determined]
+    rows = sorted(rows, key=lambda row: -abs(row[0][0].amount))
     return [
         f"{all_of([place.element for place in places], result.devices)} "
-        f"{amount_text(effect, places[0].amount, sigma)}"
+        f"{amount_text(effect, places[0].amount, sigma)} "
+        f"({100 * supports[places[0].element].share_from_data:.0f} % from the data)"
         for places, sigma in rows[:SHOWN]
     ]
+
+
+def undetermined(result: Diagnosis, effect: str) -> str:
+    """Numbers of an effect that the data do not determine, and what they are degenerate with; empty
+    if there are none."""
+    supports = _supports_of(result, effect)
+    names = [
+        (all_of([own.element for own in places], result.devices), supports[places[0].element])
+        for places, _ in _numbers_of(result, effect)
+        if not supports[places[0].element].determined
+    ]
+    if not names:
+        return ""
+    said = [f"{name} ({degenerate_text(effect, own)})" for name, own in names[:SHOWN]]
+    more = f"; and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{NOT_DETERMINED}: {'; '.join(said)}{more}"
+
+
+NOT_DETERMINED = "not determined by the data"
+
+
+def _supports_of(result: Diagnosis, effect: str) -> dict[str | None, Support]:
+    """By element."""
+    return {c.element: support for c, _, support in result.supported if c.effect == effect}
 
 
 def _numbers_of(result: Diagnosis, effect: str) -> list[tuple[tuple[Cause, ...], float]]:
@@ -84,13 +113,19 @@ def _numbers_of(result: Diagnosis, effect: str) -> list[tuple[tuple[Cause, ...],
 
 
 def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
-    """By effect: how many amounts with their rms, and the largest."""
+    """By effect: how many amounts with the rms of those that the data determine, and the largest of
+    these; and which are not determined."""
     rows = []
     for effect in dict.fromkeys(cause.effect for cause in result.causes):
-        amounts = [places[0].amount for places, _ in _numbers_of(result, effect)]
-        rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
-        said = f"{words(effect)}: {len(amounts)}, rms {rms}; largest:"
-        rows.append((said, "; ".join(largest(result, effect))))
+        supports = _supports_of(result, effect)
+        found = [places[0] for places, _ in _numbers_of(result, effect)]
+        amounts = [own.amount for own in found if supports[own.element].determined]
+        said = f"{words(effect)}: {len(found)}"
+        if amounts:
+            rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
+            said += f", {len(amounts)} determined by the data, rms {rms}; largest:"
+        parts = ["; ".join(largest(result, effect)), undetermined(result, effect)]
+        rows.append((said, ". ".join(part for part in parts if part)))
     return rows
 
 

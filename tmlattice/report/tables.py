@@ -11,14 +11,18 @@ import numpy as np
 
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.support import FREE, Support
 from tmlattice.effects import Cause, find
 from tmlattice.measurement.assume import ASSUMPTIONS
-from tmlattice.report.amounts import labelled, scaled, words
+from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
 from tmlattice.report.remedies import SETTLED
 from tmlattice.report.text import times_usual
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
 """By the group of an effect; all other elements are magnets."""
+
+Supported = tuple[Cause, float, Support]
+"""A cause, its error, and how much of it comes from the data."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,11 @@ class Table:
 
 def error_tables(diagnosis: Diagnosis) -> list[Table]:
     """Magnets, monitors, correctors and the beam of a dense fit, value and error of each effect."""
-    grouped: dict[str, list[tuple[Cause, float]]] = {}
-    for cause, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True):
-        title = TITLES.get(find(cause.effect).group, "Magnets")
-        title = "Beam" if cause.element is None else title
-        grouped.setdefault(title, []).append((cause, sigma))
+    grouped: dict[str, list[Supported]] = {}
+    for row in diagnosis.supported:
+        title = TITLES.get(find(row[0].effect).group, "Magnets")
+        title = "Beam" if row[0].element is None else title
+        grouped.setdefault(title, []).append(row)
     return [
         _table(diagnosis, title, grouped[title])
         for title in ("Magnets", *TITLES.values(), "Beam")
@@ -50,19 +54,19 @@ def error_tables(diagnosis: Diagnosis) -> list[Table]:
     ]
 
 
-def _table(diagnosis: Diagnosis, title: str, told: Sequence[tuple[Cause, float]]) -> Table:
-    effects = list(dict.fromkeys(cause.effect for cause, _ in told))
+def _table(diagnosis: Diagnosis, title: str, told: Sequence[Supported]) -> Table:
+    effects = list(dict.fromkeys(cause.effect for cause, *_ in told))
     places = {element.name: element.s for element in diagnosis.ring.elements}
-    known = {(cause.element or "", cause.effect): (cause.amount, sigma) for cause, sigma in told}
+    known = {(c.element or "", c.effect): (c.amount, sigma, own) for c, sigma, own in told}
     units = {}
     for effect in effects:
-        rms = np.sqrt(np.mean([c.amount**2 for c, _ in told if c.effect == effect]))
+        rms = np.sqrt(np.mean([c.amount**2 for c, *_ in told if c.effect == effect]))
         units[effect] = scaled(effect, float(rms))
-    names = list(dict.fromkeys(cause.element or "" for cause, _ in told))
+    names = list(dict.fromkeys(cause.element or "" for cause, *_ in told))
 
     def clearest(name: str) -> float:
-        own = (known.get((name, effect), (0.0, 1.0)) for effect in effects)
-        return max(abs(amount) / sigma if sigma > 0 else 0.0 for amount, sigma in own)
+        own = (known.get((name, effect), (0.0, 1.0, FREE)) for effect in effects)
+        return max(abs(amount) / sigma if sigma > 0 else 0.0 for amount, sigma, _ in own)
 
     names.sort(key=clearest, reverse=True)
     known_devices = any(name in diagnosis.devices for name in names)
@@ -70,16 +74,24 @@ def _table(diagnosis: Diagnosis, title: str, told: Sequence[tuple[Cause, float]]
     for name in names:
         cells = [name or "the beam", _number(places.get(name, np.nan), 2)]
         cells += [diagnosis.devices.get(name, "")] if known_devices else []
+        open_ = []
         for effect in effects:
+            if (name, effect) not in known:
+                cells += ["", "", ""]
+                continue
             factor, _ = units[effect]
-            amount, sigma = known.get((name, effect), (np.nan, np.nan))
+            amount, sigma, support = known[name, effect]
             digits = 4 if not 0 < factor * sigma < np.inf else _digits(factor * sigma)
+            if not support.determined:
+                amount = np.nan
+                open_.append(f"{find(effect).label}: {degenerate_text(effect, support)}")
             cells += [_number(factor * value, digits) for value in (amount, sigma)]
-        rows.append(tuple(cells))
+            cells.append(f"{100 * support.share_from_data:.0f}")
+        rows.append((*cells, "; ".join(open_)))
     head = ["name", "s [m]", *(["device"] if known_devices else [])]
     for effect in effects:
-        head += [f"{find(effect).label} [{units[effect][1]}]", "error"]
-    return Table(title, tuple(head), tuple(rows))
+        head += [f"{find(effect).label} [{units[effect][1]}]", "error", "from the data [%]"]
+    return Table(title, (*head, "not determined by the data"), tuple(rows))
 
 
 def _digits(error: float) -> int:

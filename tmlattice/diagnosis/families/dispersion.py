@@ -65,6 +65,11 @@ class _Kicks(Family):
     per, trust = "ring", 1e-3
     plane: ClassVar[int]
 
+    @property
+    def largest(self) -> float:
+        """Patterns have none: a single kick makes all of them."""
+        return 0.0
+
     def patterns(self, data: ResponseData) -> Patterns:
         """In the design."""
         read = bool(np.isfinite(data.orbits[-1, :, self.plane]).any())

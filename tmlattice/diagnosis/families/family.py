@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -45,6 +45,11 @@ class Family(ABC):
     def title(self) -> str:
         """Its effects, for people."""
         return ", ".join(self.effects)
+
+    @property
+    def largest(self) -> float:
+        """The largest fault of one member, in the unit of the numbers; 0: they have no members."""
+        return find(self.effects[0]).largest
 
     @abstractmethod
     def size(self, data: ResponseData) -> int:

@@ -235,6 +235,11 @@ class EdgeFocusing(_Thin):
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
     block, variable, trust = 0, "edge", 3e-3
 
+    @property
+    def largest(self) -> float:
+        """The edges of all bends of a type have one design."""
+        return 0.0
+
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("bend",))
 

@@ -45,6 +45,11 @@ class _Orbit(Family):
     per, trust = "ring", 1.0
     effect: ClassVar[str]
 
+    @property
+    def largest(self) -> float:
+        """Patterns have none: a single kick makes all of them."""
+        return 0.0
+
     def size(self, data: ResponseData) -> int:
         """Of the patterns."""
         return len(self.patterns)

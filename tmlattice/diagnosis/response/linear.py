@@ -141,12 +141,12 @@ def linear(state: State, block: int) -> Linear:
             known = state.groups.get(own.name, own)
             groups.append(
                 replace(own, basis=basis, rms=known.rms, each=known.each, first=own.rms,
-                        guessed=state.guessed)
+                        guessed=state.guessed, largest=0.0 if own.fixed else family.largest)
             )  # fmt: skip
     for one in (one for one in state.apart if one.block == block and one.variable in where):
         basis = np.zeros((end, 1))
         basis[where[one.variable], 0] = one.members
-        groups.append(Group(one.name, basis, one.wide, fixed=True))
+        groups.append(Group(one.name, basis, one.wide, fixed=True, largest=one.wide))
     return Linear(
         normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], tuple(ring),
         where, tuple(groups), kept, lowest,

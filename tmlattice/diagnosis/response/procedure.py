@@ -134,10 +134,10 @@ def diagnose_response(
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         rejected = tuple(exchanges.rejected)
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, degenerate, correlated = told(fit.state)
+        found, supports, degenerate, correlated = told(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
-        fit, found, degenerate, correlated = few.fit, few.told, (), ()
+        fit, found, supports, degenerate, correlated = few.fit, few.told, (), (), ()
         verdict, findings = few.verdict, few.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
@@ -155,6 +155,7 @@ def diagnose_response(
         degenerate=degenerate,
         rejected=rejected,
         correlations=correlated,
+        supports=supports,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
         pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),

@@ -22,6 +22,7 @@ from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
+from tmlattice.diagnosis.support import share_from_data
 from tmlattice.inference.levels import CLEAR, Levels
 from tmlattice.inference.normal import solve
 from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
@@ -80,6 +81,7 @@ class Reason:
         statistic: chi-square that it explains beside all the others.
         makes: what would make it.
         rivals: what the data do not exclude in its place, with probabilities.
+        share_from_data: of the amount, 1 - posterior variance / prior variance.
     """
 
     kind: str
@@ -91,6 +93,7 @@ class Reason:
     statistic: float
     makes: str
     rivals: tuple[tuple[str, float], ...]
+    share_from_data: float = 1.0
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -123,6 +126,7 @@ class Outlier:
     Attributes:
         element: its first piece.
         amount, amount_sigma: relative, beyond what it shares.
+        share_from_data: of the amount, 1 - posterior variance / prior variance.
         against: neighbours that it pulls against: name, amount and correlation.
     """
 
@@ -130,6 +134,7 @@ class Outlier:
     amount: float
     amount_sigma: float
     against: tuple[tuple[str, float, float], ...]
+    share_from_data: float
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -208,6 +213,7 @@ def explain_gradients(state: State) -> Reasons | None:
             tuple(places[i] for i in np.flatnonzero(members[:, one.candidate])),
             one.amount, one.sigma, chance, one.statistic, MAKES[kinds[one.candidate]],
             tuple((names[c], p) for c, p in one.rivals[1:]),
+            share_from_data(one.sigma, float(levels.slab[one.candidate])),
         )
         for one, chance in found
     )  # fmt: skip
@@ -227,7 +233,14 @@ def explain_gradients(state: State) -> Reasons | None:
     return Reasons(
         reasons,
         instead,
-        _outliers(places, left, values, sigma, covariance / np.outer(sigma, sigma)),
+        _outliers(
+            places,
+            left,
+            values,
+            sigma,
+            covariance / np.outer(sigma, sigma),
+            np.sqrt(np.sum(spread**2, axis=1)),
+        ),
         1 - float(np.sum(left**2)) / size if size else 0.0,
         float(np.sqrt(np.mean(left**2))),
         between,
@@ -284,12 +297,25 @@ def weighed(
 
 
 def _outliers(
-    places: Sequence[str], left: Array, values: Array, sigma: Array, correlation: Array
+    places: Sequence[str],
+    left: Array,
+    values: Array,
+    sigma: Array,
+    correlation: Array,
+    prior: Array,
 ) -> tuple[Outlier, ...]:
     found = []
     for i in np.flatnonzero(np.abs(left) - sigma > TOLERANCE).tolist():
         other = np.argsort(-np.abs(correlation[i]))
         pulls = [int(j) for j in other if j != i and abs(correlation[i, j]) > AGAINST][:SHOWN]
         against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)
-        found.append(Outlier(places[i], float(left[i]), float(sigma[i]), against))
+        found.append(
+            Outlier(
+                places[i],
+                float(left[i]),
+                float(sigma[i]),
+                against,
+                share_from_data(float(sigma[i]), float(prior[i])),
+            )
+        )
     return tuple(sorted(found, key=lambda one: -abs(one.amount)))

@@ -2,8 +2,10 @@
 
 >>> there = linear(state, 0)
 >>> posterior = solve(there.normal, there.groups, there.start, rounds=0)
->>> sigma = stated(state, 0, there, posterior)
+>>> sigma = stated(state, 0, there, posterior).sigma
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +15,46 @@ from tmlattice.diagnosis.response.state import Apart, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import unknown_sizes
 from tmlattice.inference.clusters import Found, Rows, widened
+from tmlattice.inference.heavy_tails import moments
 from tmlattice.inference.normal import Posterior
 from tmlattice.inference.unknown_sizes import MANY
 
 Array = NDArray[np.float64]
 
 
-def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Posterior errors, widened by what readings share (`of_readings`) and by what the sizes of
-    families are unknown by (`of_sizes`).
+class Stated(NamedTuple):
+    """What is stated of the numbers of one block, in the order of `linear`.
+
+    Attributes:
+        sigma: standard errors, [parameter].
+        prior: rms of each number before the data, [parameter].
+        covariance: of the posterior, any member of a family being the faulty one,
+            [parameter, parameter].
+    """
+
+    sigma: Array
+    prior: Array
+    covariance: Array
+
+
+def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
+    """Posterior errors, widened by what readings share (`of_readings`), by what the sizes of
+    families are unknown by (`of_sizes`), and by members that may be faulty (`heavy_tails`).
 
     Args:
         state: where the fit stands.
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block.
         posterior: solved from it.
-
-    Returns:
-        Of each number, in the order of `there`, [parameter].
     """
-    more = np.sum(of_sizes(state, block, there) ** 2, axis=1)
-    return np.asarray(np.sqrt(of_readings(state, block, there, posterior) ** 2 + more))
+    square = of_readings(state, block, there, posterior) ** 2
+    square += np.sum(of_sizes(state, block, there) ** 2, axis=1)
+    tails = moments(there.normal, there.groups, there.start)
+    # mean square about the numbers as they are stated, beyond the posterior's
+    off = np.diag(tails.covariance) + (tails.mean - posterior.values) ** 2
+    square += np.maximum(off - posterior.sigma**2, 0.0)
+    prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
+    return Stated(np.sqrt(square), prior, tails.covariance)
 
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:

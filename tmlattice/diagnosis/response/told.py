@@ -1,6 +1,7 @@
-"""What a dense fit of an orbit response found, as causes with errors."""
+"""What a hierarchical fit of an orbit response found, as causes with errors."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,17 +11,23 @@ from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import stated
-from tmlattice.errors import first_of
+from tmlattice.diagnosis.support import Support, share_from_data
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.problem import Hypothesis
 
 Array = NDArray[np.float64]
 
+AGAINST, SHOWN = 0.4, 3
+"""Posterior correlation from which on numbers are degenerate, and how many are named."""
 
-def told(state: State) -> tuple[list[Told], tuple[str, ...], tuple[Correlation, ...]]:
-    """What is wrong as causes, with errors; what the data alone do not settle, in words; and the
-    amounts that they hardly separate."""
+
+def told(
+    state: State,
+) -> tuple[list[Told], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...]]:
+    """Causes with stated errors; how much of each comes from the data; what the data alone do not
+    settle, in words; and the amounts that they hardly separate."""
     found: list[Told] = []
+    supports: list[Support] = []
     said: tuple[str, ...] = ()
     pairs: list[Correlation] = []
     for block in (0, 1):
@@ -29,40 +36,80 @@ def told(state: State) -> tuple[list[Told], tuple[str, ...], tuple[Correlation, 
             continue
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
-        sigma = stated(state, block, there, posterior)
+        known = stated(state, block, there, posterior)
+        numbers = _numbers(state, families.values(), there)
         for name, family in families.items():
-            own = sigma[there.where[name]]
-            found += family.told(state.at.errors, state.values[name], own, state.data)
-        pairs += _correlated(state, families.values(), there, posterior)
+            own, values = there.where[name], state.values[name]
+            rows = family.told(state.at.errors, values, known.sigma[own], state.data)
+            # the errors before the data in the units of the causes
+            before = family.told(state.at.errors, values, known.prior[own], state.data)
+            for row, (_, prior) in zip(rows, before, strict=True):
+                if row[0].amount == 0 and row[1] == 0:
+                    continue
+                found.append(row)
+                supports.append(_support(row, prior, own, known.covariance, numbers))
+        pairs += _correlated(state, families.values(), there, known.covariance)
         if block == 0:
             said = _degenerate(state, there, posterior)
-    return [row for row in found if row[0].amount != 0 or row[1] != 0], said, tuple(pairs)
+    return found, tuple(supports), said, tuple(pairs)
 
 
 def _correlated(
-    state: State, families: Iterable[Family], there: Linear, posterior: Posterior
+    state: State, families: Iterable[Family], there: Linear, covariance: Array
 ) -> tuple[Correlation, ...]:
     """Amounts of the magnets' families that the readings hardly separate; each number is named for
     the first that it moves."""
     amounts: list[Hypothesis] = []
-    rows: list[Array] = []
-    spread = posterior.spread
+    numbers: list[int] = []
     for family in families:
         if family.per == "ring":
-            moved = family.moves(state.data)
-            own = zip(moved, spread[there.where[family.variable]], strict=True)
-            for moves, row in own:
+            first = there.where[family.variable].start
+            for i, moves in enumerate(family.moves(state.data)):
                 if moves:
                     amounts.append(next(iter(moves)))
-                    rows.append(row)
-    if not rows:
+                    numbers.append(first + i)
+    if not numbers:
         return ()
-    root = np.array(rows)
-    return correlations_of(amounts, root @ posterior.covariance @ root.T)
+    return correlations_of(amounts, covariance[np.ix_(numbers, numbers)])
+
+
+Hypotheses = Mapping[int, Mapping[Hypothesis, float]]
+
+
+def _numbers(state: State, families: Iterable[Family], there: Linear) -> Hypotheses:
+    """What each number of the fit is of the catalogue's effects, by its place in the fit."""
+    numbers: dict[int, Mapping[Hypothesis, float]] = {}
+    for family in families:
+        first = there.where[family.variable].start
+        numbers |= {first + i: own for i, own in enumerate(family.moves(state.data)) if own}
+    return numbers
+
+
+def _support(
+    row: Told, prior: float, own: slice, covariance: Array, numbers: Hypotheses
+) -> Support:
+    """Of one cause, with its error before the data; `own` are its family's numbers."""
+    cause, sigma = row
+    support = Support(share_from_data(sigma, prior))
+    if support.determined:
+        return support
+    here = (cause.effect, cause.element)
+    mine = [i for i in range(own.start, own.stop) if here in numbers.get(i, {})]
+    width = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    near: dict[int, float] = {}
+    for i in mine:
+        correlation = covariance[i] / (width[i] * width)
+        for j in np.argsort(-np.abs(correlation))[: SHOWN + len(mine)].tolist():
+            if j not in mine and j in numbers and abs(correlation[j]) > AGAINST:
+                near[j] = max(near.get(j, 0.0), float(correlation[j]), key=abs)
+    order = sorted(near, key=lambda j: -abs(near[j]))[:SHOWN]
+    return replace(
+        support, degenerate_with=tuple((*next(iter(numbers[j])), near[j]) for j in order)
+    )
 
 
 def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
-    """Directions that the prior holds and not the data."""
+    """The scale that gains and calibrations share."""
     said = []
     columns, monitors = state.data.shape
     m = 2 * monitors
@@ -78,16 +125,4 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
             f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
             f"{both:+.2f}"
         )
-    for family in state.families:
-        own = [g for g in there.groups if g.name == family.name]
-        if family.per != "ring" or family.block or not own or len(own[0].scale) < 2:
-            continue
-        loose = np.flatnonzero(posterior.sigma[there.where[family.variable]] > 0.5 * own[0].scale)
-        moves = family.moves(state.data)  # of each number; a cause is one of its pieces
-        names = [place for i in loose for _, place in list(moves[i])[:1] if place]
-        if names:
-            said.append(
-                f"{len(names)} of {family.title} that the prior holds more than the data: "
-                + first_of(names, 12)
-            )
     return tuple(said)

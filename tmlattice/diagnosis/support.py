@@ -1,0 +1,70 @@
+"""How much of a fitted number comes from the data, and what it is degenerate with.
+
+>>> support = diagnosis.support("quadrupole_gradient", "qd::12")
+>>> support.share_from_data, support.determined, support.degenerate_with
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from tmlattice.effects import find
+
+DETERMINED = 0.5
+"""Share of a number from the data below which they do not determine it: the prior then knows more
+of it than they do (1 - posterior variance / prior variance is the data's share of the posterior
+precision)."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """Of one fitted number.
+
+    Attributes:
+        share_from_data: 1 - posterior variance / prior variance, from 0 to 1.
+        degenerate_with: effect and element of other numbers with the largest posterior
+            correlations, and these; only of what the data do not determine.
+    """
+
+    share_from_data: float
+    degenerate_with: tuple[tuple[str, str | None, float], ...] = ()
+
+    @property
+    def determined(self) -> bool:
+        """Whether the data determine the number."""
+        return self.share_from_data >= DETERMINED
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields of a number in the diagnosis."""
+        return {
+            "share_from_data": self.share_from_data,
+            "degenerate_with": [
+                {"effect": effect, "element": element, "correlation": correlation}
+                for effect, element, correlation in self.degenerate_with
+            ],
+        }
+
+
+def share_from_data(sigma: float, prior: float) -> float:
+    """Return 1 - posterior variance / prior variance, from 0 to 1.
+
+    Args:
+        sigma, prior: posterior and prior rms, in one unit.
+    """
+    return min(max(1 - (sigma / prior) ** 2, 0.0), 1.0) if prior > 0 else 0.0
+
+
+def share_of_fault(effect: str | None, sigma: float | None) -> float | None:
+    """Return the share from the data of a fault, which before them may be as large as the largest
+    of its effect; None for an amount without an error.
+
+    Args:
+        effect: of the catalogue.
+        sigma: standard error, in the effect's unit.
+    """
+    if effect is None or sigma is None:
+        return None
+    return share_from_data(sigma, find(effect).largest)
+
+
+FREE = Support(1.0)
+"""Of an amount with a log-uniform prior: any power of ten is as likely."""
