@@ -11,7 +11,7 @@ import numpy as np
 
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
+from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.amounts import labelled, scaled, words
 from tmlattice.report.remedies import SETTLED

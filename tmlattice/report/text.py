@@ -172,8 +172,12 @@ def _open(finding: Finding) -> str:
 
 
 def _after_families(diagnosis: Diagnosis) -> str:
-    """What to do after a fit of families: the suspects and gradients that there are."""
+    """What to do after a fit of families: of the suspects, the gradients and the missing effect
+    those that there are."""
+    lacks = diagnosis.assessment.remainder == "effect_missing" and diagnosis.hypotheses is None
     steps = ["inspect the suspects"] if diagnosis.suspects else []
+    if lacks and not diagnosis.since_reference:
+        steps.append("weigh which effect the model lacks (--missing)")
     if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
         steps.append("set the gradients that --repaired-out writes")
     if not steps:

@@ -123,5 +123,5 @@ def test_what_is_known_of_it_is_what_held_out_monitors_miss(small_ring):
         missed.append(score(state, split.held).dispersion)
         blocks += [block for block in remainder(state) if block.name == "held-out, RF"]
     assert min(missed) > 1.5 * 2e-8
-    # 2.4: families that came in one by one have not settled together; by the noise alone 10 and more
+    # 2.4: families that came in one by one have not settled together
     assert 0.5 < sum(b.chi2 for b in blocks) / sum(b.freedom for b in blocks) < 3
