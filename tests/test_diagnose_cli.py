@@ -110,7 +110,7 @@ def test_command_reports_writes_and_draws(outcome, folders, schema):
     assert done.stderr == ""
     assert "\x1b" not in done.stdout
     for words in ("QD::5", "between bpm::5 and end_5", "±", "held out", "fractional tunes",
-                  "What is left is noise", "written: day/"):  # fmt: skip
+                  "The remaining residual is noise", "written: day/"):  # fmt: skip
         assert words in done.stdout
     document = json.loads((folder / "day" / "diagnosis.json").read_text())
     jsonschema.validate(document, schema)
@@ -169,7 +169,7 @@ def test_reference_and_single_shot(folders, tmp_path, schema):
         "diagnose", SMALL, folders / "one", "--reference", folders / "before", "--json", path,
         "--background", "quadrupole_gradient=1e-4", cwd=tmp_path, check=0,
     )  # fmt: skip
-    assert "Nothing was held out" in done.stdout
+    assert "No reading was held out" in done.stdout
     document = json.loads(path.read_text())
     jsonschema.validate(document, schema)
     assert document["provenance"]["options"]["reference"] is True
@@ -240,11 +240,11 @@ def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, sch
                    "set or repair the gradient of QD::5", "Read back the current", "> 99.9 %",
                    "between bpm::5 and end_5", "beta beat", "after the repair: as designed",
                    "the remedy is the same"]),
-        ("equivalent", ["the data do not exclude sextupole sd::5", "or else"]),
-        ("located", ["no effect of the catalogue explains it", "Next: Look at what stands there",
-                     "(bpm::5, QD::5, end_5)", "cannot be put into the lattice"]),
-        ("nothing", ["No error is seen", "Would have been seen", "wrong strength of a quadrupole"]),
-        ("distributed", ["all along the ring", "a fault that small errors hide", "--reference"]),
+        ("equivalent", ["alternatives: sextupole sd::5", "or else"]),
+        ("located", ["no effect of the catalogue explains it", "Next: Inspect this section",
+                     "(bpm::5, QD::5, end_5)", "has no amount, so the gap of held-out readings stays"]),
+        ("nothing", ["No error is detected", "Would have been seen", "wrong strength of a quadrupole"]),
+        ("distributed", ["all along the ring", "faults that small errors hide", "--reference"]),
     ],
 )  # fmt: skip
 def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):

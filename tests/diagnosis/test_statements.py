@@ -185,8 +185,9 @@ def every_assessment():
                     continue  # it puts nothing into the model
                 yield assess(verdict, compared_of(fitted, gap), gap, **told)
     yield assess("nothing", (), None, amounts=False, findings=False, noise_estimated=False)
-    yield assess("nothing", (), None, amounts=False, findings=False, noise_estimated=False,
-                 change=True)  # fmt: skip
+    for fitted in FITTED.values():
+        yield assess("nothing", (fitted,), None, amounts=False, findings=False,
+                     noise_estimated=False, reference=True, change=True)  # fmt: skip
 
 
 def test_one_sentence_of_a_topic_holds_and_none_excludes_another():

@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
     "--holdout",
     type=click.FloatRange(0, 1, max_open=True),
     default=None,
-    help="Share of the shots, or of the correctors, that the fit does not see; they judge the gap. "
+    help="Share of the shots, or of the correctors, that the fit does not see: the validation set. "
     "0.33 of shots, 0.2 of correctors where nothing is said.",
 )
 @click.option(

@@ -334,10 +334,22 @@ _LEAVES_MORE = tuple(f"remainder_{name}" for name in _UNEXPLAINED)
 STATEMENTS = (
     Statement(
         "verdict", "no_change",
-        "verdict nothing; the findings are changes since a reference",
-        lambda own: own.verdict == "nothing" and own.change,
+        "verdict nothing; the findings are changes since a reference; the remainder is noise or "
+        "cannot be tested",
+        lambda own: own.verdict == "nothing" and own.change
+        and own.remainder not in _UNEXPLAINED,
         lambda own: "Nothing changed since the reference beyond the usual drifts of monitors, "
         "correctors and magnets.",
+        _LEAVES_MORE,
+    ),
+    Statement(
+        "verdict", "change_not_located",
+        "verdict nothing; the findings are changes since a reference; the remainder is larger than "
+        "the noise",
+        lambda own: own.verdict == "nothing" and own.change and own.remainder in _UNEXPLAINED,
+        lambda own: "No change since the reference is located, but drifts do not explain all "
+        "readings within their noise.",
+        ("remainder_noise",),
     ),
     Statement(
         "verdict", "no_error",

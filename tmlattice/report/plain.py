@@ -75,8 +75,8 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         for name, text in small:
             lines += wrapped(text, f"   {name:<{size}}   ", width)
     if diagnosis.steps:
-        if diagnosis.causes:
-            lines += ["", *columns([optics_head(diagnosis), *optics_rows(diagnosis)])]
+        if optics := optics_rows(diagnosis):
+            lines += ["", *columns([optics_head(diagnosis), *optics])]
         lines += ["", *steps_text(diagnosis, width)]
     if diagnosis.verdict == "nothing":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])

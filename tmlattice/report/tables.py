@@ -12,7 +12,7 @@ import numpy as np
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import FREE, Support
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
 from tmlattice.report.remedies import SETTLED
@@ -110,7 +110,10 @@ MOST = 8
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """The stored beam by the design and as found, of the energy that the magnets are set for
     whatever it has: (what, design, found). The closed orbit only where it was measured or errors
-    that were found move it."""
+    that were found move it. Empty where no error of the ring was found."""
+    effects = (find(cause.effect) for cause in diagnosis.causes)
+    if not any(isinstance(own, RingEffect) and not own.acts_on_settings for own in effects):
+        return []
     told = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
     moved = told.found is not None and max(told.found.orbit_rms) > SETTLED.orbit_rms[0]
     orbit = moved or "closed_orbit" in diagnosis.assessment.measured

@@ -171,18 +171,32 @@ def _open(finding: Finding) -> str:
     return f"most probable ({chance}) {text}; alternatives: " + ", or ".join(also)
 
 
+def _after_families(diagnosis: Diagnosis) -> str:
+    """What to do after a fit of families: of the suspects, the gradients and the missing effect
+    those that there are."""
+    lacks = diagnosis.assessment.remainder == "effect_missing" and diagnosis.hypotheses is None
+    steps = ["inspect the suspects"] if diagnosis.suspects else []
+    if lacks and not diagnosis.since_reference:
+        steps.append("weigh which effect the model lacks (--missing)")
+    if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
+        steps.append("set the gradients that --repaired-out writes")
+    if not steps:
+        return ""
+    text = ", ".join(steps)
+    return f"{text[0].upper()}{text[1:]}, and measure again."
+
+
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next, where the result leaves something open and no shot was proposed."""
-    everywhere = (
-        "Inspect the suspects, set the gradients that --repaired-out writes, and measure again."
-    )
+    everywhere = _after_families(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.by_steps:
         return everywhere
     if text := diagnosis.assessment.sentence("reference"):
         return text
     checks = dict.fromkeys(f.to_check for f in diagnosis.findings if f.to_check)
     if diagnosis.verdict == "located" and checks:
-        return " ".join([*checks, *([everywhere] if _errors_in_steps(diagnosis) else [])])
+        more = everywhere if _errors_in_steps(diagnosis) else ""
+        return " ".join([*checks, *([more] if more else [])])
     if diagnosis.verdict == "located":
         return (
             "Inspect this section: hardware, apertures, cables of the BPMs. More launches show "
