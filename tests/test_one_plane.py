@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
+from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.doctor import check_data
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 
@@ -111,3 +112,43 @@ def test_the_check_states_which_plane_was_not_read(petra3, plane):
 def test_both_planes_are_read(small_ring):
     found = check_data(small_ring, simulate(small_ring, shots=3).measurement())
     assert [check.status for check in found.checks if check.name == "planes"] == ["fine"]
+
+
+# --- of a stored beam -----------------------------------------------------------------------------
+def blank(values, plane):
+    """Without the other plane."""
+    values = values.copy()
+    values[..., 1 - PLANES.index(plane)] = np.nan
+    return values
+
+
+def stored(kind, ring, causes, plane):
+    data = measure(kind, ring, causes, 1.0, 2, seed=1)
+    if kind == "turn_by_turn":
+        return replace(data, readings=blank(data.readings, plane))
+    if kind == "closed_orbit":
+        return replace(data, orbit=blank(data.orbit, plane))
+    steps = (replace(step, orbit=blank(step.orbit, plane)) for step in data.steps)
+    return replace(data, steps=tuple(steps))
+
+
+@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize("kind", ["turn_by_turn", "closed_orbit", "dispersion"])
+def test_a_stored_beam_of_a_healthy_ring_is_healthy_in_one_plane(small_ring, kind, plane):
+    data = stored(kind, small_ring, [], plane)
+    assert check_data(small_ring, data).status == "note"
+    result = diagnose(small_ring, data)
+    assert (result.verdict, result.findings) == ("nothing", ())
+    assert not any("settled" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "plane"), [("turn_by_turn", "x"), ("turn_by_turn", "y"), ("dispersion", "x")]
+)
+def test_a_weak_quadrupole_is_found_with_a_stored_beam_in_one_plane(small_ring, kind, plane):
+    """The line of the other mode has an amplitude that no reading sees."""
+    cause = Cause("quadrupole_gradient", "QD::5", -0.02)
+    result = diagnose(small_ring, stored(kind, small_ring, [cause], plane))
+    (finding,) = result.findings
+    members = {(m.effect, m.element): m.amount for m in finding.credible_set}
+    assert members[cause.effect, cause.element] == pytest.approx(-0.02, rel=0.05)

@@ -165,12 +165,15 @@ def _of_orbits(
     design = problem.read(problem.view(()), NOTHING)
     if what != "dispersion":
         design = design - design.mean(axis=0)
-    there = problem.used
+    data = np.where(problem.used, data, np.nan)
+    noise = 2 * float(np.sum(problem.errors[problem.used] ** 2))
 
     def share(own: Array) -> float:
-        left = np.where(there, own - design, 0.0)
+        """Of what is read, and of the design's there, beyond the noise."""
+        there = np.isfinite(own)
+        left = np.sum(np.where(there, own - design, 0.0) ** 2)
         size = np.sum(np.where(there, own, 0.0) ** 2) + np.sum(np.where(there, design, 0.0) ** 2)
-        return float(np.sum(left**2) / max(size, 1e-300))
+        return float(max(left - noise, 0.0) / max(size, 1e-300))
 
     return _judged(ring, what, share, data, mends)
 

@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 EXACT = 1e-12
 """m, rad or relative: stands for a launch coordinate that is known exactly."""
 
+UNSEEN = 1e-13
+"""Share of a direction below which it is rounding: no row sees it, beside those before it."""
+
 
 class Readings(Protocol):
     """What whitening needs of data: see `observe.data.Data`, which has it."""
@@ -159,12 +162,21 @@ class Projection:
 
     def __init__(self, directions: Array) -> None:
         self.Q, self._R = np.linalg.qr(directions)
+        self._seen = np.abs(np.diagonal(self._R, axis1=1, axis2=2))  # [block, column]
+        size = np.linalg.norm(directions, axis=1)
+        if (self._seen <= UNSEEN * size).any():  # else a direction of Q would be any direction
+            scale = np.where(size > 0, size, 1.0)[:, None]
+            U, s, V = np.linalg.svd(directions / scale, full_matrices=False)
+            kept = s > UNSEEN * max(directions.shape[1:])
+            self.Q = U * kept[:, None]
+            self._R = (s * kept)[..., None] * V * scale
+            self._seen = np.where(kept, s, 1.0) * scale[:, 0]
 
     @property
     def log_volume(self) -> float:
-        """Of the launches' covariance: log of the square root of its determinant."""
-        seen = np.abs(np.diagonal(self._R, axis1=1, axis2=2))
-        return -float(np.log(np.maximum(seen, 1e-300)).sum())
+        """Of the launches' covariance: log of the square root of its determinant, but for the
+        directions that no row sees."""
+        return -float(np.log(np.maximum(self._seen, 1e-300)).sum())
 
     def out(self, rows: Array) -> Array:
         """Rows [..., row] less what launches explain, the same shape."""

@@ -139,8 +139,12 @@ def share(fit: LineFit, planes: Planes, line: int) -> float:
 
 
 def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
-    """The lines of the modes nearer to x and to y; None where none stands above the noise."""
-    lines = min(len(fit.frequency), 2)
+    """The lines of the modes nearer to x and to y; None where none stands above the noise.
+
+    Where one plane was read the second line is none of these, and the tune alone tells the mode.
+    """
+    read = len(np.unique(planes))
+    lines = min(len(fit.frequency), read)
     shares = [share(fit, planes, i) for i in range(lines)]
     folded = None if near is None else np.abs(np.asarray(near) - np.round(near))
     if lines == 2:
@@ -151,7 +155,7 @@ def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
         modes = [first, 1 - first]
     else:
         mode = 0 if shares[0] >= 0.5 else 1
-        if folded is not None and 0.2 < shares[0] < 0.8:
+        if folded is not None and (read == 1 or 0.2 < shares[0] < 0.8):
             mode = int(np.argmin(np.abs(fit.frequency[0] - folded)))
         modes = [0 if mode == 0 else -1, 0 if mode == 1 else -1]
     kept = [i if i >= 0 and _stands(fit, planes, i) else None for i in modes]

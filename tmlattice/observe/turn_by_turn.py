@@ -156,7 +156,7 @@ def many_turns(
         at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
         found = lines(measured.in_order_of(names), near=design[0], at=at)
     # what the model leaves out goes with the line of the mode in its own plane
-    size = np.abs(found.amplitude).max(axis=2, keepdims=True)
+    size = np.nan_to_num(np.abs(found.amplitude)).max(axis=2, keepdims=True)
     error = np.hypot(found.error, FLOOR * size).reshape(shots, -1)
     both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
     tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
