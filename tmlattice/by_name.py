@@ -25,7 +25,8 @@ def by_name(function: F) -> F:
     """The function, which takes a built-in name or a path too where it takes a ring, and a path
     where it takes a measurement: `ring`, `measurement`, `data`, `reference`."""
     signature = inspect.signature(function)
-    wanted = [name for name in ("ring", *MEASURED) if name in signature.parameters]
+    more = "options" in signature.parameters
+    wanted = [name for name in ("ring", *MEASURED) if more or name in signature.parameters]
 
     @functools.wraps(function)
     def taken(*arguments: Any, **options: Any) -> Any:

@@ -16,6 +16,7 @@ from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
 from tmlattice.cli.predict import predict
+from tmlattice.cli.progress import stopped_in
 from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
@@ -93,7 +94,8 @@ def main() -> NoReturn:
     except OSError as error:
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
     except (KeyboardInterrupt, click.exceptions.Abort):
-        click.echo("tmlattice: stopped; nothing was written", err=True)
+        where = f" in '{stopped_in[0]}'" if stopped_in else ""
+        click.echo(f"tmlattice: stopped{where}; nothing was written", err=True)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(STOPPED)  # temporary files are gone; torch and its threads need a second to end

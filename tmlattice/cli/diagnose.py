@@ -1,8 +1,7 @@
 """`tmlattice diagnose`: where the gap lies, what causes it, how far it shrinks."""
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ from tmlattice.cli.options import (
     read_data,
     table_options,
 )
+from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
@@ -192,23 +192,22 @@ def diagnose(
         for option, path in (("lattice", lattice_out), ("repaired", repaired_out)):
             if path:
                 _check_out(ring, f"--{option}-out", path)
-        with _progress(quiet) as progress:
-            where = " or ".join(str(path) for path in (*measurements, *references))
-            result = _diagnosed(
-                ring, data, where, effects=effects, assume=assumed, progress=progress, **options
-            )
-            reading = None
-            if network:
-                assert isinstance(first, Measurement)
-                progress("network")
-                reading = _weights(ring, network, first, assumed)
-            source: dict[str, Any] = {"measurement": " ".join(map(str, measurements))}
-            if said:
-                source["assumed_of_files"] = said
-            _write(result, source, folder, extra, progress)
-            written = _write_rings(result, lattice_out, repaired_out, progress)
-            if folder and reading:
-                _write_weights(reading, folder)
+        where = " or ".join(str(path) for path in (*measurements, *references))
+        result = _diagnosed(
+            ring, data, where, effects=effects, assume=assumed, progress=tell, **options
+        )
+        reading = None
+        if network:
+            assert isinstance(first, Measurement)
+            tell("network")
+            reading = _weights(ring, network, first, assumed)
+        source: dict[str, Any] = {"measurement": " ".join(map(str, measurements))}
+        if said:
+            source["assumed_of_files"] = said
+        _write(result, source, folder, extra)
+        written = _write_rings(result, lattice_out, repaired_out)
+        if folder and reading:
+            _write_weights(reading, folder)
     if not quiet:
         _print(result, out, json_file, written)
         if reading:
@@ -263,7 +262,6 @@ def _write(
     source: dict[str, Any],
     folder: Path | None,
     extra: Path | None,
-    progress: Callable[[str], None],
 ) -> None:
     """What was asked for."""
     from tmlattice.files import write_json
@@ -271,7 +269,7 @@ def _write(
     document = result.as_json()
     document["provenance"] = {**document["provenance"], **source}
     if folder:
-        progress("figures")
+        tell("figures")
         _write_folder(result, folder, document)
     if extra:
         write_json(extra, document)
@@ -281,7 +279,6 @@ def _write_rings(
     result: "Diagnosis",
     lattice_out: Path | None,
     repaired_out: Path | None,
-    progress: Callable[[str], Any],
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
     from tmlattice.diagnosis.twin import known_beside, known_document, known_of
@@ -301,7 +298,7 @@ def _write_rings(
             beside.unlink(missing_ok=True)
         beside = known_beside(lattice_out)
         beside.unlink(missing_ok=True)  # that of the ring which stood there
-        progress("what is left known")  # minutes, of a large response
+        tell("what is left known")  # minutes, of a large response
         if lattice_out.is_file() and (known := known_of(result)) is not None:
             with output_file(beside) as temporary:
                 write_json(temporary, known_document(known, lattice_out))
@@ -390,19 +387,6 @@ def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
     except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:  # singular, lost
         log.info("the numbers of a measurement", exc_info=True)
         raise MeasurementError(f"{where}: {no_numbers(error)}") from error
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Tells on a terminal what is being done; elsewhere silent."""
-    from rich.console import Console
-
-    screen = Console(stderr=True, highlight=False, markup=False)
-    if quiet or not screen.is_terminal:
-        yield lambda _: None
-        return
-    with screen.status("reading") as status:
-        yield status.update
 
 
 def _write_folder(result: "Diagnosis", folder: Path, document: dict[str, Any]) -> None:

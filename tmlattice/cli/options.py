@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tmlattice.cli.progress import shown
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -153,7 +155,8 @@ class Careful(click.Command):
             if keys & written:
                 raise OutputError(f"'{out}' is written twice; name another file for one of them")
             written |= keys
-        return super().invoke(ctx)
+        with shown(f"tmlattice {ctx.info_name}", bool(ctx.params.get("quiet"))):
+            return super().invoke(ctx)
 
 
 def _identities(path: Path) -> set[Any]:
@@ -352,11 +355,16 @@ def console() -> "Console":
     from rich.console import Console
     from rich.text import Text
 
+    from tmlattice.cli.progress import clear
     from tmlattice.errors import harmless
 
     class Screen(Console):
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(harmless(text), **options)
+
+        def print(self, *objects: Any, **options: Any) -> None:
+            clear()  # the progress line
+            super().print(*objects, **options)
 
     wide = Screen(highlight=False, markup=False)
     return wide if wide.is_terminal else Screen(highlight=False, markup=False, width=100)
