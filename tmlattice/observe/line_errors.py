@@ -13,10 +13,11 @@ FEWEST = 64
 
 
 def noise_at(fit: LineFit, line: int) -> float:
-    """What noise is where a line is, over what it is at all frequencies and turns, at least 1.
+    """What noise is where a line is, over what it is at all frequencies and turns.
 
     A line is read in the turns in which its envelope is large, so noise counts as much as it is
-    there, near the line's frequency. The typical signal's is taken.
+    there, near the line's frequency. The typical signal's is taken. It is below 1 where other lines
+    are left, as sextupoles make them of a large oscillation.
     """
     turns = fit.envelope.shape[1]
     envelope = np.abs(fit.envelope[line])
@@ -27,7 +28,7 @@ def noise_at(fit: LineFit, line: int) -> float:
     away[0] = turns  # the offset
     parts = [away <= wide, (away > wide) & (away <= wide + turns // 16)]
     density = [np.median(power[:, part] / scale[:, None], axis=0) for part in parts if part.any()]
-    return float(np.sqrt(max(1.0, *[own.mean() / np.log(2) for own in density])))
+    return float(np.sqrt(max(own.mean() / np.log(2) for own in density)))
 
 
 def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
