@@ -75,6 +75,7 @@ class StoredBeam:
         rf: cavities that the oscillation feels, of a model of six coordinates.
 
     Attributes:
+        rf: as given.
         tunes: Q of the modes that are nearer to x and to y, in [0, 1).
         modes: their vectors at the monitors, [monitor, 2, mode]: the beam is at
             Re(sum_mode a E exp(2 pi i Q turn)), a any complex number.
@@ -85,6 +86,7 @@ class StoredBeam:
 
     def __init__(self, model: ResponseModel, rf: Cavities = NO_RF) -> None:
         self.model = model
+        self.rf = rf
         # as the oscillation has them: to the exits, into the layers, back from the exits, readings
         self._C, self._into = model.tangents, model.tangents
         self._back, self._G = model.inverse, model.reading_slopes
@@ -101,6 +103,16 @@ class StoredBeam:
         self._U = np.zeros((model.dimension, 2), dtype=complex)
         self._U[: len(self._values)] = self._vectors[:, :2]
         self.modes: ComplexArray = self._G @ self._U
+
+    def launched(self, amplitude: ComplexArray) -> Array:
+        """Where a kick leaves the beam at the start of the ring, [..., n].
+
+        Args:
+            amplitude: of the modes at turn 0, [..., mode].
+        """
+        kicked = np.real(amplitude @ self._U.T)
+        kicked[..., TRANSVERSE:] = 0.0  # a kick changes neither energy nor time
+        return np.asarray(self.model.state + kicked)
 
     @property
     def shown(self) -> Moved:

@@ -21,6 +21,7 @@ from tmlattice.measurement import ClosedOrbit, Dispersion, TuneReading, TurnByTu
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.stored import Stored
+from tmlattice.observe.stored_metric import LINES
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
@@ -207,8 +208,8 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
 
 def _lines(problem: ManyTurns) -> ComplexArray:
     """Complex amplitudes [shot, mode, monitor, plane], NaN where none is known."""
-    used = problem.used[:, :-2]
-    both = np.where(used, problem.data[:, :-2], np.nan)
+    used = problem.used[:, :LINES]
+    both = np.where(used, problem.data[:, :LINES], np.nan)
     both = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
     return np.moveaxis(both[..., 0] + 1j * both[..., 1], -1, 1)
 

@@ -337,6 +337,34 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
     return composed([*parts[:middle], first]), composed([second, *parts[middle + 1 :]])
 
 
+def halves_without_sextupole(element: Element, energy: float, n: int) -> list[Quadratic]:
+    """Maps of a magnet without its sextupole field: its entrance edge, both halves of its body, its
+    exit edge.
+
+    Args:
+        element: with a length; its `errors` are left out.
+        energy: GeV.
+        n: coordinates, 4 or 6.
+    """
+    from tmlattice.lattice.ocelot import SecondTM, TMTypes
+
+    if element.kind == "octupole":
+        atom = _empty(element).source.element
+    else:
+        fields = [name for name in ("k2", "k2s") if hasattr(element.source, name)]
+        atom = element.changed(**dict.fromkeys(fields, 0.0)).source.element
+
+    def edge(where: Any) -> Quadratic:
+        if not atom.has_edge:
+            return identity(n)
+        own = SecondTM.from_element(atom, where, None).get_params(energy)
+        return of_ocelot((own.B.ravel(), *_tilted(own.R, own.T, own.tilt)), n)
+
+    B, R, T, tilt = _body(atom, energy, TMTypes.MAIN, atom.l / 2)
+    half = of_ocelot((B, *_tilted(R, T, tilt)), n)
+    return [edge(TMTypes.ENTRANCE), half, half, edge(TMTypes.EXIT)]
+
+
 def _thin(
     n: int,
     kick_x: float = 0.0,

@@ -12,16 +12,34 @@ FEWEST = 64
 """Turns from which on half of them tell a change."""
 
 
-def noise_at(fit: LineFit, line: int) -> float:
+def floor(fit: LineFit) -> Array:
+    """What noise is over the rms of what is left, [signal]: 1 but where lines are left, as
+    sextupoles make them of a large oscillation. Lines fill few of the frequencies, so the median of
+    the spectrum shows the noise."""
+    turns = fit.residual.shape[1]
+    if turns < 2 * FEWEST:
+        return np.ones(len(fit.residual))
+    window = np.hanning(turns + 2)[1:-1]
+    power = np.abs(np.fft.rfft(fit.residual * window)[:, 1:]) ** 2
+    mean = np.maximum(power.mean(axis=1), 1e-300)
+    return np.asarray(np.sqrt(np.median(power, axis=1) / np.log(2) / mean))
+
+
+def noise_at(fit: LineFit, line: int, quiet: Array) -> float:
     """What noise is where a line is, over what it is at all frequencies and turns, at least 1.
 
     A line is read in the turns in which its envelope is large, so noise counts as much as it is
     there, near the line's frequency. The typical signal's is taken.
+
+    Args:
+        fit: the lines.
+        line: which.
+        quiet: the noise at all frequencies, [signal].
     """
     turns = fit.envelope.shape[1]
     envelope = np.abs(fit.envelope[line])
     power = np.abs(np.fft.rfft(fit.residual * envelope)) ** 2
-    scale = np.maximum(fit.noise**2 * (envelope**2).sum(), 1e-300)
+    scale = np.maximum(quiet**2 * (envelope**2).sum(), 1e-300)
     wide = round(2 * turns * (envelope**4).sum() / (envelope**2).sum() ** 2)
     away = np.abs(np.arange(power.shape[1]) - round(fit.frequency[line] * turns))
     away[0] = turns  # the offset

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.measurement import TurnByTurn
-from tmlattice.observe.line_errors import change, growth, noise_at
+from tmlattice.observe.line_errors import change, floor, growth, noise_at
 from tmlattice.observe.line_fit import LineFit
 from tmlattice.observe.line_search import Modes, Near, Planes, betatron_lines, share, which
 
@@ -109,12 +109,13 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
         planes = np.tile([0, 1], monitors)[usable]
         used = fit.envelope.shape[1]
         found.turns[i] = used
+        quiet = fit.noise * floor(fit)
         noise.append(np.full(2 * monitors, np.nan))
         noise[-1][usable] = fit.noise
         for mode, line in enumerate(modes):
             if line is None:
                 continue
-            louder = noise_at(fit, line)
+            louder = noise_at(fit, line, quiet)
             if louder > NOT_ONE:
                 _say(said, shot, IMPURE.format(mode + 1))
             mirrored = near is not None and near[mode] % 1 > 0.5
@@ -126,7 +127,7 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
             values = found.amplitude[i].reshape(-1, 2)
             values[usable, mode] = turned(fit.amplitude[:, line] / late)
             errors = found.error[i].reshape(-1, 2)
-            own_error = fit.noise * np.sqrt(fit.variance[:, line]) * louder
+            own_error = quiet * np.sqrt(fit.variance[:, line]) * louder
             errors[usable, mode] = np.hypot(own_error, change(fit, line, planes))
     if not noise:
         raise TooFewTurnsError(

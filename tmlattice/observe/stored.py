@@ -201,10 +201,14 @@ class Stored(Steady):
         )
         return Beams(beams, monitors_with(self.ring, causes))
 
+    def shown(self, view: Beams, nuisances: Array) -> list[Moved]:
+        """What the beam of each state shows."""
+        return [beam.shown for beam in view.beams]
+
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Monitors' errors and all."""
         matrix, constant = view.monitors.matrix(), view.monitors.constant()
-        shown = self.counted([b.shown for b in view.beams], view.monitors.late)
+        shown = self.counted(self.shown(view, nuisances), view.monitors.late)
         return self.told([seen_by(one, matrix, constant) for one in shown], nuisances)
 
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
@@ -234,7 +238,7 @@ class Stored(Steady):
 
     def of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
         """d readings / d amount of an effect on top, every monitor's own."""
-        own = self.counted([b.shown for b in view.beams], view.monitors.late)
+        own = self.counted(self.shown(view, nuisances), view.monitors.late)
         if effect.of_turns:
             matrix = view.monitors.matrix()
             return self.told([seen_by(one, matrix) for one in self.a_turn_on(own)], nuisances)

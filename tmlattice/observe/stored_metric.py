@@ -19,6 +19,8 @@ from tmlattice.observe.stored import Stored, seen_by
 
 Array = NDArray[np.float64]
 
+LINES = -4
+"""Where the lines end among the data of a shot: see `ManyTurns`."""
 AT_ONCE = 256
 """Changes of modes that are held at a time: 4 MB for 246 monitors."""
 
@@ -86,9 +88,9 @@ class TurnsMetric(StoredMetric):
         for beam in {id(own): own for own in view.beams}.values():
             shots = [i for i, own in enumerate(view.beams) if own is beam]
             a, b = amplitude[shots].real, amplitude[shots].imag
-            re, im = told[:, shots, :-2:2], told[:, shots, 1:-2:2]
+            re, im = told[:, shots, :LINES:2], told[:, shots, 1:LINES:2]
             sums = np.stack([(a * re + b * im).sum(1), (a * im - b * re).sum(1)], axis=-1)
-            u, v = weight[shots, :-2:2], weight[shots, 1:-2:2]
+            u, v = weight[shots, :LINES:2], weight[shots, 1:LINES:2]
             squares = [
                 (own).sum(0) for own in (a**2 * u + b**2 * v, b**2 * u + a**2 * v, a * b * (v - u))
             ]

@@ -1,0 +1,182 @@
+"""What the size of an oscillation does to its lines: tunes and ratios shift with the amplitude.
+
+Sextupoles shift the tunes by the square of the amplitude, octupoles do, and where cavities hold the
+energy, so does the longer way of an oscillation. The phases between monitors, and with them the
+lines, shift by as much. The design is tracked from the measured amplitudes, and its turns are read
+by the same `lines` as the measured ones; what differs from an oscillation without size is the
+shift. Its next order, in the fourth power of the amplitude, is what is left of the shift less twice
+that at half the action.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.nonlinear import nonlinear_turn, track
+from tmlattice.beam.stored import StoredBeam
+from tmlattice.errors import first_of
+from tmlattice.harmonics import MIN_TURNS
+from tmlattice.lattice import Ring
+from tmlattice.measurement import TurnByTurn
+from tmlattice.observe.spectra import Lines, lines
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Flags = NDArray[np.bool_]
+
+TURNS = 1024
+"""Most turns that are tracked: some periods of the synchrotron motion that a longer way starts."""
+FEW_TURNS = 128
+"""From which an amplitude is read."""
+NEARLY = 0.5
+"""Most by which a kick is corrected, as a share of it."""
+SMALL = 1e-2
+"""Of the measured amplitude: that of an oscillation without size."""
+SHARE = 0.1
+"""rms error of a shift, as a share of it. BPM gains that are all wrong by 5 % make as much of the
+action; a beta beat of some percent does of the sextupoles' effect; and bends have a third order,
+which their maps lack: 13 % of the shift in ThomX, 6 % in the Australian Synchrotron."""
+CONVERGED = 0.5
+"""Largest next order of a shift, as a share of it, with which its series still says anything."""
+SEEN = 1e-3
+"""Of a line: a smaller shift is below the noise of its monitors, whatever its next order."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """How the amplitude of each shot shifts its lines.
+
+    Attributes:
+        modes: change of the modes' vectors at the monitors, [shot, monitor, 2, mode].
+        tunes: change of Q, [shot, mode].
+        error: relative rms error of both, one for all monitors, [shot, mode].
+        mode_error, tune_error: rms of what is beyond that, of the next order: of the lines, m, each
+            monitor's own, [shot, monitor, 2, mode], and of the tunes, [shot, mode].
+        too_large: shots whose amplitude second-order maps do not describe, [shot].
+    """
+
+    modes: ComplexArray
+    tunes: Array
+    error: Array
+    mode_error: Array
+    tune_error: Array
+    too_large: Flags
+
+    @classmethod
+    def none(cls, shots: int, monitors: int) -> "Shift":
+        """No shift at all."""
+        modes, two = np.zeros((shots, monitors, 2, 2)), np.zeros((shots, 2))
+        none = np.zeros(shots, dtype=np.bool_)
+        return cls(modes.astype(np.complex128), two.copy(), two + SHARE, modes, two.copy(), none)
+
+
+def shift_of(ring: Ring, beams: Sequence[StoredBeam], found: Lines, at: Array) -> Shift:
+    """The shift of measured lines.
+
+    Args:
+        ring: the design.
+        beams: of each shot, without what is wrong.
+        found: their lines.
+        at: s / C of each monitor.
+    """
+    shift = Shift.none(len(beams), len(at))
+    for beam in {id(own): own for own in beams}.values():
+        shots = [i for i, own in enumerate(beams) if own is beam]
+        amplitude = np.stack([_amplitudes(found, i, beam) for i in shots])
+        if amplitude.any():
+            _fill(shift, ring, beam, shots, amplitude, found, at)
+    return shift
+
+
+def _amplitudes(found: Lines, shot: int, beam: StoredBeam) -> ComplexArray:
+    """By which a shot shows each mode, 0 where there is no line, [mode]."""
+    read, error = found.amplitude[shot], found.error[shot]
+    there = np.isfinite(read) & np.isfinite(error)
+    weight = np.where(there, 1 / np.maximum(np.where(there, error, 1.0), 1e-300) ** 2, 0.0)
+    inner = (weight * beam.modes.conj() * np.where(there, read, 0.0)).sum(axis=(0, 1))
+    whole = (weight * np.abs(beam.modes) ** 2).sum(axis=(0, 1))
+    return np.asarray(inner / np.maximum(whole, 1e-300))
+
+
+def _spread(found: Lines, shots: Sequence[int]) -> Array:
+    """The square of an envelope as it is at most, and on the mean over the line's power, [shot,
+    mode, 2]: particles that decohere keep the first, a beam that is damped has the second."""
+    g = np.abs(found.envelope[shots]) ** 2
+    mean = (g**2).sum(axis=2) / np.maximum(g.sum(axis=2), 1e-300)
+    return np.stack([g.max(axis=2), mean], axis=2)
+
+
+def _tracked(
+    ring: Ring, beam: StoredBeam, wanted: ComplexArray, turns: int, at: Array
+) -> tuple[ComplexArray, Array, Flags]:
+    """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes [shot, mode], and
+    whether the beam was kept [shot], for amplitudes [shot, mode] of which the last is small."""
+    way, maps = nonlinear_turn(beam.model.layers), beam.model.maps
+    names = tuple(monitor.name for monitor in ring.monitors)
+
+    def seen(launched: ComplexArray, most: int) -> tuple[ComplexArray, Lines, Flags]:
+        readings = track(beam.launched(launched), min(turns, most), way, maps, beam.rf)
+        kept: Flags = np.asarray(np.isfinite(readings).reshape(len(readings), -1).all(axis=1))
+        readings[~kept] = readings[-1]
+        found = lines(TurnByTurn(readings=readings, monitors=names), beam.tunes, at)
+        unit = np.einsum("mpk,smpk->sk", beam.modes.conj(), found.amplitude)
+        return np.asarray(unit / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))), found, kept
+
+    # a kick is no pure mode: sextupoles make its lines by some percent larger or smaller
+    unit, *_ = seen(wanted, FEW_TURNS)
+    ratio = wanted / np.where(unit == 0, np.nan, unit)
+    good = np.abs(ratio - 1) < NEARLY
+    unit, found, kept = seen(wanted * np.where(good, ratio, 1.0), TURNS)
+    return found.amplitude / unit[:, None, None], found.tune, kept
+
+
+def _fill(
+    shift: Shift, ring: Ring, beam: StoredBeam, shots: Sequence[int], amplitude: ComplexArray,
+    found: Lines, at: Array,
+) -> None:  # fmt: skip
+    """What amplitudes [shot, mode] of some shots do, written into the shift."""
+    spread = _spread(found, shots)
+    size = amplitude * np.sqrt(spread.mean(axis=2))
+    scales = (1.0, np.sqrt(0.5), SMALL)
+    turns = max(int(found.turns[shots].max()), MIN_TURNS)
+    wanted = np.concatenate([scale * size for scale in scales])
+    both = _tracked(ring, beam, wanted, turns, at)
+    modes, tunes, kept = (own.reshape(len(scales), len(shots), *own.shape[1:]) for own in both)
+    whole, half = (modes[i] - modes[2] for i in (0, 1))
+    tune, tune_half = ((tunes[i] - tunes[2] + 0.5) % 1.0 - 0.5 for i in (0, 1))
+    beyond, beyond_tune = whole - 2 * half, tune - 2 * tune_half
+
+    def rms(change: ComplexArray) -> Array:
+        """Of the modes' size, [shot, mode]."""
+        squares = (np.abs(change) ** 2).sum(axis=(1, 2))
+        return np.asarray(np.sqrt(squares / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))))
+
+    # a mode without a line was not kicked
+    there = np.isfinite(rms(whole) + rms(half) + tune)
+    large = there & (rms(whole) > SEEN)
+    share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
+    shift.modes[shots] = np.where(there[:, None, None], whole, 0.0)
+    shift.tunes[shots] = np.where(there, tune, 0.0)
+    # an action that is wrong by SHARE makes twice as much of its square
+    more = np.where(there[:, None, None], np.abs(beyond * amplitude[:, None, None]), 0.0)
+    shift.mode_error[shots] = 2 * SHARE * more
+    shift.tune_error[shots] = 2 * SHARE * np.where(there, np.abs(beyond_tune), 0.0)
+    decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), 1e-300)
+    shift.error[shots] = np.sqrt(SHARE**2 + decohered**2 + (2 * SHARE * share) ** 2)
+    shift.too_large[shots] = ~kept.all(axis=0) | (share > CONVERGED).any(axis=1)
+
+
+def too_large(shift: Shift, shots: Sequence[int], found: Lines) -> list[str]:
+    """A sentence where the amplitude of shots is too large."""
+    own = np.flatnonzero(shift.too_large).tolist()
+    if not own:
+        return []
+    size = np.sqrt(np.nanmean(np.nansum(np.abs(found.amplitude[own]) ** 2, axis=3) / 2))
+    ids = first_of([shots[i] for i in own])
+    return [
+        f"shot{'s' * (len(own) > 1)} {ids}: an oscillation of {1e3 * size:.2g} mm rms is too large "
+        "for second-order maps of this ring: its tunes do not shift by the square of the amplitude "
+        "any more; kick the beam less; these turns are not used"
+    ]
