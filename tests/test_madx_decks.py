@@ -94,6 +94,12 @@ WARNED = {
 }
 
 
+def test_expressions_of_the_beam_use_the_energy_that_is_given(tmp_path):
+    text = PLAIN.split("\n", 1)[1].replace("k1=1.1", "k1:=11/beam->brho")
+    ring = read(tmp_path, text, energy=3.0)
+    assert ring["qf::0"].k1 == pytest.approx(11 / (3.0 / 0.299792458), rel=1e-6)
+
+
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_would_change_the_ring_is_refused_by_name(tmp_path, what):
     text, message = REFUSED[what]

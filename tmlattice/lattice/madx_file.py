@@ -150,7 +150,7 @@ def read_madx(
     Warns:
         Of names without a value, statements that are passed over, and what the model lacks.
     """
-    reader = _Reader()
+    reader = _Reader(energy)
     try:
         reader.read(path)
     except LatticeError as error:
@@ -184,13 +184,13 @@ class _Stop(Exception):
 class _Reader:
     """What the statements of a file have defined so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, energy: float | None = None) -> None:
         self.variables: dict[str, float | Evaluate] = dict(CONSTANTS)
         self.elements: dict[str, _Definition] = {}
         self.sequences: dict[str, _Sequence] = {}
         self.lines: dict[str, Items] = {}
         self.macros: dict[str, tuple[list[str], str]] = {}
-        self.beams: dict[str, Beam] = {"": Beam()}
+        self.beams: dict[str, Beam] = {"": Beam({} if energy is None else {"energy": energy})}
         self.order: list[str] = []
         self.used = ""
         self.undefined: set[str] = set()
