@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
 from tmlattice.lattice.source import copied
 
 Array = NDArray[np.float64]
@@ -24,6 +24,8 @@ CHROMATICITY = (0.5, 0.1)
 """Absolute and relative; second-order maps of bends with gradients differ between codes by 7 %."""
 LENGTH = 1e-6
 """Relative to the ring's length, beside 1 mm."""
+STRAIGHT = 1e-6
+"""m; an orbit below it is none."""
 STEP = 1e-6
 """Of the relative energy, for a difference: a tune near an integer must not cross it."""
 
@@ -37,12 +39,14 @@ class Stated:
         tunes: with or without integers, [2].
         chromaticity: dQ / d pt, [2].
         compaction: momentum compaction.
+        orbit: largest closed orbit, m.
     """
 
     length: float | None = None
     tunes: tuple[float, float] | None = None
     chromaticity: tuple[float, float] | None = None
     compaction: float | None = None
+    orbit: float = 0.0
 
     @classmethod
     def of_header(cls, header: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> "Stated":
@@ -59,16 +63,24 @@ class Stated:
             a, b = number(first), number(second)
             return None if a is None or b is None or not (a or b) else (a, b)
 
-        bent = any(abs(float(row.get(k) or 0.0)) > 1e-6 for row in rows for k in ("X", "Y"))
-        if bent or number("XCOMAX") or number("YCOMAX") or number("DELTAP"):
-            return cls(number("LENGTH"))
-        return cls(number("LENGTH"), pair("Q1", "Q2"), pair("DQ1", "DQ2"), number("ALFA") or None)
+        orbit = max([0.0, *(abs(float(row.get(k) or 0.0)) for row in rows for k in ("X", "Y")),
+                     *(abs(number(k) or 0.0) for k in ("XCOMAX", "YCOMAX"))])  # fmt: skip
+        if orbit > STRAIGHT or number("DELTAP"):
+            return cls(number("LENGTH"), orbit=orbit)
+        # of second order BV=-1 is not the reversed fields in MAD-X itself
+        slopes = None if number("BV_FLAG") == -1 else pair("DQ1", "DQ2")
+        return cls(number("LENGTH"), pair("Q1", "Q2"), slopes, number("ALFA") or None)
 
 
 def contradiction(ring: Ring, stated: Stated) -> str | None:
     """The first figure of the ring that differs from what its file states, with both numbers."""
     if stated.length is not None and abs(ring.length - stated.length) > 1e-3 + LENGTH * ring.length:
         return f"its elements are {ring.length:.6f} m long, the header states {stated.length:.6f} m"
+    if stated.orbit > STRAIGHT and not any(map(_kicks, ring.elements)):
+        return (
+            f"nothing in it bends the orbit, the table has one of {1e3 * stated.orbit:.3g} mm: "
+            "errors of elements are not in a table"
+        )
     if stated.tunes is None:
         return None
     chain = _maps(ring)
@@ -114,6 +126,14 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
             f"{_two(stated.chromaticity)}"
         )
     return None
+
+
+def _kicks(element: Element) -> bool:
+    """Whether an element may bend the orbit off the design's."""
+    corrector = element.kind in ("hcorrector", "vcorrector") and element.angle != 0
+    own = element.source
+    dipole = any(getattr(own, k, 0.0) for k in ("k0", "k0s"))
+    return corrector or dipole or element.errors != NO_ERRORS
 
 
 def _two(values: Iterable[float]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import LatticeError, plain
-from tmlattice.lattice.parts import MODELLED, Part, ring_of_parts
+from tmlattice.lattice.parts import MODELLED, Part, Report, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 from tmlattice.lattice.stated import Stated, contradiction
 
@@ -70,13 +70,16 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     mass = _number(header, "MASS") or ELECTRON_GEV
     charge = _number(header, "CHARGE") or 1.0
     rows: list[Row] = table.to_dict("records")
+    if _number(header, "BV_FLAG") == -1:  # all but the faces are of the reversed fields
+        rows = [row | {e: -row[e] for e in ("E1", "E2") if row.get(e)} for row in rows]
     stated = Stated.of_header(header, rows)
     said = ""
     for half in _readings(rows):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            parts = _with_drifts(path, rows, stated.length, half)
-            ring = ring_of_parts(parts, name, energy, mass, charge)
+            report = Report()
+            parts = _with_drifts(path, rows, stated.length, half, report)
+            ring = ring_of_parts(parts, name, energy, mass, charge, report)
         found = contradiction(ring, stated)
         if found is None:
             for w in caught:
@@ -112,7 +115,9 @@ def _number(header: dict[str, Any], key: str) -> float | None:
     return None if value is None else float(value)
 
 
-def _with_drifts(path: Path, rows: list[Row], length: float | None, half: bool) -> list[Part]:
+def _with_drifts(
+    path: Path, rows: list[Row], length: float | None, half: bool, report: Report
+) -> list[Part]:
     """The elements in their order, with drifts where the table has none."""
     close = CLOSE + DIGITS * (length or float(rows[-1]["S"]) if rows else 0.0)
     starts = {share: [r["S"] - share * r["L"] for r in rows] for share in (1.0, 0.5)}
@@ -131,14 +136,14 @@ def _with_drifts(path: Path, rows: list[Row], length: float | None, half: bool) 
     for row, start in zip(rows, starts[fits[0]], strict=True):
         if start - at > close:
             parts.append(Part("drift", "drift", {"l": start - at}))
-        parts.append(_part(path, row, half))
+        parts.append(_part(path, row, half, report))
         at = start + row["L"]
     if length is not None and length - at > close:
         parts.append(Part("drift", "drift", {"l": length - at}))
     return parts
 
 
-def _part(path: Path, row: Row, half: bool) -> Part:
+def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
     """One row of the table as an element."""
     name, keyword = str(row["NAME"]).lower(), str(row["KEYWORD"]).lower()
     length = float(row["L"])
@@ -163,12 +168,13 @@ def _part(path: Path, row: Row, half: bool) -> Part:
     strengths = {"knl": "K{}L", "ksl": "K{}SL"}
     for attribute, column in strengths.items():
         values = [float(row.get(column.format(n)) or 0.0) for n in ORDERS]
-        if keyword == "sbend":  # K0L of a bend is its whole field where it is not 0
+        if keyword == "sbend" and attribute == "knl":
             field, values[0] = values[0], 0.0
-            if attribute == "knl" and field:
+            if field:  # the whole field, where it is not that of the angle
                 own["k0"] = field / length
-            elif field:
-                values[0] = field
+        elif keyword == "sbend" and any(values):
+            report.left_out("skew fields of the SBEND (as in MAD-X's TWISS)", name)
+            continue
         if any(values):
             own[attribute] = values
     kept = MODELLED.get(keyword)
