@@ -1,5 +1,6 @@
 """The command as a user runs it: what it prints and writes, and how it ends on wrong input."""
 
+import contextlib
 import json
 import os
 import signal
@@ -315,6 +316,84 @@ def test_ctrl_c_ends_soon_with_nothing_half_written(tmp_path):
     assert time.monotonic() - sent < 10  # a second in life; a loaded test machine has its own pace
     assert "stopped" in errors
     assert list(tmp_path.iterdir()) == []
+
+
+WAITS_IN_A_SCAN = (
+    "import signal, time, tmlattice.cli.diagnose as diagnose, tmlattice.cli.progress as progress\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "progress.AFTER, progress.EVERY = 0.2, 0.05\n"
+    "def told(stage):\n"
+    "    progress.tell(stage)\n"
+    "    if stage == 'scan':\n"
+    "        print('it scans', flush=True)\n"
+    "        time.sleep(WAIT)\n"
+    "diagnose.tell = told\n"
+    "from tmlattice.cli.command import main\n"
+    "main()\n"
+)
+
+
+def on_a_terminal(code, *words, cwd, stop):
+    """Exit code, stdout, and what a terminal of 100 columns was sent."""
+    import fcntl
+    import struct
+    import termios
+
+    own, end = os.openpty()
+    fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, words)],
+        cwd=cwd, stdout=subprocess.PIPE, stderr=end, text=True,
+    )  # fmt: skip
+    os.close(end)
+    sent = b""
+    first = process.stdout.readline()
+    time.sleep(1.0)
+    if stop:
+        process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=120)
+    with contextlib.suppress(OSError):  # the terminal's other end is closed
+        while part := os.read(own, 4096):
+            sent += part
+    os.close(own)
+    return process.returncode, first + out, sent.decode()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX terminals")
+@pytest.mark.parametrize("stop", [False, True])
+def test_a_terminal_shows_the_progress_and_ctrl_c_writes_nothing(tmp_path, small_ring, stop):
+    from tmlattice import simulate, write_measurement
+
+    write_measurement(tmp_path / "day", simulate(small_ring, [], shots=3, seed=1).measurement())
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "report.txt").write_text("of yesterday")
+    words = ["diagnose", SMALL, "day", "--out", "out", "--json", "a.json"]
+    code = WAITS_IN_A_SCAN.replace("WAIT)", "60)" if stop else "1.5)")
+    exit_code, out, sent = on_a_terminal(code, *words, cwd=tmp_path, stop=stop)
+    assert "tmlattice diagnose: scan, " in sent
+    if not stop:
+        assert exit_code == 0
+        assert "written: out/" in out
+        assert "scan, " not in sent.rsplit("\r", 1)[-1]  # the line is gone
+        return
+    assert exit_code == 130
+    assert "stopped in 'scan'; nothing was written" in sent
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["day", "out"]
+    assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["of yesterday"]
+
+
+def test_no_progress_is_shown_where_there_is_no_terminal(tmp_path):
+    code = (
+        "import tmlattice.cli.progress as progress\n"
+        "progress.AFTER, progress.EVERY = 0.0, 0.01\n"
+        "from tmlattice.cli.command import main\n"
+        "main()\n"
+    )
+    words = [sys.executable, "-c", code, "simulate", SMALL, "--shots", "2", "--out", "day"]
+    done = subprocess.run(
+        [*map(str, words)], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tmlattice import diagnose
+from tmlattice import Cause, diagnose
 from tmlattice.fitting.launches import with_noise
 from tmlattice.machine import simulate
 
@@ -37,3 +37,21 @@ def test_a_fit_of_weights_takes_that_noise_too(small_ring, copied):
     found, estimated = with_noise(small_ring, copied)
     assert estimated
     assert found.noise == pytest.approx(np.full_like(found.noise, NOISE), rel=0.25)
+
+
+def test_noise_is_estimated_once_from_measurement_and_reference(small_ring):
+    """Small errors everywhere, which neighbours leave of one another, are not taken for noise."""
+    options = {"background": {"all": None}, "machine_seed": 7, "noise": NOISE, "amplitude": 4e-4,
+               "engine": "ocelot"}  # fmt: skip
+    before = simulate(small_ring, [], shots=5, seed=1, **options).measurement()
+    fault = Cause("quadrupole_gradient", "QD::5", -0.05)
+    after = simulate(small_ring, [fault], shots=5, seed=2, **options).measurement()
+    told = []
+    before, after = (replace(own, noise=None) for own in (before, after))
+    found = diagnose(small_ring, after, reference=before, progress=told.append)
+    assert found.noise == pytest.approx((NOISE, NOISE), rel=0.5)  # neighbours leave ten times it
+    assert found.noise_estimated
+    assert [(one.effect, one.element) for one in found.findings] == [(fault.effect, fault.element)]
+    own = found.findings[0]
+    assert abs(own.amount - fault.amount) < 4 * own.amount_sigma < 0.04
+    assert "reference" in told

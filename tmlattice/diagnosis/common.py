@@ -9,6 +9,9 @@ for that is found in the measurement; it is in both where the reference is the l
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.prepare import Prepared, prepare
 from tmlattice.diagnosis.strategy import Found, sought
@@ -19,6 +22,9 @@ from tmlattice.inference.search import Explanation, Search
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.first_turns import turns_of
+from tmlattice.observe.noise import scatter
+
+Array = NDArray[np.float64]
 
 MOST = 8
 """Causes of a reference at most."""
@@ -53,9 +59,17 @@ def sought_in(
     """
     common: tuple[Cause, ...] = ()
     before: Found | None = None
+    estimated = False
     if reference is not None:
+        both = prepare(ring, measurement, reference, radiation, effects, judgement)
+        progress = search_of(both).progress
+        if both.estimated:  # once, from both: of the same electronics
+            noise = scatter(both.problem.data, both.before.point.view)
+            if estimated := bool(np.isfinite(noise).all()):
+                measurement, reference = (_with(own, noise) for own in (measurement, reference))
+        progress("reference")
         alone = prepare(ring, reference, None, radiation, None, judgement)
-        first = Search(alone.problem, alone.hypotheses, MOST)
+        first = Search(alone.problem, alone.hypotheses, MOST, progress=progress)
         before = sought(ring, alone, first, background)
         common = _named(before.explanation.fit.causes)
     for _ in range(ROUNDS):
@@ -65,7 +79,14 @@ def sought_in(
         if not more:
             break
         common = (*common, *more)
-    return ready, found
+    return replace(ready, estimated=ready.estimated or estimated), found
+
+
+def _with(measured: Measurement, noise: Array) -> Measurement:
+    """The measurement with this noise, m, [2], where it states none."""
+    stated = np.full((len(measured.monitors), 2), np.nan)
+    stated = stated if measured.noise is None else np.asarray(measured.noise)
+    return replace(measured, noise=np.where(np.isfinite(stated), stated, noise))
 
 
 def _named(causes: tuple[Cause, ...]) -> tuple[Cause, ...]:

@@ -60,6 +60,47 @@ def estimate(data: Data, paths: Paths) -> Array:
     return np.array([_MAD * np.median(np.abs(p)) if len(p) > 20 else np.nan for p in planes])
 
 
+LEAST_FREEDOM = 2
+"""Shots beyond those that the errors between neighbours take up, to estimate a scatter."""
+LEAST_READINGS = 8
+"""Of the median: with two shots beyond, it is known to a fifth then."""
+
+
+def scatter(data: Data, paths: Paths) -> Array:
+    """rms noise of one reading from its scatter between shots, m, [2]; NaN without enough shots.
+
+    Static errors (offsets, gains, gradients between neighbours) leave the same of a reading in
+    every shot, or what is linear in the trajectory: that is fitted and taken out, so that small
+    errors are not taken for noise. The median over the readings does not see a fault that only
+    some of the shots have.
+
+    Args:
+        data: several shots of one machine.
+        paths: of the model, through them.
+    """
+    misfit, orbit = local_misfit(data, paths), paths.readings
+    variances: list[list[float]] = [[], []]
+    for plane in (0, 1):
+        for i in range(1, misfit.shape[1]):
+            there = np.isfinite(misfit[:, i, plane])
+            count = int(there.sum())
+            both = count >= 5 + LEAST_FREEDOM  # the other plane's too, where there are enough
+            columns = 4 if both else 2
+            freedom = count - columns - 1
+            if freedom < LEAST_FREEDOM:
+                continue
+            linear = orbit[there, i - 1 : i + 1][:, :, slice(None) if both else plane]
+            fixed = np.column_stack([np.ones(count), linear.reshape(count, columns)])
+            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), 1e-30)
+            left = misfit[there, i, plane]
+            left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
+            usual = (1 - 2 / (9 * freedom)) ** 3  # median of chi-square over its freedom
+            variances[plane].append(float(np.sum(left**2)) / freedom / usual)
+    return np.array([
+        np.sqrt(np.median(own)) if len(own) >= LEAST_READINGS else np.nan for own in variances
+    ])  # fmt: skip
+
+
 SCATTER = 3
 """Passes beyond those that errors of monitors and magnets take up: a constant, and what is in
 proportion to the trajectory in its plane (or in both, where there are enough)."""
