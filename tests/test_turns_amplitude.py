@@ -1,0 +1,122 @@
+"""What the amplitude does to turns: the tracked design against AT; no fault is made of it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import machine_data
+import numpy as np
+import pytest
+from conftest import SMALL
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause, diagnose, load_ring
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.nonlinear import nonlinear_turn, track
+from tmlattice.beam.stored import StoredBeam
+from tmlattice.errors import MeasurementError
+from tmlattice.inference.newton import fit
+from tmlattice.machine.at_engine import AtEngine
+from tmlattice.machine.stored_beam import simulate_turns
+from tmlattice.observe.spectra import lines
+from tmlattice.observe.stored import cavities_of
+from tmlattice.observe.turn_by_turn import many_turns
+
+SHIPPED = Path(machine_data.__file__).parent
+OCTUPOLES = 'Octupole(l=0.3, k3=4e3, tilt=0.3, eid="oct"), d, generated_b'
+
+
+@pytest.fixture(scope="module")
+def small_with_octupole(tmp_path_factory):
+    """The small ring with a tilted octupole, a tilted sextupole and two cavities."""
+    text = SMALL.read_text().replace("[d, generated_b", f"[d, {OCTUPOLES}")
+    text = text.replace('k2=-9.0, eid="sd")', 'k2=-9.0, tilt=0.05, eid="sd")')
+    text = text.replace(
+        "back, wiggler", "back, Cavity(l=0.3, v=2.5e-3, freq=5e8, eid='rf'), wiggler"
+    )
+    path = tmp_path_factory.mktemp("octupole") / "ring.py"
+    path.write_text(text)
+    with pytest.warns(UserWarning, match="octupoles"):
+        return load_ring(path)
+
+
+def tracked(ring, launch, turns):
+    """Turns of the tracked design after a kick [4], [turn, monitor, 2]."""
+    model = ResponseModel(ring)
+    state = model.state.copy()
+    state[:4] += launch
+    way = nonlinear_turn(model.layers)
+    return track(state[None], turns, way, model.maps, cavities_of(ring, model))[0]
+
+
+@pytest.mark.parametrize("launch", [(2e-3, 0, 1e-3, 0), (-1e-3, 1e-4, 2e-3, -1e-4)])
+def test_turns_follow_at_through_octupoles_and_tilted_sextupoles(small_with_octupole, launch):
+    ring = small_with_octupole
+    whole = tracked(ring, launch, 2).reshape(-1, 2)
+    engine = AtEngine(ring)
+    launches = np.zeros((1, 6))
+    launches[0, :4] = launch
+    first = engine.track(launches, 1)[0, 0]
+    count = len(ring.monitors)
+    without = tracked(
+        replace(ring, elements=tuple(_drift(e) for e in ring.elements)), launch, 1
+    ).reshape(-1, 2)
+    last = slice(count - 2, count)  # behind the octupole
+    kicked = np.abs(first[last] - without[last]).max()
+    assert kicked > 1e-7
+    assert np.abs(first[last] - whole[last]).max() < 0.05 * kicked
+
+
+def _drift(element):
+    return element.changed(k3=0.0) if element.kind == "octupole" else element
+
+
+def test_tunes_shift_with_amplitude_as_in_at(small_with_octupole):
+    """Sextupoles, an octupole, and the RF that holds the time of a longer way."""
+    ring = small_with_octupole
+    model = ResponseModel(ring)
+    beam = StoredBeam(model, cavities_of(ring, model))
+    shifts = []
+    kick = np.array([2e-4, 2e-4])
+    for size in (1.0, 0.01):
+        data = simulate_turns(ring, kick=size * kick, turns=512, noise=0.0).measured
+        launch = np.array([0.0, size * kick[0], 0.0, size * kick[1]])
+        own = replace(data, readings=tracked(ring, launch, 512)[None])
+        shifts.append([lines(one, near=beam.tunes).tune[0] for one in (data, own)])
+    by_at, by_model = np.array(shifts[0]) - np.array(shifts[1])
+    assert np.abs(by_at).min() > 1e-5
+    assert_allclose(by_model, by_at, rtol=0.03, atol=2e-7)
+
+
+@pytest.mark.parametrize("amplitude", [2e-4, 1e-3, 5e-3])
+def test_chi_square_of_a_healthy_ring_is_right_at_every_amplitude(small_ring, amplitude):
+    turns = simulate_turns(small_ring, amplitude=amplitude, turns=600, seed=4).measured
+    problem = many_turns(small_ring, turns, {})
+    found = fit(problem, (), problem.first)
+    assert found.chi2 < problem.freedom + 4 * np.sqrt(2 * problem.freedom)
+    assert found.chi2 > 0.6 * problem.freedom
+    pulls = found.point.nuisances[0, :, 2] / problem.shift.error[0]
+    assert np.abs(pulls).max() < 1  # the shift is AT's to less than a tenth
+    linear = replace(problem, shift=replace(problem.shift, modes=0 * problem.shift.modes,
+                                            tunes=0 * problem.shift.tunes))  # fmt: skip
+    without = fit(linear, (), linear.first).chi2 - found.chi2
+    if amplitude > 1e-3:
+        assert without > 100  # what a fault would be made of
+
+
+def test_nothing_is_found_in_a_healthy_ring_at_the_default_amplitude(petra3):
+    assert diagnose(petra3, simulate_turns(petra3, seed=0).measured).verdict == "nothing"
+
+
+def test_a_quadrupole_is_found_at_a_large_amplitude(small_ring):
+    weak = Cause("quadrupole_gradient", "QD::3", -0.01)
+    turns = simulate_turns(small_ring, [weak], amplitude=2e-3, turns=600, seed=2).measured
+    found = diagnose(small_ring, turns)
+    assert found.findings[0].element == "QD::3"
+
+
+def test_an_amplitude_beyond_second_order_is_said():
+    with pytest.warns(UserWarning, match="octupoles"):
+        ring = load_ring(SHIPPED / "hmba.mat", correctors="SH*")
+    turns = simulate_turns(ring, amplitude=2e-3, turns=256, seed=0).measured
+    with pytest.raises(MeasurementError, match=r"an oscillation of 2 mm rms is too large"):
+        diagnose(ring, turns)
