@@ -44,8 +44,8 @@ def place_text(finding: Finding) -> str:
     return f"s = {finding.s:.2f} m; from {span}{between}"
 
 
-LARGER = 1.5
-"""Times what is left after, from which what was left before is no noise."""
+LARGER = 1.2
+"""Times the chi-square after, from which that before is no noise alone."""
 
 NOT_HELD_OUT = "Nothing was held out: nobody but the fit judges the gap"
 
@@ -67,10 +67,10 @@ def closed_text(diagnosis: Diagnosis) -> str:
             "The beam of held-out shots is lost in one of the models, so they do not judge the gap"
         )
     before, after = gap.misfits[gap.since], gap.misfits[-1]
-    if gap.closed is None and before.rms > LARGER * after.rms:
+    if gap.closed is None and before.chi2_per_dof > LARGER * after.chi2_per_dof:
         return (
             f"Held-out readings are left with {micrometres(before.rms)} before and "
-            f"{micrometres(after.rms)} after; their launches leave open how much of that is closed"
+            f"{micrometres(after.rms)} after: too little to say which share of the gap is closed"
         )
     if gap.closed is None:
         return "Held-out readings show no gap beyond the noise, so there is none to close"
