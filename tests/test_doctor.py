@@ -130,7 +130,9 @@ SICK = {
 def test_healthy_data_of_a_sick_machine_tell_nothing(small_ring, kind):
     causes, options = SICK[kind]
     data = simulate(small_ring, causes, **{"shots": 6, "seed": 5, **options}).measurement()
-    assert [check.sentence for check in check_data(small_ring, data).told] == []
+    told = check_data(small_ring, data).told
+    assert [check.sentence for check in told if check.name != "noise"] == []
+    assert all("shots do not show which" in check.sentence for check in told)  # small errors
 
 
 def test_few_monitors_tell_nothing(small_ring, healthy):

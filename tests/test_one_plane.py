@@ -152,3 +152,17 @@ def test_a_weak_quadrupole_is_found_with_a_stored_beam_in_one_plane(small_ring, 
     (finding,) = result.findings
     members = {(m.effect, m.element): m.amount for m in finding.credible_set}
     assert members[cause.effect, cause.element] == pytest.approx(-0.02, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "cause", [Cause("quadrupole_roll", "QD::5", 0.05), Cause("monitor_roll", "bpm::9", 0.1)]
+)
+def test_what_passes_an_unknown_orbit_on_has_no_amount(small_ring, cause):
+    """Half of the other orbit and twice the roll read the same."""
+    result = diagnose(small_ring, measured(small_ring, [cause], "x", launches_known=False))
+    assert all(finding.effect is None for finding in result.findings)
+    known = diagnose(small_ring, measured(small_ring, [cause], "x"))
+    assert any(
+        (m.effect, m.element) == (cause.effect, cause.element)
+        for finding in known.findings for m in finding.credible_set
+    )  # fmt: skip

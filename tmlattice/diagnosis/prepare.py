@@ -39,6 +39,9 @@ SMALL = 1e-5
 ALONE = 1e-6
 """Square of the share of a signature in a plane below which there is nothing of it: sextupoles make
 1e-8 along small trajectories, and coupling of the thousandth part of an orbit is seen."""
+PASSED_ON = 0.05
+"""Share of a signature's square that turns its sign with the other plane's orbit, above which an
+unknown orbit is part of the amount; of a gradient where a tenth of the orbit couples it is 0.02."""
 CHUNK = 256
 """Hypotheses whose signatures are made at a time."""
 COPIES = 16
@@ -110,7 +113,7 @@ def prepare(
     said = (*said, *floor)
     problem = replace(problem, data=data, white=None)
     before = _on_its_way(fit(problem, (), start.nuisances, steps=STEPS), ring)
-    hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data.planes))
+    hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
     return Prepared(problem, before, hypotheses, known, dead, noise, estimated, said)
 
 
@@ -142,29 +145,32 @@ def batch(ring: Ring, measurement: Measurement, said: list[str]) -> Measurement:
     return measurement.select(shots=[measurement.shots[i] for i in taken])
 
 
-def _determined(
-    ring: Ring, hypotheses: Sequence[Hypothesis], planes: NDArray[np.bool_]
-) -> list[Hypothesis]:
-    """Those that the planes [2] that were read determine.
+def _determined(ring: Ring, hypotheses: Sequence[Hypothesis], data: Data) -> list[Hypothesis]:
+    """Those that the planes that were read determine.
 
     In the other plane the orbit is unknown all along the ring, so what acts there alone cannot be
     determined by what sextupoles make of it. Along small trajectories that part vanishes. The
-    energy is the focusing's in both planes.
+    energy is the focusing's in both planes. Where launches in the other plane are unknown too, so
+    is what passes its orbit on: a rolled BPM, a skew gradient.
     """
+    planes = data.planes
     if planes.all():
         return list(hypotheses)
-    model = Model(ring, [{}, {}])
+    unread = np.repeat(~planes, 2)
+    unknown = bool(np.isinf(data.launch_sigma[:, :4][:, unread]).all())
     launches = SMALL * np.array([[1.0, 0, 1.0, 0, 0], [0, 0.1, 0, 0.1, 0]])
+    launches = np.concatenate([launches, launches * np.append(np.where(unread, -1, 1), 1)])
+    model = Model(ring, [{}] * len(launches))
     paths = model.paths(launches, ())
     found: list[Hypothesis] = []
     for start in range(0, len(hypotheses), CHUNK):
         some = hypotheses[start : start + CHUNK]
-        squares = np.nan_to_num(model.signatures(paths, some, launches)) ** 2
-        read = squares.sum(axis=(1, 2)) @ np.array([planes, ~planes]).T  # [hypothesis, read or not]
-        found += [
-            h for h, (seen, other) in zip(some, read, strict=True)
-            if seen >= ALONE * other or find(h[0]).energy
-        ]  # fmt: skip
+        made = np.nan_to_num(model.signatures(paths, some, launches))
+        seen = made[..., planes]
+        read, other = (np.sum(own**2, axis=(1, 2, 3)) for own in (seen, made[..., ~planes]))
+        turned = np.sum((seen[:, :2] - seen[:, 2:]) ** 2, axis=(1, 2, 3))  # with the other orbit
+        keep = (read >= ALONE * other) & ~(unknown & (turned > PASSED_ON * read))
+        found += [h for h, own in zip(some, keep, strict=True) if own or find(h[0]).energy]
     return found
 
 

@@ -327,8 +327,9 @@ def _said(
     """What a reader should know, each once."""
     found = [*said, *ready.said, *told.said]
     if ready.estimated:
-        x, y = map(micrometres, noise)
-        found.append(f"the noise was estimated from the data: {x} in x, {y} in y")
+        both = zip(noise, "xy", strict=True)
+        levels = [f"{micrometres(own)} in {plane}" for own, plane in both if np.isfinite(own)]
+        found.append(f"the noise was estimated from the data: {', '.join(levels)}")
     read = ready.problem.data.planes
     if not read.all() and any(finding.effect is None for finding in told.findings):
         unread, other = ("x", "y") if read[1] else ("y", "x")
