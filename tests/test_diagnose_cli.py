@@ -242,8 +242,9 @@ def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, sch
                    "the remedy is the same"]),
         ("equivalent", ["alternatives: sextupole sd::5", "or else"]),
         ("located", ["no effect of the catalogue explains it", "Next: Inspect this section",
-                     "(bpm::5, QD::5, end_5)", "has no amount, so the gap of held-out readings stays"]),
-        ("nothing", ["No error is detected", "Would have been seen", "wrong strength of a quadrupole"]),
+                     "(bpm::5, QD::5, end_5)", "the gap of held-out readings stays"]),
+        ("nothing", ["No error is detected", "Would have been seen",
+                     "wrong strength of a quadrupole"]),
         ("distributed", ["all along the ring", "faults that small errors hide", "--reference"]),
     ],
 )  # fmt: skip
