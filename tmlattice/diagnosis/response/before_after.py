@@ -48,6 +48,7 @@ from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.response.what_changed import MOST, REPRODUCED, what_changed
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.support import FREE
 from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
@@ -166,12 +167,17 @@ def diagnose_change(
     told: list[Told] = list(zip(causes, known, strict=True))
     found = strongest_first([*named, *pairs])
     have = {(cause.effect, cause.element) for cause in causes}
-    told += [row for row in drifts(whole) if (row[0].effect, row[0].element) not in have]
+    supports = [FREE] * len(told)
+    for row, support in drifts(whole):
+        if (row[0].effect, row[0].element) not in have:
+            told.append(row)
+            supports.append(support)
     return as_diagnosis(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
         verdict=least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
         warnings=(*said, *_said(data, fit, whole, scatter)),
+        supports=tuple(supports),
         noise_estimated=True,
         provenance=provenance(ring, options, seed, started),
     )  # fmt: skip

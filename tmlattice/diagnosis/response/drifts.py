@@ -10,7 +10,10 @@ from tmlattice.diagnosis.families.steps import CHANGES
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.stated import unwidened
+from tmlattice.diagnosis.response.told import with_support
 from tmlattice.diagnosis.result import Finding
+from tmlattice.diagnosis.support import Support
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
@@ -21,24 +24,23 @@ DRIFT, OUTSTANDING = 0.03, 8.0
 as others do."""
 
 
-def drifts(state: State) -> list[Told]:
-    """What monitors and correctors do otherwise than before, with errors."""
-    found: list[Told] = []
+def drifts(state: State) -> list[tuple[Told, Support]]:
+    """Changes of BPMs and correctors since the reference, with errors, and how much of each comes
+    from the data."""
+    found: list[tuple[Told, Support]] = []
     for block in (0, 1):
         own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
         if not own:
             continue
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
-        for name, family in own.items():
-            sigma = posterior.sigma[there.where[name]]
-            found += family.told(state.at.errors, state.values[name], sigma, state.data)
+        found += with_support(state, own.values(), there, unwidened(posterior))
     return found
 
 
 def outstanding(state: State, judgement: Judgement) -> list[Finding]:
     """Monitors and correctors whose change is another thing than everybody's drift."""
-    told = drifts(state)
+    told = [row for row, _ in drifts(state)]
     found = []
     for effect in dict.fromkeys(cause.effect for cause, _ in told):
         rows = [row for row in told if row[0].effect == effect]

@@ -37,6 +37,13 @@ class Stated(NamedTuple):
     covariance: Array
 
 
+def unwidened(posterior: Posterior) -> Stated:
+    """The posterior's own."""
+    prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
+    covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
+    return Stated(posterior.sigma, prior, covariance)
+
+
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
     """Posterior errors, widened by what readings share (`of_readings`), by what the sizes of
     families are unknown by (`of_sizes`), and by members that may be faulty (`heavy_tails`).

@@ -1,6 +1,6 @@
 """What a hierarchical fit of an orbit response found, as causes with errors."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from tmlattice.diagnosis.correlations import Correlation, correlations_of
 from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.stated import stated
+from tmlattice.diagnosis.response.stated import Stated, stated
 from tmlattice.diagnosis.support import Support, share_from_data
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.problem import Hypothesis
@@ -37,17 +37,10 @@ def told(
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
         known = stated(state, block, there, posterior)
-        numbers = _numbers(state, families.values(), there)
-        for name, family in families.items():
-            own, values = there.where[name], state.values[name]
-            rows = family.told(state.at.errors, values, known.sigma[own], state.data)
-            # the errors before the data in the units of the causes
-            before = family.told(state.at.errors, values, known.prior[own], state.data)
-            for row, (_, prior) in zip(rows, before, strict=True):
-                if row[0].amount == 0 and row[1] == 0:
-                    continue
+        for row, support in with_support(state, families.values(), there, known):
+            if row[0].amount != 0 or row[1] != 0:
                 found.append(row)
-                supports.append(_support(row, prior, own, known.covariance, numbers))
+                supports.append(support)
         pairs += _correlated(state, families.values(), there, known.covariance)
         if block == 0:
             said = _degenerate(state, there, posterior)
@@ -71,6 +64,26 @@ def _correlated(
     if not numbers:
         return ()
     return correlations_of(amounts, covariance[np.ix_(numbers, numbers)])
+
+
+def with_support(
+    state: State, families: Collection[Family], there: Linear, known: Stated
+) -> Iterator[tuple[Told, Support]]:
+    """Yield the causes of some families of a block, and how much of each comes from the data.
+
+    Args:
+        state, there: where the fit stands, and `linear` of the block.
+        families: with a variable each.
+        known: what is stated of the numbers of the block.
+    """
+    numbers = _numbers(state, families, there)
+    for family in families:
+        own, values = there.where[family.variable], state.values[family.variable]
+        rows = family.told(state.at.errors, values, known.sigma[own], state.data)
+        # the errors before the data in the units of the causes
+        before = family.told(state.at.errors, values, known.prior[own], state.data)
+        for row, (_, prior) in zip(rows, before, strict=True):
+            yield row, _support(row, prior, own, known.covariance, numbers)
 
 
 Hypotheses = Mapping[int, Mapping[Hypothesis, float]]
