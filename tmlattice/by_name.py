@@ -35,14 +35,15 @@ def by_name(function: F) -> F:
         for name in wanted:
             given_to = given if name in given else given.get("options", {})
             value = given_to.get(name)
+            ring = given.get("ring", given.get("options", {}).get("ring"))
             if name == "ring":
                 if _is_path(value):
-                    given[name] = _ring(value)
+                    given_to[name] = _ring(value)
             elif _is_path(value):
-                given_to[name] = _open.function(value, given.get("ring"))
+                given_to[name] = _open.function(value, ring)
             elif isinstance(value, Mapping):
                 given_to[name] = {
-                    key: _open.function(own, given.get("ring")) if _is_path(own) else own
+                    key: _open.function(own, ring) if _is_path(own) else own
                     for key, own in value.items()
                 }
         return function(*bound.args, **bound.kwargs)
