@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tmlattice.beam.nonlinear import nonlinear_turn, track
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.errors import first_of
-from tmlattice.harmonics import MIN_TURNS
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
@@ -26,10 +25,9 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Flags = NDArray[np.bool_]
 
-TURNS = 1024
-"""Most turns that are tracked: some periods of the synchrotron motion that a longer way starts."""
-FEW_TURNS = 128
-"""From which an amplitude is read."""
+TURNS = (256, 1024)
+"""Fewest and most turns that are tracked, else as many as were measured: a line is read well of the
+first; the second hold some periods of the synchrotron motion that a longer way starts."""
 NEARLY = 0.5
 """Most by which a kick is corrected, as a share of it."""
 SMALL = 1e-2
@@ -116,8 +114,8 @@ def _tracked(
     way, maps = nonlinear_turn(beam.model.layers), beam.model.maps
     names = tuple(monitor.name for monitor in ring.monitors)
 
-    def seen(launched: ComplexArray, most: int) -> tuple[ComplexArray, Lines, Flags]:
-        readings = track(beam.launched(launched), min(turns, most), way, maps, beam.rf)
+    def seen(launched: ComplexArray, turns: int) -> tuple[ComplexArray, Lines, Flags]:
+        readings = track(beam.launched(launched), turns, way, maps, beam.rf)
         kept: Flags = np.asarray(np.isfinite(readings).reshape(len(readings), -1).all(axis=1))
         readings[~kept] = readings[-1]
         found = lines(TurnByTurn(readings=readings, monitors=names), beam.tunes, at)
@@ -125,10 +123,10 @@ def _tracked(
         return np.asarray(unit / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))), found, kept
 
     # a kick is no pure mode: sextupoles make its lines by some percent larger or smaller
-    unit, *_ = seen(wanted, FEW_TURNS)
+    unit, *_ = seen(wanted, TURNS[0])
     ratio = wanted / np.where(unit == 0, np.nan, unit)
     good = np.abs(ratio - 1) < NEARLY
-    unit, found, kept = seen(wanted * np.where(good, ratio, 1.0), TURNS)
+    unit, found, kept = seen(wanted * np.where(good, ratio, 1.0), turns)
     return found.amplitude / unit[:, None, None], found.tune, kept
 
 
@@ -140,7 +138,7 @@ def _fill(
     spread = _spread(found, shots)
     size = amplitude * np.sqrt(spread.mean(axis=2))
     scales = (1.0, np.sqrt(0.5), SMALL)
-    turns = max(int(found.turns[shots].max()), MIN_TURNS)
+    turns = int(np.clip(found.turns[shots].max(), *TURNS))
     wanted = np.concatenate([scale * size for scale in scales])
     both = _tracked(ring, beam, wanted, turns, at)
     modes, tunes, kept = (own.reshape(len(scales), len(shots), *own.shape[1:]) for own in both)
