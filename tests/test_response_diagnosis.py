@@ -294,7 +294,8 @@ def test_what_the_fit_may_not_mend_is_warned_about(small_ring):
     found = diagnose(small_ring, measured, seed=1, effects=["monitor_gain_x"])
     assert found.verdict == "distributed"
     assert {cause.effect for cause in found.causes} <= {"monitor_gain_x", "monitor_gain_y"}
-    assert any("fitted, in-plane" in warning for warning in found.warnings)
+    assert found.assessment.remainder == "effect_missing"
+    assert "fitted, in-plane" in [block.name for block in found.assessment.significant]
 
 
 def test_options_act_and_are_told(small_ring, measured):
@@ -572,7 +573,7 @@ def test_report_and_json(small_ring, result):
     text = report_text(result)
     assert "NAMED: 5 faults" in text  # and no small errors beside them
     assert "QD::5" in text
-    (line,) = (line for line in text.splitlines() if line.startswith("beta beat, rms [%]"))
+    (line,) = (line for line in text.splitlines() if line.startswith("beta beating, rms [%]"))
     told = [float(word) for word in line.split()[-3::2]]
     sick = apply(small_ring, [c for c in CAUSES if c.effect == "quadrupole_gradient"])
     expected, design = (twiss(TaylorNetwork.from_ring(ring)).beta for ring in (sick, small_ring))

@@ -5,6 +5,7 @@ import pytest
 
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.suspects import numbers
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -12,7 +13,7 @@ from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.observe.steady import NOTHING
-from tmlattice.report.amounts import all_of, numbers
+from tmlattice.report.amounts import all_of
 
 
 def measured(ring, causes, **options):
@@ -168,5 +169,6 @@ def test_one_number_of_several_places_is_told_once():
         (Cause("vertical_focusing", "c::3", 0.0), 0.0),
     ]
     rows = numbers(told)
-    assert [all_of(places) for places, _ in rows] == ["b::1 and 1 alike", "c::1", "c::2", "c::3"]
+    said = [all_of([place.element for place in places], {}) for places, _ in rows]
+    assert said == ["b::1 and 1 alike", "c::1", "c::2", "c::3"]
     assert [sigma for _, sigma in rows] == [1e-4, 2e-4, 0.0, 0.0]

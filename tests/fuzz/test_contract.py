@@ -56,7 +56,7 @@ def test_one_wrong_reading_does_not_spoil_the_others(inputs):
     orbit[2, 0] += 0.02
     found = diagnose(ring, replace(measured, rf=replace(measured.rf, orbit=orbit)))
     assert found.fit_after.rms <= found.fit_before.rms
-    assert any("fitted, RF" in said for said in found.warnings)
+    assert "fitted, RF" in [block.name for block in found.assessment.significant]
 
 
 def test_killed_commands_and_full_disks_leave_nothing_half_written(tmp_path):
