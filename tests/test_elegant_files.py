@@ -286,7 +286,7 @@ def test_use_says_which_line(tmp_path):
     path = write(tmp_path, text)
     assert load_ring(path, energy=3.0).length == pytest.approx(42.4 / 4)
     assert load_ring(path, sequence="ring", energy=3.0).length == pytest.approx(42.4)
-    with pytest.raises(LatticeError, match="USE, NO, which no sequence or line is"):
+    with pytest.raises(LatticeError, match=r"USE of .* names NO, which no sequence or line"):
         load_ring(write(tmp_path, text.replace("USE, OTHER", "USE, NO")), energy=3.0)
     path = write(tmp_path, text.replace("USE, OTHER", "").replace("RING", "HALVES"))
     with pytest.raises(LatticeError, match="has the sequences HALVES, OTHER; name one"):

@@ -58,6 +58,15 @@ REFUSED = {
     "result": (PLAIN + "qf, k1=table(twiss, qf, k1l);", r"TABLE\(\) reads a result"),
     "range": (PLAIN + "use, sequence=ring, range=qf/qd;", "USE with a RANGE takes a part"),
     "beam-beam": (with_element("b: beambeam, charge=1, at=4.95;"), "BEAMBEAM 'b' .* by its CHARGE"),
+    "beam-beam by default": (with_element("b: beambeam, at=4.95;"), "BEAMBEAM 'b' .* by its"),
+    "install": (
+        PLAIN + "seqedit, sequence=cell; install, element=qf; endedit;", "AT is missing"
+    ),
+    "call": (PLAIN + "call;", "it calls"),
+    "nested branches": (
+        PLAIN + "if (1 == 1) { if (1 == 2) { qf, k1=2; } } else { frobnicate; } wrong;",
+        "no element or command 'wrong'",
+    ),
     "rotation": (
         with_element("y: yrotation, angle=1e-3, at=4.95;"), "YROTATION 'y' .* by its ANGLE"
     ),

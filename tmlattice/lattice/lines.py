@@ -143,7 +143,7 @@ def chosen(
     if used:
         if used.casefold() not in known:
             raise LatticeError(
-                f"'{path}' says USE, {plain(used, 60)}, which no sequence or line is"
+                f"USE of '{path}' names {plain(used, 60)}, which no sequence or line is"
             )
         return known[used.casefold()]
     if "ring" in known:

@@ -49,16 +49,9 @@ NO_STATEMENT = frozenset({
     "dynap", "sodd", "sixtrack", "dumpsequ", "create", "fill", "readtable", "readmytable",
     "setplot", "resplot", "usemonitor", "usekick", "chdir", "rename", "copyfile", "removefile",
     "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
-    "ptc_create_universe", "ptc_create_layout", "ptc_end", "ptc_twiss", "ptc_normal", "ptc_track",
-    "ptc_track_end", "ptc_observe", "ptc_start", "ptc_setswitch", "ptc_align", "ptc_trackline",
-    "ptc_printparametric", "ptc_printframes", "ptc_select", "ptc_select_moment", "ptc_dumpmaps",
-    "ptc_eplacement", "ptc_enforce6d", "ptc_knob", "ptc_moments", "ptc_read_errors", "ptc_script",
-    "ptc_setcavities", "ptc_setfieldcomp", "ptc_open_gino", "ptc_export_xml", "ptc_rviewer",
-    "ptc_oneturnmap", "ptc_varyknob", "ptc_setknobvalue", "ptc_refreshtables", "ptc_move_to_layout",
-    "ptc_setaccel_method", "ptc_gino", "ptc_select_checking", "ptc_refresh_k", "ptc_getnfieldcomp",
-    "set", "error", "help_", "resbeam_", "use_macro", "setvars_lin_", "select_ptc_",
+    "set", "error",
 })  # fmt: skip
-"""Statements that leave the ring as it is."""
+"""Statements that leave the ring as it is, as do all that begin with PTC_."""
 NOT_RUN = {
     "system": "SYSTEM is not run",
     "makethin": "MAKETHIN is not carried out: magnets stay thick",
@@ -115,7 +108,6 @@ class _Node:
 @dataclass
 class _Sequence:
     name: str
-    where: str
     length: Evaluate
     refer: str = "centre"
     refpos: str = ""
@@ -205,7 +197,6 @@ class _Reader:
         self._count = 0
         self._work = 0
         self._depth = 0
-        self._reflected = False
 
     # --- what expressions ask for ---------------------------------------------------------------
     def work(self, steps: int = 1) -> None:
@@ -277,16 +268,14 @@ class _Reader:
             self.work(10)
             try:
                 self._carry_out(statement)
-            except LatticeError as error:
+            except (LatticeError, ArithmeticError, ValueError, TypeError, LookupError) as error:
                 if "in the statement" in str(error):
                     raise
-                shown = plain(statement.text, 100)
-                raise LatticeError(f"{error} (in the statement '{shown}', {self._where(statement)})"
-                                   ) from error  # fmt: skip
-            except (ArithmeticError, ValueError, TypeError, IndexError) as error:
-                shown = plain(statement.text, 100)
+                why = str(error) or type(error).__name__
+                if isinstance(error, KeyError):
+                    why = f"{str(error.args[0]).upper()} is missing"
                 raise LatticeError(
-                    f"{error or type(error).__name__} (in the statement '{shown}', "
+                    f"{why} (in the statement '{plain(statement.text, 100)}', "
                     f"{self._where(statement)})"
                 ) from error
 
@@ -315,14 +304,14 @@ class _Reader:
         if match:
             # worked out at once even after `:=`, as MAD-X does
             owner, given = unquoted(match[1]).lower(), Given(match[4])
-            return self._set(owner, {match[2].lower(): given}, statement)
+            return self._set(owner, {match[2].lower(): given})
         match = re.fullmatch(r"([\w.$%]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
                              re.DOTALL)  # fmt: skip
         if match:
             if match[2]:
                 raise LatticeError("lines and elements with arguments are not read; write them out")
             return self._define(unquoted(match[1]).lower(), match[3], statement)
-        return self._command(text, statement)
+        return self._command(text)
 
     def _assign(self, name: str, given: Given) -> None:
         text = given.text.strip()
@@ -346,10 +335,10 @@ class _Reader:
             return
         if word == "elseif" and self._branched:
             return
-        true = holds(condition, self)
-        if true:
+        holding = holds(condition, self)
+        if holding:
             self._read_text(body)
-        self._branched = true  # after what stands inside
+        self._branched = holding  # also where blocks inside have changed it
 
     _branched = False
 
@@ -365,10 +354,10 @@ class _Reader:
         given = attributes(items)
         word = unquoted(head).lower()
         if word == "sequence":
-            return self._begin(name, given, statement)
+            return self._begin(name, given)
         if word not in KEYWORDS and word not in self.elements:
             if word in NO_STATEMENT or word in ("beam", "select", "call", "use", *REFUSED):
-                return self._command(rest, statement)
+                return self._command(rest)
             raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
         parent = self.elements.get(word)
         own = dict(parent.values) if parent else {}
@@ -403,7 +392,7 @@ class _Reader:
             return lambda names: values(given, names)
         return compiled(text)
 
-    def _set(self, owner: str, given: dict[str, Given], statement: Statement) -> None:
+    def _set(self, owner: str, given: dict[str, Given]) -> None:
         """`owner->attribute = value`, and an element that is named again with other values."""
         if owner == "beam" or owner.startswith("beam%"):
             raise LatticeError("MAD-X leaves its beam as it is here; state it by BEAM")
@@ -427,7 +416,7 @@ class _Reader:
         return lambda names: value
 
     # --- commands -------------------------------------------------------------------------------
-    def _command(self, text: str, statement: Statement) -> None:
+    def _command(self, text: str) -> None:
         match = re.match(r"\"[^\"]*\"|[\w.$%]+", text)
         if match is None:
             raise LatticeError("no element or command begins so")
@@ -481,7 +470,7 @@ class _Reader:
             if word in self.elements:
                 self._update(self.elements[word], given)
             elif "at" not in given:
-                return self._set(word, given, statement)
+                return self._set(word, given)
             if self._open is not None and "at" in given:
                 return self._place(word, given)
             if self._open is not None and word in self.elements and not given:
@@ -490,7 +479,7 @@ class _Reader:
         raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
 
     def _call(self, given: dict[str, Given]) -> None:
-        called = unquoted(given["file"].text if "file" in given else next(iter(given)))
+        called = unquoted(given["file"].text if "file" in given else next(iter(given), ""))
         folders = [self._files[-1].parent, self._files[0].parent]
         found = [folder / called for folder in folders if (folder / called).is_file()]
         self._read_file(found[0] if found else folders[0] / called)
@@ -539,7 +528,7 @@ class _Reader:
             raise LatticeError(f"USE names '{plain(self.used, 60)}', which no sequence or line is")
 
     # --- sequences ------------------------------------------------------------------------------
-    def _begin(self, name: str, given: dict[str, Given], statement: Statement) -> None:
+    def _begin(self, name: str, given: dict[str, Given]) -> None:
         if self._open is not None:
             raise LatticeError(f"SEQUENCE '{self._open.name}' has no ENDSEQUENCE before this one")
         if "l" not in given:
@@ -547,7 +536,7 @@ class _Reader:
         for word in ("next_sequ", "add_pass"):
             if word in given and unquoted(given[word].text) not in ("", "0"):
                 raise LatticeError(f"{word.upper()} of a sequence is not read")
-        self._open = _Sequence(name, self._where(statement), self._evaluate(given["l"]))
+        self._open = _Sequence(name, self._evaluate(given["l"]))
         if "refer" in given:
             self._open.refer = _refer(given["refer"])
         if "refpos" in given:
@@ -557,9 +546,7 @@ class _Reader:
 
     def _place(self, name: str, given: dict[str, Given]) -> None:
         """An element's place in the sequence that is open."""
-        if self._open is None:
-            return
-        if "at" not in given:
+        if self._open is None or "at" not in given:
             return
         origin = unquoted(given["from"].text).lower() if "from" in given else ""
         self._open.nodes.append(_Node(name, self._evaluate(given["at"]), origin))
@@ -853,7 +840,7 @@ class _Reader:
                 what = f"{attribute.upper()} of the {keyword.upper()} (as in MAD-X's TWISS)"
                 self.report.left_out(what, definition.name)
         if float(beam.given.get("bv", 1.0)) == -1:
-            own = _reversed_fields(keyword, own)
+            own = _reversed_fields(own)
         return Part(definition.name, keyword, own, definition.where)
 
 
@@ -868,7 +855,7 @@ _ODD = ("angle", "k0", "k1", "k2", "k3", "k0s", "k1s", "k2s", "k3s", "ks", "ksi"
         "kick", "knl", "ksl", "e1", "e2", "h")  # fmt: skip
 
 
-def _reversed_fields(keyword: str, own: dict[str, Any]) -> dict[str, Any]:
+def _reversed_fields(own: dict[str, Any]) -> dict[str, Any]:
     """BV=-1: the beam goes through the same fields with the other sign of charge or direction."""
     return {k: tuple(-x for x in v) if isinstance(v, tuple) else -v
             if k in _ODD else v for k, v in own.items()}  # fmt: skip

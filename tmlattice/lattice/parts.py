@@ -93,6 +93,8 @@ ACTING: dict[str, tuple[str, ...]] = {
     "yrotation": ("angle",),
 }
 """Elements that are not modelled; they are refused unless these attributes are zero."""
+_ASSUMED = {"charge": 1.0}
+"""What MAD-X takes where such an attribute is not given, if that is not zero."""
 
 NO_EFFECT = frozenset({
     "l", "at", "from", "type", "name", "apertype", "aperture", "aper_offset", "aper_tol", "aper_vx",
@@ -214,7 +216,7 @@ def _check(part: Part, report: Report) -> None:
     named = f"{keyword.upper()} '{plain(part.name, 60)}'{where}"
     if keyword in ACTING:
         for attribute in ACTING[keyword]:
-            if _acts(part.values.get(attribute)):
+            if _acts(part.values.get(attribute, _ASSUMED.get(attribute))):
                 raise LatticeError(
                     f"{named} acts on the beam by its {attribute.upper()}, which is not modelled; "
                     "set it to 0 or take the element out"

@@ -23,7 +23,7 @@ COMPACTION = 1e-2
 CHROMATICITY = (0.5, 0.1)
 """Absolute and relative; second-order maps of bends with gradients differ between codes by 7 %."""
 LENGTH = 1e-6
-"""Relative to the ring's length, beside 1 mm."""
+"""Relative to the ring's length, in addition to 1 mm."""
 STRAIGHT = 1e-6
 """m; an orbit below it is none."""
 STEP = 1e-6
@@ -142,12 +142,20 @@ def _two(values: Iterable[float]) -> str:
 
 def _maps(ring: Ring) -> list[tuple[Array, Array, Array]]:
     """B, R, T of every element's parts, in beam order."""
-    known: dict[int, list[tuple[Array, Array, Array]]] = {}
+    known: dict[Any, list[tuple[Array, Array, Array]]] = {}
     chain: list[tuple[Array, Array, Array]] = []
     for element in ring.elements:
-        if id(element.source) not in known:
-            known[id(element.source)] = _parts(element, ring.map_energy)
-        chain += known[id(element.source)]
+        own = vars(element.source.element).values()
+        key: Any = (
+            type(element.source),
+            element.kind,
+            *(v for v in own if isinstance(v, int | float)),
+        )
+        if element.kind in ("matrix", "wiggler", "solenoid"):  # arrays
+            key = id(element.source)
+        if key not in known:
+            known[key] = _parts(element, ring.map_energy)
+        chain += known[key]
     return chain
 
 

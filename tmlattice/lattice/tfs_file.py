@@ -73,7 +73,7 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     if _number(header, "BV_FLAG") == -1:  # all but the faces are of the reversed fields
         rows = [row | {e: -row[e] for e in ("E1", "E2") if row.get(e)} for row in rows]
     stated = Stated.of_header(header, rows)
-    said = ""
+    first = ""
     for half in _readings(rows):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -85,12 +85,12 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
             for w in caught:
                 warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
             return ring
-        said = said or found
-    raise LatticeError(f"'{path}' contradicts its header: {said}; {_advice(table.columns, rows)}")
+        first = first or found
+    raise LatticeError(f"'{path}' contradicts its header: {first}; {_advice(table.columns, rows)}")
 
 
 def _readings(rows: list[Row]) -> list[bool]:
-    """Whether half of the angle is added to an RBEND's E1 and E2; the likelier first."""
+    """Whether half of the angle is added to an RBEND's E1 and E2; the more probable first."""
     bends = [row for row in rows if str(row["KEYWORD"]).upper() == "RBEND" and row.get("ANGLE")]
     if not bends:
         return [False]
@@ -157,6 +157,9 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
             f"'{path}' has the MATRIX '{plain(name, 60)}', whose entries a table does not hold; "
             "give the sequence instead"
         )
+    if keyword == "beambeam":  # no column has its charge; the header's tunes have what it does
+        own["charge"] = 0.0
+        report.left_out("what the BEAMBEAM does", name)
     if keyword == "rbend":
         keyword = "sbend"
         if half:
