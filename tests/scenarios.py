@@ -514,12 +514,12 @@ DEFECTS = (
     defect("two steps read too early", readings(lagging), "contradict"),
     defect("another kick in two steps", readings(other_kick), "v2", "v4"),
     defect("two steps are larger", larger_steps),
-    defect("a monitor resembles nothing", readings(random_monitor), "MONITOR"),
-    defect("a monitor is noisy", noisy_monitor(40), "MONITOR"),
-    defect("a monitor is noisy across", readings(noisy_across), "MONITOR"),
-    defect("a monitor is silent", readings(silent), "MONITOR"),
+    defect("a monitor resembles nothing", readings(random_monitor), "end_2"),
+    defect("a monitor is noisy", noisy_monitor(40), "end_2"),
+    defect("a monitor is noisy across", readings(noisy_across), "end_2"),
+    defect("a monitor is silent", readings(silent), "end_2"),
     defect(
-        "a corrector resembles nothing", readings(random_corrector), "v4", others=1, verdicts=ANY
+        "a corrector resembles nothing", readings(random_corrector), "v5", others=1, verdicts=ANY
     ),
     defect("the beam moves in y", moved(1, 20), "the beam moved"),
     defect("the beam moves little in x", moved(0, 5), "the beam moved"),
