@@ -145,6 +145,8 @@ def _naff() -> Callable[..., Any]:
     """nafflib's NAFF, whose compiled loop is kept from one process to the next, as our own are."""
     import nafflib
 
+    import tmlattice.compiled  # noqa: F401  (where numba, which it loads, keeps its code)
+
     with suppress(AttributeError, RuntimeError):  # another version, or no place to keep it
         nafflib.optimize.expArray.enable_caching()
     return cast(Callable[..., Any], nafflib.naff)
