@@ -10,6 +10,7 @@ nobody else can write to it.
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +33,20 @@ _KEPT = bool(os.environ["NUMBA_CACHE_DIR"]) or os.access(_PACKAGE, os.W_OK)
 
 import numba  # noqa: E402
 
-__all__ = ["jit", "jit_sums", "numba"]
+__all__ = ["jit", "jit_sums", "keep", "numba"]
+
+
+def keep(kernel: Any) -> Any:
+    """Keep what numba makes of a kernel from one process to the next, where there is a place."""
+    with suppress(RuntimeError):  # nowhere to write
+        if _KEPT:
+            kernel.enable_caching()
+    return kernel
 
 
 def _compiled(function: Callable[..., Any], *fast: str) -> Any:
     options: Any = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", *fast}}
-    try:
-        return numba.njit(cache=_KEPT, **options)(function)
-    except RuntimeError:  # nowhere to write: it is compiled in every process
-        return numba.njit(**options)(function)
+    return keep(numba.njit(**options)(function))
 
 
 def jit(function: Callable[..., Any]) -> Any:
