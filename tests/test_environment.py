@@ -50,9 +50,13 @@ def test_figures_need_no_display(data):
     assert (data / "R" / "gap.png").exists()
 
 
-@pytest.mark.parametrize(("name", "value"), [("TMPDIR", "/nowhere"), ("TMPDIR", "/proc"),
-                                             ("COLUMNS", "40"), ("COLUMNS", "0"),
-                                             ("HOME", "/nowhere"), ("HOME", None)])  # fmt: skip
+SURROUNDINGS = [
+    ("TMPDIR", "/proc/nowhere"), ("TMPDIR", "/proc"), ("COLUMNS", "40"), ("COLUMNS", "0"),
+    ("HOME", "/proc/nowhere"), ("HOME", None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), SURROUNDINGS)
 def test_surroundings_change_no_result(data, name, value):
     environment = {name: value, "TMLATTICE_CACHE": None if name == "HOME" else "off"}
     outputs = "lattice.json", "found.json"

@@ -153,6 +153,40 @@ def test_without_a_home_nothing_is_kept(open_folder, monkeypatch):
     assert as_other(work) == "(None, [])"
 
 
+TWICE = """
+import contextlib, os, sys
+from tmlattice.cli.command import main
+sys.argv[:1] = ["tmlattice"]
+with contextlib.suppress(SystemExit):
+    main()  # what it imports is loaded now: the other user may not see Python's folder
+os.chdir("his")
+os.setgroups([])
+os.setresgid(54321, 54321, 54321)
+os.setresuid(54321, 54321, 54321)
+for name in ("HOME", "USER", "LOGNAME", "XDG_CACHE_HOME", "TMLATTICE_CACHE"):
+    os.environ.pop(name, None)
+main()
+"""
+
+
+@as_root
+def test_a_user_without_a_name_or_a_home_can_work(open_folder, beside):
+    (open_folder / "his").mkdir()
+    os.chown(open_folder / "his", OTHER, OTHER)
+    for name in ("ring.json", "M"):
+        copy = shutil.copytree if (beside / name).is_dir() else shutil.copy
+        copy(beside / name, open_folder / name)
+    ring, data = open_folder / "ring.json", open_folder / "M"
+    words = ("diagnose", ring, data, "--out", "R", "-q")
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", TWICE, *words], cwd=open_folder, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert (open_folder / "his" / "R" / "report.html").stat().st_uid == OTHER
+    assert os.listdir(open_folder / "his") == ["R"]
+
+
 @as_root
 def test_another_user_can_read_and_change_nothing_that_is_kept(kept):
     folder, _, _ = kept

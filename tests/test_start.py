@@ -280,8 +280,8 @@ def test_many_writers_never_leave_a_torn_entry(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "tmlattice").iterdir()] == [name]
 
 
-def test_the_cache_stays_within_its_bound_and_the_oldest_go(tmp_path, monkeypatch):
-    """Files that the cache has not written are neither counted nor removed."""
+def test_only_what_the_cache_has_written_is_counted_and_removed(tmp_path, monkeypatch):
+    """The oldest entries go, until the cache is within its bound."""
     monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path))
     monkeypatch.setattr(cache, "LIMIT", 5000)
     own = tmp_path / "tmlattice"
