@@ -276,6 +276,36 @@ def test_a_killed_run_leaves_only_what_the_next_removes(tmp_path):
     assert not litter(tmp_path)
 
 
+AMID = """
+import os, sys
+from pathlib import Path
+from tmlattice.files import output_folder
+real, left = os.replace, [int(sys.argv[1])]
+def replace(*paths):
+    if not left[0]:
+        os.kill(os.getpid(), 9)
+    left[0] -= 1
+    real(*paths)
+os.replace = replace
+with output_folder(Path("out")) as folder:
+    for name in "abc":
+        (folder / name).write_text("new")
+"""
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_a_run_that_is_killed_while_it_moves_its_files_is_finished(tmp_path, moved):
+    """By whoever has the folder's lock next: it never sees files of two runs."""
+    folder = tmp_path / "out"
+    write_pair(folder, "old", "abc")
+    done = subprocess.run([sys.executable, "-c", AMID, str(moved)], cwd=tmp_path, check=False)
+    assert done.returncode == -9
+    assert [(folder / name).read_text() for name in "abc"].count("new") == moved
+    with locked(folder, shared=True):
+        assert [(folder / name).read_text() for name in "abc"] == ["new"] * 3
+    assert not litter(tmp_path)
+
+
 def test_a_table_that_was_cut_is_not_read(tmp_path, rng):
     readings = rng.normal(0, 1e-3, (1, 1, 4, 2))
     write_measurement(tmp_path / "M", Measurement(np.zeros((1, 5)), readings, tuple("abcd")))

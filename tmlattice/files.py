@@ -11,12 +11,19 @@ import shutil
 import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import TmlatticeError
-from tmlattice.temporaries import is_temporary, locked, temporary_file, temporary_folder
+from tmlattice.temporaries import (
+    WHOLE,
+    is_temporary,
+    locked,
+    move_files,
+    temporary_file,
+    temporary_folder,
+)
 
 
 class OutputError(TmlatticeError):
@@ -67,13 +74,19 @@ def _put(temporary: Path, folder: Path) -> None:
         except OSError:
             if not folder.is_dir():  # else somebody has made it meanwhile, and has written to it
                 raise
-    paths = sorted(temporary.iterdir())
-    with nullcontext() if is_temporary(folder) else locked(folder):
-        for path in paths:
-            if (folder / path.name).is_dir():
-                raise IsADirectoryError(errno.EISDIR, f"'{path.name}' is a folder there")
-        for path in paths:
-            os.replace(path, folder / path.name)
+    for path in temporary.iterdir():
+        if (folder / path.name).is_dir():
+            raise IsADirectoryError(errno.EISDIR, f"'{path.name}' is a folder there")
+    if is_temporary(folder):
+        move_files(temporary, folder)
+        return
+    with locked(folder):
+        whole = folder / (temporary.name + WHOLE)  # from now on a killed run is finished by others
+        os.rename(temporary, whole)
+        try:
+            move_files(whole, folder)
+        finally:
+            shutil.rmtree(whole, ignore_errors=True)
 
 
 @contextmanager

@@ -20,6 +20,9 @@ YOUNG = 2.0
 PATIENCE = 10.0
 """s that a folder's lock is waited for."""
 
+WHOLE = "-whole"
+"""End of the name of a folder of which every file has to be moved."""
+
 _NAME = re.compile(re.escape(PREFIX) + "[0-9a-f]{16}")
 
 
@@ -75,12 +78,34 @@ def locked(folder: Path, shared: bool = False) -> Iterator[None]:
         descriptor = os.open(folder, os.O_RDONLY)
     try:
         end = time.monotonic() + PATIENCE
-        while descriptor is not None and not lock(descriptor, shared) and time.monotonic() < end:
+        while not (mine := descriptor is not None and lock(descriptor, shared)):
+            if descriptor is None or time.monotonic() > end:
+                break
             time.sleep(0.002)
+        if mine:
+            _finish(folder)
         yield
     finally:
         if descriptor is not None:
             os.close(descriptor)
+
+
+def _finish(folder: Path) -> None:
+    """Move what outputs of this user that were killed meanwhile had still to move."""
+    with suppress(OSError):
+        for entry in list(os.scandir(folder)):
+            own = entry.stat(follow_symlinks=False).st_uid == os.geteuid()
+            name = entry.name.removesuffix(WHOLE)
+            if own and name != entry.name and _NAME.fullmatch(name) and not entry.is_symlink():
+                move_files(Path(entry.path), folder)
+                os.rmdir(entry.path)
+
+
+def move_files(source: Path, folder: Path) -> None:
+    """Move every file of a folder into another one, over those of the same names."""
+    for path in sorted(source.iterdir()):
+        with suppress(FileNotFoundError):  # another process finishes the same
+            os.replace(path, folder / path.name)
 
 
 def lock(descriptor: int, shared: bool = False) -> bool:
