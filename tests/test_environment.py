@@ -51,8 +51,7 @@ def test_figures_need_no_display(data):
 
 
 SURROUNDINGS = [
-    ("TMPDIR", "/proc/nowhere"), ("TMPDIR", "/proc"), ("COLUMNS", "40"), ("COLUMNS", "0"),
-    ("HOME", "/proc/nowhere"), ("HOME", None),
+    ("TMPDIR", "/proc/nowhere"), ("COLUMNS", "40"), ("HOME", "/proc/nowhere"), ("HOME", None),
 ]  # fmt: skip
 
 
