@@ -64,13 +64,13 @@ def read_ocelot(
 
 @contextmanager
 def _import_path(folder: Path) -> Iterator[None]:
-    """A lattice file may import its neighbours, as when it is run from its own folder."""
-    sys.path.insert(0, str(folder))
+    """A lattice file may import its neighbours; what is installed comes before them."""
+    before = sys.path[:]
+    sys.path.append(str(folder))
     try:
         yield
     finally:
-        if str(folder) in sys.path:
-            sys.path.remove(str(folder))
+        sys.path[:] = before
 
 
 def _run_as_module(path: Path) -> ModuleType:
