@@ -62,6 +62,25 @@ REFUSED = {
     "install": (
         PLAIN + "seqedit, sequence=cell; install, element=qf; endedit;", "AT is missing"
     ),
+    "flattened names": (
+        PLAIN + "seqedit, sequence=ring; flatten; replace, element=mq, by=sf; endedit;",
+        "FLATTEN has made 8 elements 'mq' of one name",
+    ),
+    "edit after flatten": (
+        PLAIN + "half: sequence, l=41.6; ring, at=20.8; endsequence;"
+        "seqedit, sequence=cell; install, element=q9, class=sf, at=5; endedit;"
+        "one: sequence, l=10, refer=entry; cell, at=0; endsequence;"
+        "seqedit, sequence=one; flatten; remove, element=q9; endedit;",
+        "put ENDEDIT and another SEQEDIT before",
+    ),
+    "cycle": (
+        PLAIN + "seqedit, sequence=cell; cycle, start=qd; endedit;",
+        "CYCLE starts at 'qd', which has a length; take a marker",
+    ),
+    "extract": (
+        PLAIN + "extract, sequence=cell, from=qf, to=qd, newname=part;",
+        "EXTRACT is not from a marker to a marker",
+    ),
     "call": (PLAIN + "call;", "it calls"),
     "nested branches": (
         PLAIN + "if (1 == 1) { if (1 == 2) { qf, k1=2; } } else { frobnicate; } wrong;",
@@ -99,6 +118,7 @@ WARNED = {
         with_element("d: multipole, knl={0,0,0,0,9}, at=4.95;"),
         "above the sextupole of d",
     ),
+    "no value": (PLAIN + "qf, tilt;", "TILT of 'qf' has no value: 0, as in MAD-X"),
     "later length": (PLAIN + "qf, l=0.5;", r"left out.*the later L or ANGLE .* of qf \(1\)"),
 }
 

@@ -167,6 +167,7 @@ def ring_of_parts(
             own = known[id(part)] = _places(part, design, abs(charge), report)
             if amounts := _errors(part):
                 errors |= {id(source): amounts for _, _, source in own}
+            own += _exit_of_displaced(part)
         places += known[id(part)]
     report.warn(name)
     return assembled(design, places, errors)
@@ -276,6 +277,28 @@ def _errors(part: Part) -> dict[str, Any]:
     return {k: v for k, v in amounts.items() if np.any(v)}
 
 
+def _exit_of_displaced(part: Part) -> list[Place]:
+    """What the exit of a displaced bend does beyond that of a displaced straight magnet.
+
+    The body is moved as a whole, by dx and ds along the axes of its entrance; those of its exit are
+    turned by the angle.
+    """
+    angle, ds, tilt = part.number("angle"), part.number("ds"), part.number("tilt")
+    cos, sin = math.cos(tilt), math.sin(tilt)
+    inward = part.number("dx") * cos + part.number("dy") * sin
+    if part.keyword != "sbend" or not angle or not (ds or inward):
+        return []
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    aside = ds * math.sin(angle) - inward * (1 - math.cos(angle))
+    way = ds * (1 - math.cos(angle)) + inward * math.sin(angle)
+    source = ocelot.Matrix(l=0.0, eid=f"{part.name}_exit")
+    source.r = np.eye(6)
+    source.r[0, 1] = source.r[2, 3] = way
+    source.b = np.array([[aside * cos, 0.0, aside * sin, 0.0, 0.0, 0.0]]).T
+    return [(f"{part.name}_exit", "matrix", source)]
+
+
 def _integrated(part: Part, attribute: str) -> Array:
     """Four integrated strengths at least."""
     given = part.list(attribute)
@@ -345,9 +368,9 @@ def _corrector(part: Part) -> list[Place]:
     name, length, tilt = part.name, part.number("l"), part.number("tilt")
     x, y = part.number("hkick"), part.number("vkick")
     if part.keyword == "hkicker":
-        x = x or part.number("kick")
+        x = part.number("kick") or x
     elif part.keyword == "vkicker":
-        y = y or part.number("kick")
+        y = part.number("kick") or y
     cos, sin = math.cos(tilt), math.sin(tilt)
     if part.keyword in ("hkicker", "vkicker"):
         plane = "h" if part.keyword == "hkicker" else "v"
