@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.lattice.at_fields import straight_magnet
-from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
+from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 from tmlattice.lattice.wigglers import merge_wigglers
 
@@ -487,25 +487,17 @@ def _matrix(part: Part, ring: Ring) -> Place:
         case "dipedge":
             r[1, 0], r[3, 2] = edge_focusing(*map(part.number, ("h", "e1", "hgap", "fint")))
         case "srotation":
-            r[:4, :4] = _rotation(part.number("angle"))
+            r = rotation(part.number("angle"))
         case "solenoid":
             half, turn = part.number("ks") / 2, part.number("ksi") / 2
             r[1, 0] = r[3, 2] = -half * turn
-            r[:4, :4] = _rotation(turn) @ r[:4, :4]
+            r = rotation(turn) @ r
             turn = 0.0
     if turn:
-        rotation = np.eye(6)
-        rotation[:4, :4] = _rotation(turn)
-        r = rotation.T @ r @ rotation
+        r = rotation(-turn) @ r @ rotation(turn)
     source = ocelot.Matrix(l=part.number("l"), eid=part.name)
     source.r = r
     if "b" in part.values:
         source.b = np.asarray(part.values["b"], dtype=float).reshape(6, 1)
     kind: Kind = "solenoid" if part.keyword == "solenoid" else "matrix"
     return part.name, "wiggler" if "wig" in part.name.casefold() else kind, source
-
-
-def _rotation(angle: float) -> Array:
-    """Of (x, px, y, py), as seen by axes turned by `angle` from x towards y, [4, 4]."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.asarray(np.kron([[cos, sin], [-sin, cos]], np.eye(2)))
