@@ -102,7 +102,7 @@ NO_EFFECT = frozenset({
     "comments", "comment", "kmax", "kmin", "nst", "method", "model", "exact", "fringe",
     "bend_fringe", "thick", "magnet", "lrad", "lag", "harmon", "shunt", "tfill", "betrf", "pg",
     "n_bessel", "no_cavity_totalpath", "add_angle", "f_factor", "slice", "sigx", "sigy",
-    "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq",
+    "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq", "entrance",
 })  # fmt: skip
 """Attributes without effect on the optics, of any keyword."""
 NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl", "rad", "tm"})
@@ -229,7 +229,7 @@ def _check(part: Part, report: Report) -> None:
         return
     if keyword not in MODELLED:
         raise LatticeError(f"{named}: no element class {keyword.upper()} is known")
-    for attribute, value in part.values.items():
+    for attribute, value in part.values.items() if MODELLED[keyword] is not _PASSIVE else ():
         if attribute in MODELLED[keyword] or attribute in NO_EFFECT or not _acts(value):
             continue
         if attribute not in NONLINEAR:
