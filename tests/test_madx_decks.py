@@ -118,6 +118,10 @@ WARNED = {
         with_element("d: multipole, knl={0,0,0,0,9}, at=4.95;"),
         "above the sextupole of d",
     ),
+    "shift in a line": (
+        PLAIN + "d1: drift, l=2; own: line=(8*(qf,d1,qd,d1)); qf, dx=1e-3; use, period=own;",
+        r"left out.*DX of the QUADRUPOLE \(as in a LINE\) of qf \(1\)",
+    ),
     "no value": (PLAIN + "qf, tilt;", "TILT of 'qf' has no value: 0, as in MAD-X"),
     "later length": (PLAIN + "qf, l=0.5;", r"left out.*the later L or ANGLE .* of qf \(1\)"),
 }

@@ -33,7 +33,16 @@ from tmlattice.lattice.madx_language import (
     unquoted,
     values,
 )
-from tmlattice.lattice.parts import ACTING, MODELLED, NO_EFFECT, STATIC, Part, Report, ring_of_parts
+from tmlattice.lattice.parts import (
+    ACTING,
+    MODELLED,
+    NO_EFFECT,
+    SHIFTS,
+    STATIC,
+    Part,
+    Report,
+    ring_of_parts,
+)
 from tmlattice.lattice.ring import Ring
 
 MOST_WORK = 4_000_000
@@ -354,7 +363,7 @@ class _Reader:
             self._read_text(body)
         self._branched = holding  # also where blocks inside have changed it
 
-    _branched = False
+    _branched = _in_line = False
 
     def _define(self, name: str, rest: str, statement: Statement) -> None:
         line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
@@ -842,6 +851,7 @@ class _Reader:
         if use in self.sequences:
             sequence = self.sequences[use]
             return self._laid_out(sequence, beam, self._length(use))
+        self._in_line = True
         names = [name for name, _ in laid_out(self.lines[use], self.lines)]
         self.work(len(names))
         parts: list[Part] = []
@@ -907,9 +917,10 @@ class _Reader:
                 own = _with_matrix(own)
             case "multipole" if not self.thin_focusing:
                 own["lrad"] = 0.0
-        for attribute in _NOT_IN_TWISS.get(keyword, ()):
+        for attribute in (*_NOT_IN_TWISS.get(keyword, ()), *(SHIFTS if self._in_line else ())):
             if np.any(own.pop(attribute, 0.0)):
-                what = f"{attribute.upper()} of the {keyword.upper()} (as in MAD-X's TWISS)"
+                where = "a LINE" if attribute in SHIFTS else "MAD-X's TWISS"
+                what = f"{attribute.upper()} of the {keyword.upper()} (as in {where})"
                 self.report.left_out(what, definition.name)
         if float(beam.given.get("bv", 1.0)) == -1:
             own = _reversed_fields(own)

@@ -55,7 +55,7 @@ class Part:
 
 
 _STRENGTHS = frozenset({"k0", "k0s", "k1", "k1s", "k2", "k2s", "k3", "k3s", "knl", "ksl"})
-_SHIFTS = frozenset({"dx", "dy", "ds", "dpsi"})
+SHIFTS = frozenset({"dx", "dy", "ds", "dpsi"})
 _EDGES = frozenset({
     "angle", "e1", "e2", "h1", "h2", "hgap", "fint", "fintx", "kill_ent_fringe", "kill_exi_fringe",
 })  # fmt: skip
@@ -67,9 +67,9 @@ MODELLED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("collimator", "ecollimator", "rcollimator"), _PASSIVE),
     **dict.fromkeys(("monitor", "hmonitor", "vmonitor"), _PASSIVE),
     **dict.fromkeys(("hkicker", "vkicker", "kicker", "tkicker"), _KICKS | {"tilt"}),
-    "sbend": _STRENGTHS | _SHIFTS | _EDGES | {"tilt"},
-    **dict.fromkeys(("quadrupole", "sextupole", "octupole"), _STRENGTHS | _SHIFTS | {"tilt"}),
-    "multipole": _STRENGTHS | _SHIFTS | {"tilt", "lrad", "angle"},
+    "sbend": _STRENGTHS | SHIFTS | _EDGES | {"tilt"},
+    **dict.fromkeys(("quadrupole", "sextupole", "octupole"), _STRENGTHS | SHIFTS | {"tilt"}),
+    "multipole": _STRENGTHS | SHIFTS | {"tilt", "lrad", "angle"},
     "solenoid": frozenset({"ks", "ksi"}),
     "rfcavity": frozenset({"volt", "freq"}),
     "matrix": frozenset({"rm", "rmat", "b", "tilt"}),
