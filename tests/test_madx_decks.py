@@ -53,6 +53,8 @@ REFUSED = {
     "match": (PLAIN + "match, sequence=ring; vary, name=kq; endmatch;", "MATCH changes strengths"),
     "ealign": (PLAIN + "use, sequence=ring; ealign, dx=1e-4;", "EALIGN moves elements"),
     "efcomp": (PLAIN + "efcomp, order=0, dkn={1e-4};", "EFCOMP gives elements field errors"),
+    "taper": (PLAIN + "taper, reset;", "TAPER changes strengths along the ring"),
+    "setvars_lin": (PLAIN + "setvars_lin, table=t;", "SETVARS_LIN sets variables from a table"),
     "correct": (PLAIN + "correct, flag=ring;", "CORRECT sets correctors"),
     "random": (PLAIN + "qf, k1=1.1 + 1e-3*gauss();", r"GAUSS\(\) is random"),
     "result": (PLAIN + "qf, k1=table(twiss, qf, k1l);", r"TABLE\(\) reads a result"),
@@ -91,7 +93,7 @@ REFUSED = {
     ),
     "class": (with_element("w: wigglerx, at=4.95;"), "no element or command 'wigglerx' is known"),
     "attribute": (PLAIN + "qf, k1x=1;", "attribute K1X of QUADRUPOLE 'qf'"),
-    "taper": (PLAIN + "qf, ktap=0.01;", "attribute KTAP of QUADRUPOLE 'qf'"),
+    "tapered magnet": (PLAIN + "qf, ktap=0.01;", "attribute KTAP of QUADRUPOLE 'qf'"),
     "pitch": (PLAIN + "qf, dtheta=1e-3;", "attribute DTHETA of QUADRUPOLE 'qf'"),
     "overlap": (
         with_element("q: quadrupole, l=0.4, at=2.9;"),

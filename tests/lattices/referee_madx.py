@@ -222,6 +222,15 @@ DECKS = {
         "set, format=\"22.14e\"; use, sequence=ring; select, flag=twiss, clear;\n"
         "select, flag=twiss, column=name,s,betx,bety; savebeta, label=b0, place=#s;\n")),
     "save": deck(after="save, sequence=ring, file=\"ring.seq\";\n"),
+    "initial values": deck(after="start: beta0, betx=1, bety=1;\nuse, sequence=ring;\n"),
+    "other monitors": deck(extra="b1: blmonitor, l=0.1, at=4.8; i1: imonitor, at=4.9;"
+                                 " s1: slmonitor, l=0.1, at=5.0;"),
+    "thin bends of makethin": BEAM + bends("bb: multipole, knl={twopi/16}, lrad=1;"
+        "d1: dipedge, h=twopi/16, e1=0.05, entrance=true; d2: dipedge, h=twopi/16, e1=0.05,"
+        " entrance=false; mm: marker, kill_ent_fringe=true;") + "ring: sequence, l=41.6;\n"
+        + "".join(f"{q}, at={s - 1.2}; d1, at={s}; bb, at={s}; mm, at={s}; d2, at={s};\n"
+                  for k in range(8) for q, s in (("qf", 5.2 * k + 1.5), ("qd", 5.2 * k + 4.1)))
+        + "endsequence;\n",
     "stop": deck(after="use, sequence=ring;\n"),
     "two comments": deck(before="/* one ! two // three\n more */ qf, k1=1.12; // ! and */\n"),
     "semicolon in a text": deck(elements=quadrupoles("type=\"a;b\", k1=1.1")),

@@ -59,7 +59,8 @@ NO_STATEMENT = frozenset({
     "dynap", "sodd", "sixtrack", "dumpsequ", "create", "fill", "readtable", "readmytable",
     "setplot", "resplot", "usemonitor", "usekick", "chdir", "rename", "copyfile", "removefile",
     "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
-    "set", "error",
+    "set", "error", "beta0", "coption", "deselect", "distribution", "etable", "getdisp", "getkick",
+    "getorbit", "renamefile", "rviewer", "save_state", "sddsin", "sddsout", "select_ptc_normal",
 })  # fmt: skip
 """Statements that leave the ring as it is, as do all that begin with PTC_."""
 NOT_RUN = {
@@ -74,7 +75,12 @@ REFUSED: dict[str, str] = {
     "efcomp": "EFCOMP gives elements field errors; take it out to read the ring as designed",
     "seterr": "SETERR gives elements errors from a table; take it out to read the ring as designed",
     "correct": "CORRECT sets correctors; take it out to read the ring before it",
-    "setvars": "SETVARS sets variables from a table; write their values",
+    "taper": "TAPER changes strengths along the ring; take it out to read the ring as designed",
+    "add2expr": "ADD2EXPR changes the expression of a variable; write the expression",
+    **{word: f"{word.upper()} sets variables from a table; write their values"
+       for word in ("setvars", "setvars_lin", "setvars_const", "setvars_knob")},
+    **{word: f"{word.upper()} sets correctors from a table; write their kicks"
+       for word in ("readcorr", "setcorr", "putkick", "putorbit", "putdisp")},
     "sxfread": "SXFREAD reads a ring from a file of SXF; give a sequence",
     "setplugin": "SETPLUGIN runs a program; take it out",
 }  # fmt: skip

@@ -63,7 +63,8 @@ _KICKS = frozenset({"hkick", "vkick", "kick"})
 _PASSIVE = frozenset[str]()
 
 MODELLED: dict[str, frozenset[str]] = {
-    **dict.fromkeys(("drift", "marker", "instrument", "placeholder"), _PASSIVE),
+    **dict.fromkeys(("drift", "marker", "sixmarker", "instrument", "placeholder"), _PASSIVE),
+    **dict.fromkeys(("blmonitor", "imonitor", "slmonitor"), _PASSIVE),  # of losses, current, light
     **dict.fromkeys(("collimator", "ecollimator", "rcollimator"), _PASSIVE),
     **dict.fromkeys(("monitor", "hmonitor", "vmonitor"), _PASSIVE),
     **dict.fromkeys(("hkicker", "vkicker", "kicker", "tkicker"), _KICKS | {"tilt"}),
@@ -85,6 +86,7 @@ STATIC: dict[str, str] = {
 ACTING: dict[str, tuple[str, ...]] = {
     "elseparator": ("ex", "ey", "ex_l", "ey_l"),
     "beambeam": ("charge",),
+    "wire": ("current",),
     "nllens": ("knll",),
     "rfmultipole": ("knl", "ksl", "volt"),
     "changeref": ("patch_ang", "patch_trans"),
