@@ -17,7 +17,8 @@ from tmlattice.observe.stored import Stored, rf_of, stacked
 Array = NDArray[np.float64]
 
 DELTA = 5e-4
-"""Energy deviation on both sides of the nominal one, of the difference that is the chromaticity."""
+"""Energy deviation dE / p0 c on both sides of the nominal one, of the difference that is the
+chromaticity."""
 
 TUNE, CHROMATICITY = 1e-4, 0.1
 """Errors where none is stated: a tune's by what currents drift in minutes, a chromaticity's by what
@@ -29,7 +30,11 @@ WIDER = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class TuneReadings(Stored):
-    """Tunes and chromaticities, [shot, (Qx, Qy, Q'x, Q'y)]."""
+    """Tunes and chromaticities, [shot, (Qx, Qy, Q'x, Q'y)].
+
+    Attributes:
+        energies: difference of the relative momentum deviation of the two outer states.
+    """
 
     energies: float
 
@@ -51,7 +56,8 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     settings: tuple[Settings, ...] = measured.settings or ({},) * shots
     model = ResponseModel(ring)
     step = abs(DELTA / model.rf_start[5])
-    energies = 2 * step * float(model.rf_start[5])
+    # delta is the relative deviation of the momentum, p that of the energy over p0 c: beta delta
+    energies = 2 * step * float(model.rf_start[5]) / ring.beta
     design = np.array(
         [StoredBeam(ResponseModel(apply(ring, (), one), 6, rf_of(one))).tunes for one in settings]
     )

@@ -1,4 +1,4 @@
-"""Chromaticities of a compact ring, which depend on how a code treats fringe fields of bends.
+"""Chromaticities as a reading: fringe fields of bends, and particles slower than light.
 
 The referee is AT, whose exact bends let the focusing of a fringe field rise with the momentum; in
 the second-order maps it does not change. ThomX, which AT ships, has bends of 0.35 m radius, for
@@ -45,3 +45,19 @@ def test_a_reversed_sextupole_is_still_seen(thomx):
     assert found.findings
     effects = [m.effect for m in found.findings[0].credible_set]
     assert "sextupole_strength" in effects
+
+
+def test_chromaticity_of_slow_particles_is_per_momentum(tmp_path):
+    """The maps have the energy dE / p0 c, which is beta times the momentum's deviation."""
+    sequence = tmp_path / "slow.seq"
+    sequence.write_text(
+        "beam, particle=proton, energy=0.98;\n"
+        "qf: quadrupole, l=0.5, k1=1.0; qd: quadrupole, l=0.5, k1=-1.0;\n"
+        "b: sbend, l=1.0, angle=twopi/16; m: monitor; c: hkicker;\n"
+        "cell: line=(m, qf, dr, b, dr, c, qd, dr, b, dr); dr: drift, l=0.5;\n"
+        "ring: line=(8*cell);\nuse, sequence=ring;\n"
+    )
+    ring = load_ring(sequence)
+    assert ring.beta < 0.4
+    read = simulate_tunes(ring, noise=(2e-5, 0.01), seed=1).measured
+    assert diagnose(ring, read).verdict == "nothing"
