@@ -72,6 +72,12 @@ def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
     return float(C_GAMMA * energy**4 / (2 * np.pi) * (bends * bent + wigglers * wiggled))
 
 
+def _kick(element: Element) -> dict[str, Array]:
+    """What a matrix element adds to the coordinates behind it, as AT has it."""
+    kick = np.ravel(getattr(element.source, "b", np.zeros(6))).astype(float)[SWAPPED]
+    return {"T2": kick} if kick.any() else {}
+
+
 def _matrix(element: Element, energy: float) -> Array:
     """The design's matrix of a matrix element or undulator in AT's coordinates, [6, 6].
 
@@ -80,10 +86,10 @@ def _matrix(element: Element, energy: float) -> Array:
     """
     source, length = element.source, element.length
     if hasattr(source, "r"):
-        if np.any(source.t) or np.any(source.b) or source.delta_e:
+        if np.any(source.t) or source.delta_e:
             raise LatticeError(
-                f"matrix '{element.name}' has a kick, a second order or an energy gain, which AT's "
-                "matrix has not; take them out of the lattice file"
+                f"matrix '{element.name}' has a second order or an energy gain, which AT's matrix "
+                "has not; take them out of the lattice file"
             )
         return np.asarray(source.r, dtype=float)[np.ix_(SWAPPED, SWAPPED)]
     matrix = np.eye(6)
@@ -356,7 +362,7 @@ class Builder:
 
     def _matrix(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         matrix = np.asfortranarray(_matrix(element, self.energy))
-        return [at.M66(element.name, matrix, Length=element.length)]
+        return [at.M66(element.name, matrix, Length=element.length, **_kick(element))]
 
     def _wiggler(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         middle = self._thin(element, wrong, "middle")
@@ -365,8 +371,9 @@ class Builder:
         if not middle:
             return self._matrix(element, wrong, setting)
         root = np.asfortranarray(np.real(sqrtm(_matrix(element, self.energy))))
-        half = at.M66(element.name, root, Length=element.length / 2)
-        return [half, *middle, half]
+        half = {"m66": root, "Length": element.length / 2}
+        first, last = at.M66(element.name, **half), at.M66(element.name, **half, **_kick(element))
+        return [first, *middle, last]
 
     def _loss(self, element: Element) -> list[Any]:
         """delta -> delta - u (1 + 2 delta), and px, py in proportion to the momentum.
