@@ -624,7 +624,8 @@ CHANGES = (
         "correctors exchanged in the reference",
         before_damage=exchanged_correctors("v5", "v9"),
         verdicts=NOTHING | LOCATED | MANY,
-        says=("v5 and v9",),
+        others=1,
+        says=("v5 and v9|v9 and v5",),
     ),
     since(
         "supplies, and every magnet by 1 %",
