@@ -169,7 +169,7 @@ def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:
 
     def value(node: Any, depth: int) -> Any:
         if isinstance(node, yaml.ScalarNode):
-            empty = node.style is None and node.value in ("", "~", "null")
+            empty = not node.style and node.value in ("", "~", "null")
             return None if empty else node.value
         if isinstance(node, yaml.SequenceNode):
             return [value(item, depth + 1) for item in node.value]
@@ -251,7 +251,9 @@ def _explain(error: Any) -> str:
     if kind == "additionalProperties":
         known = error.schema.get("properties", {})
         strange = next((name for name in value if name not in known), "?")
-        return f'{place} has a key "{strange}"; known are {", ".join(known)}'
+        return f'{place or "it"} has the key "{plain(strange, 60)}"; known are {", ".join(known)}'
+    if kind == "anyOf" and all("type" in one for one in wanted):
+        kind, wanted = "type", [one["type"] for one in wanted]
     if kind == "type":
         types = [wanted] if isinstance(wanted, str) else wanted
         should = f"should be {' or '.join(_KINDS[t] for t in types)}"

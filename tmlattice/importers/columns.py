@@ -147,6 +147,9 @@ def _sdds(path: Path) -> list[Column]:
 def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
     """Arrays of numbers and names as columns of one length."""
     texts = {name: _texts(value) for name, (value, _) in arrays.items() if _is_text(value)}
+    for name in texts:
+        if _POSITION.search(name.rsplit("/", 1)[-1]):
+            raise MeasurementError(f"'{path}': '{name}' holds texts; readings are numbers")
     flat: list[Column] = []
     for name, (value, unit) in arrays.items():
         if name in texts:

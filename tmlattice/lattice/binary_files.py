@@ -202,7 +202,7 @@ class _Budget:
         """
         import h5py
 
-        if not name.isprintable() or any("\ud800" <= c <= "\udfff" for c in name):
+        if not isinstance(name, str) or not name.isprintable():  # surrogates are not, either
             raise RefusedError(f"the name {name!r:.60} is not UTF-8, or not printable")
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise RefusedError(f"'{name}' is a link to another place or file; store the data there")
@@ -246,6 +246,8 @@ class _Budget:
             raise RefusedError(f"'{name}' holds {_kind(kind)}; numbers or texts are read")
         if item.shape is None or 0 in item.shape:
             raise RefusedError(f"'{name}' is empty")
+        if text and sum(n > 1 for n in item.shape) > 1:
+            raise RefusedError(f"'{name}' is a table of texts, {item.shape}; write a list")
         if item.is_virtual or item.external:
             raise RefusedError(f"the data of '{name}' are in another file; store them in this one")
         self.total += math.prod(item.shape) * kind.itemsize
