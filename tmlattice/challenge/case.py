@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -302,7 +303,15 @@ def read_truth(folder: Path, name: str) -> Truth:
         if not (few <= len(truth.causes) <= many and known):
             raise ValueError(f"{len(truth.causes)} causes are none of tier {truth.tier}")
         return truth
-    except (OSError, ArithmeticError, LookupError, TypeError, ValueError, MemoryError) as error:
+    except (
+        OSError,
+        ArithmeticError,
+        LookupError,
+        TypeError,
+        ValueError,
+        MemoryError,
+        BadZipFile,
+    ) as error:
         said = plain(str(error), 100)
         raise TmlatticeError(
             f"the truth of case {name} in '{folder}' cannot be read ({said}); make it anew"
