@@ -58,10 +58,13 @@ def content_of(path: Path, error: type[TmlatticeError]) -> bytes:
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-        with os.fdopen(descriptor, "rb") as file:
-            status = os.fstat(file.fileno())
+        try:
+            status = os.fstat(descriptor)
             _check(path, status, error)
-            return file.read(status.st_size)
+            with os.fdopen(descriptor, "rb", closefd=False) as file:
+                return file.read(status.st_size)
+        finally:
+            os.close(descriptor)
     except (OSError, ValueError) as problem:
         said = getattr(problem, "strerror", None) or problem
         raise error(f"cannot read '{path}': {said}") from problem

@@ -69,8 +69,8 @@ def damaged_bytes(rng, content):
 # --- names and sizes ------------------------------------------------------------------------------
 ODD_NAMES = (
     "q<!--", "</script>", "%{x}", "<b>q</b>", '<a href="https://e.example/">q</a>', "$\\frac$",
-    "@ink", "", " ", "nan", "..", "/etc/passwd", "x" * 5000, "\u202eq", "\x1b[2J", "qf::0", "QF", "µ",
-    "\ud83d", "0", "__class__", "a,b", 'a"b', "a\\nb",
+    "@ink", "", " ", "nan", "..", "/etc/passwd", "x" * 5000, "\u202eq", "\x1b[2J", "qf::0", "QF",
+    "µ", "\ud83d", "0", "__class__", "a,b", 'a"b', "a\\nb",
 )  # fmt: skip
 NAME = re.compile(rb"[A-Za-z_][A-Za-z_0-9.:]+")
 ODD_SIZES = (0, 1, 2, 7, -1, -(2**31), 2**31 - 1, 2**24, 2**16, 255)
