@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose
 import tmlattice as package
 from tmlattice import load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.errors import LatticeError, TmlatticeError
+from tmlattice.errors import LatticeError, MeasurementError, TmlatticeError
 from tmlattice.harmonics import frequency
 from tmlattice.importers import Options, bring_in, write_imported
 from tmlattice.lattice import save_ring
@@ -612,6 +612,36 @@ def middle_layer(variables):
             "DeviceList": monitors,
         }
     return loco, {"Rmat": Rmat}, beside
+
+
+@pytest.mark.parametrize(
+    ("variable", "field", "value", "words"),
+    [
+        ("BPMxDisp", "Actuator", "x", "BPMxDisp.Actuator should be a structure"),
+        ("BPMxDisp", "dp", "x", "BPMxDisp.dp holds no numbers"),
+        ("BPMxDisp", "dp", np.ones(3), "dp has the shape"),
+        ("BPMyDisp", "UnitsString", 3.0, "BPMyDisp.UnitsString should be a text"),
+        ("BPMxData", "DeviceList", np.full((16, 2), np.nan), "of no device"),
+        ("BPMxData", None, "x", "BPMxData should be a structure"),
+        ("Rmat", "Actuator", "x", "Rmat.Actuator should be a structure"),
+        ("Rmat", "ActuatorDelta", np.ones(3), "ActuatorDelta has the shape"),
+        ("Rmat", "Data", np.ones((3, 5)), "Rmat.Data has the shape"),
+    ],
+)
+def test_fields_of_the_middle_layer_of_other_types_are_named(
+    simulated, tmp_path, variable, field, value, words
+):
+    for name, variables in zip("abc", middle_layer(simulated), strict=True):
+        if variable in variables:
+            own = variables[variable]
+            own = own[0, 0] if variable == "Rmat" else own
+            if field is None:
+                variables[variable] = value
+            else:
+                own[field] = value
+        scipy.io.savemat(tmp_path / f"{name}.mat", variables)
+    with pytest.raises(MeasurementError, match=words):
+        bring_in([tmp_path / f"{name}.mat" for name in "abc"])
 
 
 def test_middle_layers_files_are_read_by_the_loco_file(simulated, tmp_path):

@@ -125,19 +125,24 @@ def write_loco(folder):
 
 def write_matlab_and_hdf5(folder):
     """LOCO as MATLAB 7.3 writes it, and the ESRF's files, which the tests of the importer make."""
+    import scipy.io
     import test_import
 
     simulated = test_import.simulated.__wrapped__()
     test_import.save_as_hdf5(folder / "seven.mat", simulated)
     seven = ["import", "seven.mat", "--out", "loco73", "--force"]
+    for name, variables in zip("abc", test_import.middle_layer(simulated), strict=True):
+        scipy.io.savemat(folder / f"{name}.mat", variables)
+    layer = ["import", "a.mat", "b.mat", "c.mat", "--out", "layer", "--force"]
     (folder / "esrf").mkdir()
     factory = SimpleNamespace(mktemp=lambda name: folder / "esrf")
     test_import.esrf.__wrapped__(simulated, factory)
     parts = ["orm.h5", "eta.h5", "noise.h5", "names.json", "ring.mat"]
     esrf = ["import", *(f"esrf/{part}" for part in parts), "--out", "brought", "--force"]
-    for words in (seven, esrf):
+    for words in (seven, layer, esrf):
         tmlattice(*words, "-q", cwd=folder, check=0)
     return {"LOCO .mat 7.3": (seven, "seven.mat"),
+            "Middle Layer, response": (layer, "b.mat"), "Middle Layer, others": (layer, "c.mat"),
             **{f"ESRF {part}": (esrf, f"esrf/{part}") for part in parts}}  # fmt: skip
 
 
