@@ -1,6 +1,7 @@
 """Damage to a file, by a seed: bytes, lines, sizes, names; types and values of JSON, YAML, MATLAB
 and HDF5; the structure of HDF5."""
 
+import contextlib
 import io
 import json
 import re
@@ -255,7 +256,9 @@ def damaged_hdf5(rng, content):
                 file.visit(names.append)
                 if not names:
                     break
-                _damage_object(rng, file, names[int(rng.integers(len(names)))])
+                # what the library itself does not write is no damage
+                with contextlib.suppress(TypeError, ValueError, OSError, RuntimeError, KeyError):
+                    _damage_object(rng, file, names[int(rng.integers(len(names)))])
         changed = path.read_bytes()
     head = content[:512]  # of MATLAB, whose words stand before the file's own
     return head + changed[512:] if head.startswith(b"MATLAB") else changed
@@ -309,7 +312,8 @@ def _damage_object(rng, file, name):
             value.flat[int(rng.integers(value.size))] = other
         item[()] = value
     elif data and item.dtype.kind in "fiu" and item.shape:
-        value = _damaged_numbers(rng, item[()])
+        value = np.asarray(_damaged_numbers(rng, item[()]))
+        value = value.astype("S") if value.dtype.kind == "U" else value
         del group[own]
         group[own] = value
         for key, one in attributes.items():

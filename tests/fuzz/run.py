@@ -33,6 +33,8 @@ def main(count=10_000, first=0, seconds=10**9, file=None):
                 break
             with mock.patch("tmlattice.lattice.mat_file.subprocess.run", forked):
                 name, said = tried(seed, folder, inputs, np.random.default_rng([19, seed]))
+            if seed % 500 == 499:
+                print(f"{seed + 1 - first} inputs", flush=True)
             if said is not None:
                 print(f"--- {name}, seed {seed}: {said}", flush=True)
         print(report(inputs))
