@@ -70,6 +70,7 @@ class Tally:
     accepted: int = 0
     refused: int = 0
     slow: int = 0
+    undamaged: int = 0
     longest: float = 0.0
     broken: list[str] = field(default_factory=list)
 
@@ -160,8 +161,13 @@ def tried(seed, folder, inputs, rng):
     tally = inputs.tallies.setdefault(name, Tally())
     damage = damages(path, whole)[int(rng.integers(4))]
     try:
-        content = damage(rng, whole)
+        try:
+            content = damage(rng, whole)
+        except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError):
+            tally.undamaged += 1  # twice damaged values that their own library does not write
+            return name, None
         if content == whole:
+            tally.undamaged += 1
             return name, None
         path.write_bytes(content)
         said = broken(words, folder, tally)

@@ -150,7 +150,7 @@ def _damaged_document(rng, document):
                 del owner[key]
             case 3 if isinstance(owner, dict):
                 owner[str(key).upper() if rng.integers(2) else f"{key}\x1b[2J"] = owner.pop(key)
-            case 4 if isinstance(owner[key], int | float) and not isinstance(owner[key], bool):
+            case 4 if isinstance(owner[key], int | float) and abs(owner[key]) < 1e300:
                 owner[key] = owner[key] * float(10.0 ** rng.integers(-12, 13))
             case _:
                 owner[key] = "HERE"

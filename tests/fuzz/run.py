@@ -4,6 +4,7 @@ python tests/fuzz/run.py [INPUTS] [FIRST SEED] [SECONDS AT MOST] [FILE.json]
 """
 
 import os
+import resource
 import sys
 import tempfile
 import time
@@ -28,6 +29,7 @@ def main(count=10_000, first=0, seconds=10**9, file=None):
             tried_whole(name, folder, inputs)
         limit_memory()
         end = time.monotonic() + seconds
+        begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         for seed in range(first, first + count):
             if time.monotonic() > end:
                 break
@@ -38,6 +40,8 @@ def main(count=10_000, first=0, seconds=10**9, file=None):
             if said is not None:
                 print(f"--- {name}, seed {seed}: {said}", flush=True)
         print(report(inputs))
+        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        print(f"memory: {begun >> 10} MB with every format read once, {most >> 10} MB at the end")
         if file:
             dumped(inputs, Path(file))
         return any(tally.broken for tally in inputs.tallies.values())
