@@ -23,6 +23,7 @@ BESIDE = {
     "input_files",
     "temporaries",
     "cache",
+    "compiled",
     "by_name",
     "late",
     "speaks",

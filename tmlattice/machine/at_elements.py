@@ -14,6 +14,7 @@ from tmlattice.effects.build import Build, Where
 from tmlattice.effects.radiation import expected_loss as loss_of
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.combined import bend_matrix
+from tmlattice.lattice.places import rotation
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -105,15 +106,6 @@ def _turned(wrong: Build, angle: float) -> list[float]:
         float(cosine * wrong.kick_x - sine * wrong.kick_y),
         float(sine * wrong.kick_x + cosine * wrong.kick_y),
     ]
-
-
-def _rotation(angle: float) -> Array:
-    """Coordinates seen by a magnet turned by `angle` from x towards y, [6, 6]."""
-    matrix = np.eye(6)
-    matrix[:4, :4] = np.kron(
-        [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], np.eye(2)
-    )
-    return matrix
 
 
 def errors_of(element: Element, energy: float) -> Build:
@@ -240,7 +232,7 @@ class Builder:
             shift = np.array([wrong.dx, 0, wrong.dy, 0, 0, 0])
             more |= {"T1": -shift, "T2": shift}
         if angle:
-            more |= {"R1": _rotation(angle), "R2": _rotation(-angle)}
+            more |= {"R1": rotation(angle), "R2": rotation(-angle)}
         source = element.source
         skew = [0.0] * len(normal)
         combined = type(source).__name__ == "CombinedMultipole"
@@ -295,7 +287,7 @@ class Builder:
         factorials = np.cumprod([1, *range(1, len(strengths))])
         more = {}
         if element.tilt:
-            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
+            more = {"R1": rotation(element.tilt), "R2": rotation(-element.tilt)}
         zero = np.zeros(len(strengths))
         return [at.ThinMultipole(element.name, zero, strengths / factorials, **more)]
 
@@ -322,7 +314,7 @@ class Builder:
         steps = self.steps if k1 or element.k2 else 4
         more: dict[str, Any] = {}
         if element.tilt:
-            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
+            more = {"R1": rotation(element.tilt), "R2": rotation(-element.tilt)}
 
         def body(share: float, **edges: float) -> Any:
             return at.Dipole(

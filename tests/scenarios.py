@@ -1,0 +1,802 @@
+"""What a diagnosis has to answer: `python -m tests.scenarios [NAME ...] [--into FILE]`.
+
+A row is a machine (ring, causes, small errors), what is measured of it, a defect of the data, and
+the answer that is right: the verdicts that may be given, the causes that have to be found, each
+within four of its errors, and words that the report has to contain. Nothing else may be found. All
+goes through public functions, so that a method can be exchanged behind them. The result of each row
+is printed as it comes and stored, with its seconds, in FILE; rows in FILE are not run again.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice import Cause, diagnose, load_ring, simulate
+from tmlattice.errors import TmlatticeError
+from tmlattice.files import write_json
+from tmlattice.machine.response import simulate_response
+from tmlattice.machine.stored_beam import (
+    simulate_dispersion,
+    simulate_orbits,
+    simulate_tunes,
+    simulate_turns,
+)
+
+LATTICE = Path(__file__).parent / "lattices" / "small_ring.py"
+USUAL = {"all": None}
+ERRORS = 4.0
+"""Stated errors that an amount may be from the truth."""
+ANY = frozenset({"named", "equivalent", "located", "distributed"})
+ONE = frozenset({"named", "equivalent"})
+"""Verdicts on something that the catalogue has."""
+MAKE: dict[str, Callable[..., Any]] = {
+    "first turns": lambda ring, causes, **o: simulate(ring, causes, **o).measurement(),
+    "turns": lambda ring, causes, **o: simulate_turns(ring, causes, **o).measured,
+    "orbit": lambda ring, causes, **o: simulate_orbits(ring, causes, **o).measured,
+    "dispersion": lambda ring, causes, **o: simulate_dispersion(ring, causes, **o).measured,
+    "tunes": lambda ring, causes, **o: simulate_tunes(ring, causes, **o).measured,
+    "response": lambda ring, causes, **o: (
+        simulate_response(ring, causes, progress=False, **o).measured
+    ),
+}
+Change = Callable[[Any, np.random.Generator], Any]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A machine, what is read of it, and the right answer."""
+
+    name: str
+    causes: tuple[Cause, ...] = ()
+    kinds: tuple[str, ...] = ("response",)
+    small: Mapping[str, float | None] | None = None
+    """Small errors: effect -> rms."""
+    ring: str = "small"
+    edits: tuple[tuple[str, str], ...] = ()
+    """Of the design's lattice file, which then is not that of the machine."""
+    seed: int = 3
+    made: Mapping[str, Any] | None = None
+    """Options of the virtual machine."""
+    damage: Change | None = None
+    before: tuple[Cause, ...] | None = None
+    """Causes of the reference; None: there is none."""
+    before_damage: Change | None = None
+    options: Mapping[str, Any] | None = None
+    """Of `diagnose`."""
+    verdicts: frozenset[str] = ONE
+    found: tuple[Cause, ...] | None = None
+    """None: the causes. Those of an amount of nan are found with any."""
+    says: tuple[str, ...] = ()
+    """Each is one text, or several of which one is enough, with `|` between them."""
+    others: int = 0
+    """Findings that may stand beside those."""
+    lasts: bool = False
+    """It takes long: not among the quick ones."""
+
+
+@cache
+def ring_of(name: str, edits: tuple[tuple[str, str], ...] = ()) -> Any:
+    """The small ring, with correctors of both planes where it is called `both`; or a built-in."""
+    if name not in {"small", "both"}:
+        return load_ring(name)
+    import tempfile
+
+    text = LATTICE.read_text(encoding="utf-8")
+    if name == "both":
+        edits = (('Vcor(eid=f"v{i}")', '(Hcor if i % 2 else Vcor)(eid=f"v{i}")'), *edits)
+    for old, new in edits:
+        if old not in text:
+            raise ValueError(f"'{old}' is not in the lattice")
+        text = text.replace(old, new)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "small_ring.py"
+        path.write_text(text, encoding="utf-8")
+        return load_ring(path)
+
+
+def measured(own: Scenario, causes: Sequence[Cause], seed: int, damage: Change | None) -> Any:
+    """What is read: one measurement, or several by name."""
+    options = {"background": own.small or {}, "machine_seed": own.seed, **(own.made or {})}
+    ring = ring_of(own.ring)
+    data = {kind: MAKE[kind](ring, causes, seed=seed, **options) for kind in own.kinds}
+    rng = np.random.default_rng(own.seed)
+    if damage is not None:
+        data = {kind: damage(one, rng) for kind, one in data.items()}
+    return data if len(data) > 1 else data[own.kinds[0]]
+
+
+def run(own: Scenario) -> dict[str, Any]:
+    """The answer to a scenario, and what is wrong with it, `faults`: empty where it is right."""
+    start = time.process_time()
+    data = measured(own, own.causes, own.seed, own.damage)
+    options = dict(own.options or {})
+    if own.before is not None:
+        options["reference"] = measured(own, own.before, own.seed + 1, own.before_damage)
+    made = time.process_time()
+    answer: dict[str, Any] = {"name": own.name}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            result = diagnose(ring_of(own.ring, own.edits), data, seed=own.seed, **options)
+    except TmlatticeError as error:
+        answer |= {"verdict": "refused", "found": [], "faults": _unsaid(own, str(error))}
+        if "refused" not in own.verdicts:
+            answer["faults"].insert(0, f"refused: {error}")
+        return answer
+    answer["verdict"] = result.verdict
+    answer["found"] = [
+        [one.effect, one.element, _number(one.amount), _number(one.amount_sigma)]
+        if one.effect else [one.words, None, None, None]
+        for one in result.findings
+    ]  # fmt: skip
+    faults = [] if result.verdict in own.verdicts else [f"verdict {result.verdict}"]
+    wanted = list(own.causes if own.found is None else own.found)
+    answer["pulls"] = pulls = []
+    for cause in wanted:
+        one = next((f for f in result.findings if _holds(f, cause)), None)
+        if one is None:
+            faults.append(f"not found: {cause.effect} {cause.element}")
+        elif one.effect == cause.effect and one.amount_sigma and np.isfinite(cause.amount):
+            pulls.append(_number((one.amount - cause.amount) / one.amount_sigma))
+            if abs(pulls[-1]) > ERRORS:
+                faults.append(f"{cause.effect} {cause.element}: {pulls[-1]:.1f} errors from it")
+    if len(result.findings) > len(wanted) + own.others:
+        faults.append(f"{len(result.findings)} findings, not {len(wanted)}")
+    answer["faults"] = faults + _unsaid(own, result.report())
+    answer["seconds"] = [round(made - start, 1), round(time.process_time() - made, 1)]
+    return answer
+
+
+def _unsaid(own: Scenario, text: str) -> list[str]:
+    plain = " ".join(text.split())
+    return [
+        f"does not say: {words}"
+        for words in own.says
+        if not any(either in plain for either in words.split("|"))
+    ]
+
+
+def _holds(finding: Any, cause: Cause) -> bool:
+    members = [(one.effect, one.element) for one in finding.credible_set]
+    if cause.effect.startswith("exchanged"):
+        return set(finding.elements) == set((cause.element or "").split(","))
+    named = [*members, (finding.effect, finding.element)]
+    wanted = (cause.effect, (cause.element or "").casefold())  # a family has no case
+    return wanted in [(effect, (element or "").casefold()) for effect, element in named]
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.4g}")
+
+
+# --- defects of the data ------------------------------------------------------------------------
+
+
+def readings(change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
+    """A change of a response's readings [corrector, monitor, plane] in place."""
+
+    def changed(data: Any, rng: np.random.Generator) -> Any:
+        response = data.response.copy()
+        change(response, data, rng)
+        return replace(data, response=response)
+
+    return changed
+
+
+def own_plane(data: Any) -> np.ndarray:
+    return np.array([int(plane == "y") for plane in data.planes])
+
+
+def noise_of(data: Any) -> float:
+    return float(np.nanmedian(data.noise))
+
+
+def single(number: int, times: float) -> Change:
+    """Single readings that stick out, in the plane of their corrector."""
+
+    def change(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+        for place in rng.permutation(read[:, :, 0].size)[:number]:
+            c, m = divmod(int(place), read.shape[1])
+            read[c, m, own_plane(data)[c]] += times * noise_of(data) * rng.choice([-1, 1])
+
+    return readings(change)
+
+
+def lagging(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    """At two steps half of the monitors still average over the time before."""
+    for c in (2, 9):
+        read[c, ::2, own_plane(data)[c]] *= 0.85
+
+
+def other_kick(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    """A second kick in two steps, in the plane of the step and across."""
+    x = data.planes.index("x")
+    read[data.correctors.index("v2"), :, 0] += 0.05 * read[x, :, 0]
+    read[data.correctors.index("v4")] += 0.1 * read[data.correctors.index("v8")]
+
+
+def larger_steps(data: Any, rng: np.random.Generator) -> Any:
+    """Two correctors that were stepped 20 times as far."""
+    response, kicks = data.response.copy(), np.array(data.kicks)
+    for c in (2, 9):
+        response[c] *= 20
+        kicks[c] *= 20
+    return replace(data, response=response, kicks=kicks)
+
+
+def random_monitor(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[:, 6] = rng.permutation(read[:, 6])
+
+
+def noisy_monitor(times: float) -> Change:
+    def change(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+        read[:, 6] += times * noise_of(data) * rng.standard_normal(read[:, 6].shape)
+
+    return readings(change)
+
+
+def noisy_across(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    """One monitor, in x, of correctors that kick in y."""
+    across = own_plane(data) == 1
+    read[across, 6, 0] += 40 * noise_of(data) * rng.standard_normal(across.sum())
+
+
+def random_corrector(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[5] = rng.permutation(read[5])
+
+
+def silent(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[:, 6] = 0.0
+
+
+def moved(plane: int, times: float) -> Change:
+    """A closed orbit in every step and the RF's, each time another amount."""
+
+    def change(data: Any, rng: np.random.Generator) -> Any:
+        first = next(c for c, own in enumerate(own_plane(data)) if own == plane)
+        orbit = data.response[first, :, plane]
+        orbit = orbit * times * noise_of(data) / np.sqrt(np.mean(orbit**2))
+        amounts = rng.standard_normal(len(data.correctors) + 1)
+        response, rf = data.response.copy(), data.rf.orbit.copy()
+        response[:, :, plane] += amounts[:-1, None] * orbit
+        rf[:, plane] += amounts[-1] * orbit
+        return replace(data, response=response, rf=replace(data.rf, orbit=rf))
+
+    return change
+
+
+def drifting(data: Any, rng: np.random.Generator) -> Any:
+    """The beam's energy drifts within the steps, by a hundredth of what the RF's step makes."""
+    amounts = 0.01 * rng.standard_normal(len(data.correctors))
+    return replace(data, response=data.response + amounts[:, None, None] * data.rf.orbit)
+
+
+def exchanged_correctors(first: str, second: str) -> Change:
+    def change(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+        pair = [data.correctors.index(first), data.correctors.index(second)]
+        read[pair] = read[pair[::-1]]
+
+    return readings(change)
+
+
+def exchanged_monitors(first: str, second: str) -> Change:
+    def change(data: Any, rng: np.random.Generator) -> Any:
+        pair = [data.monitors.index(first), data.monitors.index(second)]
+        response, orbit = data.response.copy(), data.rf.orbit.copy()
+        response[:, pair] = response[:, pair[::-1]]
+        orbit[pair] = orbit[pair[::-1]]
+        return replace(data, response=response, rf=replace(data.rf, orbit=orbit))
+
+    return change
+
+
+def noise_times(factor: Any) -> Change:
+    return lambda data, rng: replace(data, noise=data.noise * np.asarray(factor))
+
+
+def rf_zeros(data: Any, rng: np.random.Generator) -> Any:
+    orbit = data.rf.orbit.copy()
+    orbit[[5, 15, 25]] = 0.0
+    return replace(data, rf=replace(data.rf, orbit=orbit))
+
+
+def rf_copied(data: Any, rng: np.random.Generator) -> Any:
+    """The design's dispersion, cell by cell the same."""
+    orbit = data.rf.orbit.copy()
+    orbit[:, 0] = 1e-4 * np.array([1.0, np.pi, np.sqrt(2)])[np.arange(len(orbit)) % 3]
+    return replace(data, rf=replace(data.rf, orbit=orbit))
+
+
+def no_rf(data: Any, rng: np.random.Generator) -> Any:
+    return replace(data, rf=None)
+
+
+def no_noise(data: Any, rng: np.random.Generator) -> Any:
+    return replace(data, noise=None)
+
+
+def zeros_across(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    for c, plane in enumerate(own_plane(data)):
+        read[c, :, 1 - plane] = 0.0
+
+
+def in_turn(change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
+    """A change of the readings of first turns or turns, [shot, turn, monitor, plane], in place."""
+
+    def changed(data: Any, rng: np.random.Generator) -> Any:
+        read = data.readings.copy()
+        change(read, data, rng)
+        return replace(data, readings=read)
+
+    return changed
+
+
+def no_x(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[..., 0] = np.nan
+
+
+def no_y(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[..., 1] = np.nan
+
+
+def lost(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[:, :, 20:] = 0.0
+
+
+def frozen(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[:, :, 9] = 1.234e-4
+
+
+def dead(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[:, :, 9] = 0.0
+
+
+def wild(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[2, 0, 11, 0] += 5e-3
+
+
+def reversed_x(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read[..., 0] *= -1
+
+
+def millimetres(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
+    read *= 1e-3
+
+
+# --- rows ---------------------------------------------------------------------------------------
+
+WEAK = Cause("quadrupole_gradient", "QF::2", -0.02)
+GRADIENTS = {"quadrupole_gradient": 3e-3}
+NOTHING = frozenset({"nothing"})
+MANY = frozenset({"distributed"})
+SOUND = NOTHING | MANY
+"""Verdicts on a machine without a single fault among its small errors."""
+LOCATED = frozenset({"located"})
+BENDS = [f"bend::{k}" for k in range(32)]
+
+
+def one(effect: str, element: str | None, amount: float, **more: Any) -> Scenario:
+    """A single cause in a response."""
+    return Scenario(
+        f"response: {effect} {element} {amount:g}", (Cause(effect, element, amount),), **more
+    )
+
+
+def usual(effect: str, element: str | None, amount: float, **more: Any) -> Scenario:
+    """A single cause among small errors of every kind, in a response."""
+    row = one(effect, element, amount, small=USUAL, lasts=True, **more)
+    return replace(row, name=row.name.replace("response", "response, usual errors"))
+
+
+def turned(effect: str, element: str | None, amount: float, **more: Any) -> Scenario:
+    """A single cause in first turns."""
+    return Scenario(
+        f"first turns: {effect} {element} {amount:g}", (Cause(effect, element, amount),),
+        ("first turns",), **more,
+    )  # fmt: skip
+
+
+def defect(name: str, damage: Change, *says: str, **more: Any) -> Scenario:
+    """A defect of a response's data, among small errors of gradients, calibrations and gains."""
+    small = {
+        **GRADIENTS,
+        "corrector_calibration": 0.02,
+        "monitor_gain_x": 0.01,
+        "monitor_gain_y": 0.01,
+    }
+    options = {
+        "ring": "both",
+        "small": small,
+        "found": (),
+        "verdicts": SOUND,
+        "lasts": True,
+        "says": says,
+    } | more
+    return Scenario(f"response, data: {name}", damage=damage, **options)
+
+
+RESPONSES = (
+    Scenario("response: nothing", verdicts=NOTHING),
+    one("quadrupole_gradient", "QF::2", -0.02),
+    one("quadrupole_gradient", "QF::2", -0.05),
+    one("quadrupole_roll", "QD::4", 0.01),
+    one("sextupole_offset_y", "sf::2", -3e-3),
+    one("dipole_roll", "bend::10", 1e-3),
+    one("quadrupole_offset_x", "QD::9", 1e-4),
+    one("corrector_kick_x", "v4", 2e-5),
+    one("corrector_calibration", "v3", -2.0),
+    one("corrector_calibration", "v5", 0.5),
+    one("corrector_calibration", "v2", -1.0),
+    one("corrector_roll", "v5", 0.05),
+    one("monitor_gain_x", "end_1", -2.0),
+    one("monitor_swap", "bpm::4", 1.0),
+    one("monitor_roll", "bpm::4", 0.01),
+    one("energy_offset", None, 2e-3),
+    one("energy_spread", None, 1e-3),
+    one("family_gradient", "QD", -0.01),
+    Scenario(
+        "response: two causes",
+        (Cause("quadrupole_roll", "QF::2", 0.02), Cause("corrector_calibration", "v7", 0.2)),
+    ),
+    Scenario(
+        "response: five causes",
+        (
+            Cause("quadrupole_gradient", "QD::5", 0.01),
+            Cause("quadrupole_gradient", "QF::9", -0.008),
+            Cause("quadrupole_gradient", "QF::3", 0.006),
+            Cause("quadrupole_gradient", "QD::12", 0.005),
+            Cause("corrector_calibration", "v2", 0.1),
+        ),
+        made={"kick": 1e-5, "noise": 2e-8, "engine": "ocelot", "rf_step": -3000.0},
+        lasts=True,
+    ),
+    Scenario("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY),
+    *(
+        Scenario(
+            f"response, usual errors: none, {k}", small=USUAL, seed=k, verdicts=SOUND, lasts=True
+        )
+        for k in (5, 8, 11)
+    ),
+    usual("quadrupole_gradient", "QF::2", 0.03),
+    usual("quadrupole_roll", "QD::4", 0.02),
+    usual("corrector_calibration", "v3", -2.0),
+    usual("corrector_calibration", "v2", -1.0),
+    usual("corrector_roll", "v5", np.pi / 2),
+    usual("monitor_gain_y", "bpm::6", -2.0),
+    usual("monitor_gain_x", "end_1", -1.33),
+    usual("monitor_swap", "end_6", 1.0),
+    usual("family_gradient", "QD", -0.0235),
+    usual("sextupole_offset_y", "sf::2", -3e-3),
+    Scenario(
+        "response: edges of all bends",
+        tuple(Cause("vertical_focusing", name, 2e-3) for name in BENDS),
+        small=GRADIENTS,
+        found=(),
+        verdicts=MANY,
+        says=("vertical_focusing",),
+        lasts=True,
+    ),
+    Scenario(
+        "response: an insertion device in a straight",
+        (Cause("vertical_focusing", "d::95", 0.01),),
+        small=GRADIENTS,
+        found=(),
+        verdicts=MANY | ONE,
+        others=1,
+        says=("d::95",),
+        lasts=True,
+    ),
+    Scenario(
+        "response: kicks in the dispersion",
+        small={"quadrupole_offset_x": 1e-4, **GRADIENTS},
+        verdicts=SOUND,
+        lasts=True,
+    ),
+    Scenario(
+        "response: small errors and the beam's energy",
+        (Cause("energy_offset", None, 2e-3),),
+        small=USUAL,
+        found=(),
+        verdicts=MANY | ONE,
+        others=1,
+        says=("energy_offset",),
+        lasts=True,
+    ),
+    Scenario(
+        "response: a design 2 % off",
+        ring="both",
+        edits=(("k = 0.9", "k = 0.88"),),
+        small=GRADIENTS,
+        found=(),
+        verdicts=MANY | ONE,
+        others=2,
+        lasts=True,
+    ),
+)
+
+DEFECTS = (
+    defect("single readings stick out", single(24, 10)),
+    defect("single readings are gross", single(12, 250)),
+    defect("two steps read too early", readings(lagging), "contradict"),
+    defect("another kick in two steps", readings(other_kick), "v2", "v4"),
+    defect("two steps are larger", larger_steps),
+    defect("a monitor resembles nothing", readings(random_monitor), "end_2"),
+    defect("a monitor is noisy", noisy_monitor(40), "end_2"),
+    defect("a monitor is noisy across", readings(noisy_across), "end_2"),
+    defect("a monitor is silent", readings(silent), "end_2"),
+    defect(
+        "a corrector resembles nothing", readings(random_corrector), "v5", others=1, verdicts=ANY
+    ),
+    defect("the beam moves in y", moved(1, 20), "the beam moved"),
+    defect("the beam moves little in x", moved(0, 5), "the beam moved"),
+    defect("the energy drifts", drifting),
+    *(
+        defect(
+            f"exchanged correctors {a}, {b}",
+            exchanged_correctors(a, b),
+            verdicts=LOCATED | MANY,
+            says=(f"{a} and {b}|{b} and {a}",),
+            others=1,
+        )
+        for a, b in (("v5", "v7"), ("v4", "v10"), ("v4", "v5"), ("v0", "v14"))
+    ),
+    defect(
+        "exchanged monitors",
+        exchanged_monitors("end_1", "end_14"),
+        verdicts=LOCATED | MANY,
+        says=("end_1 and end_14|end_14 and end_1",),
+        others=1,
+    ),
+    *(
+        Scenario(
+            f"response, data: exchanged correctors {a}, {b} alone",
+            damage=exchanged_correctors(a, b),
+            verdicts=LOCATED,
+            found=(Cause("exchanged", f"{a},{b}", np.nan),),
+        )
+        for a, b in (("v5", "v6"), ("v5", "v9"), ("generated_a", "v5"))
+    ),
+    Scenario(
+        "response, data: exchanged monitors alone",
+        damage=exchanged_monitors("end_1", "end_14"),
+        verdicts=LOCATED,
+        found=(Cause("exchanged", "end_1,end_14", np.nan),),
+    ),
+    defect("the noise is stated five times too small", noise_times([0.2, 1.0]), "the noise in x"),
+    defect("the noise is stated ten times too large", noise_times(10.0), "it is too large"),
+    defect("no noise is stated", no_noise, "noise of the readings is not stated"),
+    defect("no step of the RF", no_rf, "there is no RF step"),
+    defect("three zeros in the RF's orbit", rf_zeros, "RF's orbit"),
+    defect("the RF's orbit is a copy", rf_copied, "no measurement"),
+    defect("zeros across", readings(zeros_across), "no corrector is read in the other plane"),
+    defect("one-sided steps", lambda data, rng: data, made={"one_sided": True}),
+    defect(
+        "half of the correctors",
+        lambda data, rng: data,
+        made={"correctors": [f"v{k}" for k in range(0, 16, 2)]},
+    ),
+)
+
+
+def since(name: str, *causes: Cause, **more: Any) -> Scenario:
+    """What changed between two responses of a machine with usual errors."""
+    options = {"small": USUAL, "before": (), "lasts": True} | more
+    return Scenario(f"response, since: {name}", causes, **options)
+
+
+CHANGES = (
+    since("nothing", verdicts=NOTHING),
+    since("a magnet", Cause("quadrupole_gradient", "QD::5", -0.008)),
+    since("a supply", Cause("family_gradient", "QF", 0.003)),
+    since(
+        "a supply and a magnet",
+        Cause("family_gradient", "QF", 0.003),
+        Cause("quadrupole_gradient", "QD::5", -0.008),
+    ),
+    since(
+        "two supplies, 5 and -3 %",
+        Cause("family_gradient", "QF", 0.05),
+        Cause("family_gradient", "QD", -0.03),
+    ),
+    since("a corrector is reversed", Cause("corrector_calibration", "v3", -2.0)),
+    since("a monitor's gain", Cause("monitor_gain_x", "bpm::6", 0.1)),
+    since(
+        "correctors exchanged",
+        damage=exchanged_correctors("v5", "v9"),
+        verdicts=LOCATED,
+        found=(Cause("exchanged", "v5,v9", np.nan),),
+    ),
+    since(
+        "correctors exchanged on both days",
+        damage=exchanged_correctors("v5", "v9"),
+        before_damage=exchanged_correctors("v5", "v9"),
+        verdicts=NOTHING,
+    ),
+    since(
+        "correctors exchanged in the reference",
+        before_damage=exchanged_correctors("v5", "v9"),
+        verdicts=NOTHING | LOCATED | MANY,
+        says=("v5 and v9",),
+    ),
+    since(
+        "supplies, and every magnet by 1 %",
+        Cause("family_gradient", "QF", -0.01),
+        Cause("family_gradient", "QD", -0.016),
+        verdicts=ANY,
+        lasts=True,
+        damage=None,
+    ),
+    Scenario(
+        "first turns, since: a magnet",
+        (Cause("quadrupole_gradient", "QD::5", -0.02),),
+        ("first turns",),
+        small=USUAL,
+        before=(),
+    ),
+    Scenario(
+        "first turns, since: nothing",
+        kinds=("first turns",),
+        small=USUAL,
+        before=(),
+        verdicts=NOTHING,
+    ),
+    Scenario(
+        "orbit, since: a kick",
+        (Cause("corrector_kick_x", "v6", 3e-5),),
+        ("orbit",),
+        small=USUAL,
+        before=(),
+    ),
+)
+
+TURNS = (
+    Scenario("first turns: nothing", kinds=("first turns",), verdicts=NOTHING),
+    Scenario(
+        "first turns, usual errors: none", kinds=("first turns",), small=USUAL, verdicts=SOUND
+    ),
+    turned("quadrupole_gradient", "QD::5", -0.05),
+    turned("quadrupole_roll", "QF::7", 0.05),
+    turned("sextupole_strength", "sf::3", -1.0, made={"amplitude": 3e-3}),
+    turned("dipole_roll", "bend::10", 2e-3),
+    turned("quadrupole_offset_x", "QF::4", 5e-4),
+    turned("corrector_kick_x", "v4", 2e-4),
+    turned("monitor_gain_y", "bpm::6", -2.0),
+    turned("monitor_swap", "end_6", 1.0),
+    turned("monitor_offset_x", "end_6", 5e-4),
+    turned("quadrupole_gradient", "QD::5", -0.2, small=USUAL),
+    Scenario(
+        "first turns: two magnets",
+        (
+            Cause("quadrupole_gradient", "QD::5", -0.05),
+            Cause("quadrupole_gradient", "QF::12", 0.05),
+        ),
+        ("first turns",),
+    ),
+    Scenario(
+        "first turns, data: one frozen",
+        kinds=("first turns",),
+        damage=in_turn(frozen),
+        found=(Cause("monitor_dead", "bpm::4", np.nan),),
+        verdicts=ANY,
+        says=("frozen",),
+    ),
+    Scenario(
+        "first turns, data: one silent",
+        kinds=("first turns",),
+        damage=in_turn(dead),
+        found=(Cause("monitor_dead", "bpm::4", np.nan),),
+        verdicts=ANY,
+    ),
+    Scenario("first turns, data: a wild reading", (WEAK,), ("first turns",), damage=in_turn(wild)),
+    Scenario(
+        "first turns, data: lost", (WEAK,), ("first turns",), damage=in_turn(lost), says=("lost",)
+    ),
+    Scenario(
+        "first turns, data: x reversed",
+        kinds=("first turns",),
+        damage=in_turn(reversed_x),
+        verdicts=frozenset({"refused"}),
+        says=("x",),
+    ),
+    Scenario(
+        "first turns, data: millimetres",
+        kinds=("first turns",),
+        damage=in_turn(millimetres),
+        verdicts=frozenset({"refused"}),
+    ),
+    Scenario(
+        "first turns, x alone: nothing",
+        kinds=("first turns",),
+        damage=in_turn(no_y),
+        verdicts=NOTHING,
+    ),
+    Scenario(
+        "first turns, x alone: a magnet",
+        (Cause("quadrupole_gradient", "QD::5", -0.05),),
+        ("first turns",),
+        damage=in_turn(no_y),
+    ),
+    Scenario(
+        "first turns, y alone: a magnet",
+        (Cause("quadrupole_gradient", "QD::5", -0.05),),
+        ("first turns",),
+        damage=in_turn(no_x),
+    ),
+    Scenario("turns: nothing", kinds=("turns",), verdicts=NOTHING),
+    Scenario("turns: a magnet", (Cause("quadrupole_gradient", "QD::5", -0.01),), ("turns",)),
+    Scenario("turns: a roll", (Cause("quadrupole_roll", "QF::7", 0.02),), ("turns",)),
+    Scenario("turns: exchanged planes", (Cause("monitor_swap", "end_1", 1.0),), ("turns",)),
+    Scenario("turns, usual errors: none", kinds=("turns",), small=USUAL, verdicts=SOUND),
+    Scenario(
+        "turns, y alone: a magnet",
+        (Cause("quadrupole_gradient", "QD::5", -0.01),),
+        ("turns",),
+        damage=in_turn(no_x),
+    ),
+    Scenario("orbit: a kick", (Cause("corrector_kick_x", "v6", 3e-5),), ("orbit",)),
+    Scenario("orbit: nothing", kinds=("orbit",), verdicts=NOTHING),
+    Scenario(
+        "dispersion: a magnet", (Cause("quadrupole_gradient", "QD::3", -0.01),), ("dispersion",)
+    ),
+    Scenario(
+        "orbit, dispersion, tunes: nothing",
+        kinds=("orbit", "dispersion", "tunes"),
+        verdicts=NOTHING,
+    ),
+    Scenario(
+        "orbit, dispersion, tunes: a kick and a magnet",
+        (Cause("corrector_kick_x", "v6", 3e-5), Cause("quadrupole_gradient", "QD::3", -0.01)),
+        ("orbit", "dispersion", "tunes"),
+    ),
+    Scenario(
+        "turns, dispersion, usual errors: a magnet",
+        (Cause("quadrupole_gradient", "QD::3", -0.05),),
+        ("turns", "dispersion"),
+        small=USUAL,
+        lasts=True,
+    ),
+    Scenario("response, dispersion: a magnet", (WEAK,), ("response", "dispersion"), lasts=True),
+    Scenario(
+        "response, first turns, usual errors: a magnet",
+        (Cause("quadrupole_gradient", "QF::2", 0.03),),
+        ("response", "first turns"),
+        small=USUAL,
+        lasts=True,
+    ),
+)
+
+SCENARIOS = (*RESPONSES, *DEFECTS, *CHANGES, *TURNS)
+QUICK = tuple(own for own in SCENARIOS if not own.lasts)
+
+
+def main() -> None:
+    """The table, or the rows whose names contain one of the words."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("words", nargs="*")
+    parser.add_argument("--into", type=Path)
+    given = parser.parse_args()
+    known = json.loads(given.into.read_text())["rows"] if given.into and given.into.exists() else []
+    rows = {row["name"]: row for row in known}
+    for own in SCENARIOS:
+        if own.name in rows or (given.words and not any(word in own.name for word in given.words)):
+            continue
+        row = run(own)
+        rows[own.name] = row
+        print("wrong" if row["faults"] else "right", own.name, row.get("seconds"), row["verdict"],
+              *row["faults"], sep="; ", flush=True)  # fmt: skip
+        if given.into:
+            write_json(given.into, {"rows": list(rows.values())})
+    wrong = sum(bool(row["faults"]) for row in rows.values())
+    print(f"{len(rows) - wrong} of {len(rows)} right")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""The examples of the tutorials and pages run as written, and what they print is the truth."""
+
+import json
+import re
+import shlex
+import types
+from pathlib import Path
+
+import at
+import pytest
+import scipy.io
+from command import tmlattice
+from test_import import simulated  # noqa: F401  (a fixture)
+
+import tmlattice as package
+from tmlattice.lattice import save_ring, write_ring
+
+DOCS = Path(__file__).parent.parent / "docs"
+SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
+FAULT = package.Cause("quadrupole_gradient", "QD::5", -0.05)
+MAGNET = "qd::5"  # as AT's file has it
+WEAK = ("--effect", f"{FAULT.effect} {FAULT.element} {FAULT.amount}")
+
+
+def blocks(page, language):
+    """The blocks of one language on a page; what follows a `#` in a command is a comment."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
+
+
+def run(page, place):
+    """Each command of a tutorial, and what it did, in order."""
+    said = []
+    for block in blocks(f"tutorials/{page}.md", "sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            program, *words = shlex.split(line.removeprefix("$ "), comments=True)
+            if program == "tmlattice":
+                done = tmlattice(*words, cwd=place)
+                assert done.returncode == 0, done
+                said.append((line, done))
+    return said
+
+
+def right(remedy):
+    assert remedy.element.lower() == MAGNET
+    assert abs(remedy.amount - FAULT.amount) < 4 * remedy.amount_sigma < 0.2 * abs(FAULT.amount)
+
+
+@pytest.fixture(scope="module")
+def place(small_ring, simulated, tmp_path_factory):  # noqa: F811
+    """A folder with the files that the pages call the reader's own."""
+    place = tmp_path_factory.mktemp("examples")
+    save_ring(small_ring, place / "ring.json")
+    write_ring(small_ring, place / "small.at.json")
+    lattice = at.load_json(str(place / "small.at.json"))
+    for name in ("ring.mat", "my_ring.mat"):
+        at.save_mat(lattice, str(place / name))
+    scipy.io.savemat(place / "machine.loco.mat", simulated)
+    turns = ("--kind", "turn-by-turn")
+    for words in (
+        ("yesterday",),
+        ("today", "--seed", 1, *WEAK),
+        ("kick", *turns, *WEAK),
+        ("tunes", "--kind", "tunes", *WEAK),
+    ):
+        tmlattice("simulate", SMALL, "--out", *words, cwd=place, check=0)
+    (place / "readings.csv").write_bytes((place / "today" / "readings.csv").read_bytes())
+    return place
+
+
+def test_a_physicist_finds_the_magnet(place):
+    """From the lattice to the ring as found, and the LOCO file of a ring without errors."""
+    design = package.load_ring(place / "my_ring.mat")
+    info, _, found, _, response = (done.stdout for _, done in run("physicist", place))
+    for tune in package.one_turn_optics(package.TaylorNetwork.from_ring(design)).tunes:
+        assert f"{tune:.6f}".removeprefix("0") in info
+    as_found = package.load_ring(place / "found.at.json")
+    away = {
+        now.name: now.k1 / then.k1 - 1
+        for now, then in zip(as_found.elements, design.elements, strict=True)
+        if now.k1 != then.k1
+    }
+    assert away == {MAGNET: pytest.approx(FAULT.amount, abs=3e-3)}
+    assert f"{100 * away[MAGNET]:.2f}" in found
+    assert "nothing" in response.lower()
+
+
+def test_an_operator_is_told_the_magnet_and_the_settings(place):
+    """No verdict is an error, and the repair is what the fault asks for."""
+    check, found = (done for _, done in run("operator", place))
+    assert (check.returncode, found.returncode) == (0, 0)
+    result = json.loads((place / "report" / "diagnosis.json").read_text())
+    (finding,) = result["findings"]
+    right(types.SimpleNamespace(**finding["remedy"]))
+
+
+def test_in_python_too(place, monkeypatch):
+    monkeypatch.chdir(place)
+    (code,) = blocks("tutorials/physicist.md", "python")
+    names = {"tmlattice": package}
+    exec(code, names)
+    diagnosis = names["diagnosis"]
+    (finding,) = diagnosis.findings
+    right(finding.remedy)
+
+
+def test_what_several_measurements_say_together(place, monkeypatch):
+    monkeypatch.chdir(place)
+    (code,) = blocks("together.md", "python")
+    names = {}
+    exec(code, names)
+    (finding,) = names["diagnosis"].findings
+    right(finding.remedy)
+    (printed,) = re.findall(r"seen_by  # (.*)", code)
+    assert finding.seen_by == pytest.approx(json.loads(printed), abs=0.05)
