@@ -150,7 +150,7 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
     for name in texts:
         if _POSITION.search(name.rsplit("/", 1)[-1]):
             raise MeasurementError(f"'{path}': '{name}' holds texts; readings are numbers")
-    flat: list[Column] = []
+    flat: list[tuple[str, str, Any]] = []  # texts of them would take ten times the memory
     for name, (value, unit) in arrays.items():
         if name in texts:
             continue
@@ -165,7 +165,7 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
         short = name.rsplit("/", 1)[-1]
         if array.ndim == 1:
             plain, own = named(name)
-            flat.append(Column(plain, unit or own, [str(v) for v in array.tolist()]))
+            flat.append((plain, unit or own, array))
             continue
         fits = [list_ for list_ in texts.values() if len(list_) == array.shape[1]]
         if not fits:
@@ -175,23 +175,21 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
             )
         plain, own = named(short)
         flat += [
-            Column(f"{monitor} {plain}", unit or own, [str(v) for v in array[:, i].tolist()])
-            for i, monitor in enumerate(fits[0])
+            (f"{monitor} {plain}", unit or own, array[:, i]) for i, monitor in enumerate(fits[0])
         ]
-    lengths = [len(column.values) for column in flat]
+    lengths = [len(values) for _, _, values in flat]
     if not lengths:
         raise MeasurementError(
             f"'{path}' holds no readings: an array for each monitor and plane, or x and y [shot, "
             "monitor] with the monitors' names"
         )
     most = max(set(lengths), key=lengths.count)
-    for column in flat:
-        if len(column.values) != most and _POSITION.search(column.name):
-            raise MeasurementError(
-                f"'{path}': '{column.name}' has {len(column.values)} rows, others {most}"
-            )
+    for name, _, values in flat:
+        if len(values) != most and _POSITION.search(name):
+            raise MeasurementError(f"'{path}': '{name}' has {len(values)} rows, others {most}")
     names = [Column(name, "", list_) for name, list_ in texts.items() if len(list_) == most]
-    return [*names, *(column for column in flat if len(column.values) == most)]
+    kept = [column for column in flat if len(column[2]) == most]
+    return [*names, *(Column(name, unit, list(map(str, v.tolist()))) for name, unit, v in kept)]
 
 
 def _is_text(value: Any) -> bool:
