@@ -29,6 +29,7 @@ from tmlattice.machine.stored_beam import (
     simulate_tunes,
     simulate_turns,
 )
+from tmlattice.version import __version__
 
 LATTICE = Path(__file__).parent / "lattices" / "small_ring.py"
 USUAL = {"all": None}
@@ -794,7 +795,8 @@ def main() -> None:
         print("wrong" if row["faults"] else "right", own.name, row.get("seconds"), row["verdict"],
               *row["faults"], sep="; ", flush=True)  # fmt: skip
         if given.into:
-            write_json(given.into, {"rows": list(rows.values())})
+            made_by = {"command": "python -m tests.scenarios --into FILE", "package": __version__}
+            write_json(given.into, {**made_by, "rows": list(rows.values())})
     wrong = sum(bool(row["faults"]) for row in rows.values())
     print(f"{len(rows) - wrong} of {len(rows)} right")
 

@@ -84,8 +84,9 @@ def test_a_reader_that_leaves_ends_the_command_quietly(data):
 def stopped(folder, words, number, ready):
     """Send a signal to the command as soon as it is ready; its status and stderr."""
     process = psutil.Popen(
-        [sys.executable, "-m", "tmlattice", *words], cwd=folder, stderr=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-m", "tmlattice", *words], cwd=folder, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # nohup and a shell's & ignore it
+    )  # fmt: skip
     end = time.monotonic() + 60
     while not ready(process) and process.poll() is None and time.monotonic() < end:
         time.sleep(0.01)

@@ -70,9 +70,14 @@ def content_of(path: Path, error: type[TmlatticeError]) -> bytes:
         raise error(f"cannot read '{path}': {said}") from problem
 
 
-def zip_of(path: Path, error: type[TmlatticeError]) -> BytesIO:
+def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
     """The content of a ZIP archive (NumPy's and torch's arrays) whose parts are not compressed,
     so that together they are as large as the file.
+
+    Args:
+        path: the file.
+        error: raised.
+        wanted: what it should hold, and where that is from.
 
     Raises:
         error: as of `content_of`, no archive, or compressed parts.
@@ -82,7 +87,7 @@ def zip_of(path: Path, error: type[TmlatticeError]) -> BytesIO:
         with ZipFile(content) as archive:
             parts = archive.infolist()
     except (BadZipFile, ValueError, NotImplementedError) as problem:
-        raise error(f"'{path}' is no archive of arrays ({problem})") from problem
+        raise error(f"'{path}' does not hold {wanted} ({problem})") from problem
     size = len(content.getbuffer())
     if any(part.compress_type != ZIP_STORED for part in parts) or (
         sum(part.file_size for part in parts) > size

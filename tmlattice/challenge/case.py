@@ -322,7 +322,7 @@ def _truth(folder: Path, name: str) -> Truth:
     secret = _read(folder / "truth" / f"{name}.json", TRUTH)
     launches: dict[str, Array] = {}
     clean: dict[str, Array] = {}
-    content = zip_of(folder / "truth" / f"{name}.npz", TmlatticeError)
+    content = zip_of(folder / "truth" / f"{name}.npz", TmlatticeError, "arrays of a truth")
     with np.load(content) as arrays:
         for key in arrays:
             kind, part = key.split("_", 1)

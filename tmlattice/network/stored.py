@@ -24,15 +24,16 @@ def load_network(ring: Ring, path: Path) -> TaylorNetwork:
     Raises:
         TmlatticeError: no such file, no network's, or one of a ring of other magnets.
     """
-    content = zip_of(path, TmlatticeError)
+    wanted = (
+        f"the weights of a network of '{ring.name}'; name the network.pt that `tmlattice tune-fit` "
+        "wrote for this lattice"
+    )
+    content = zip_of(path, TmlatticeError, wanted)
     try:
         weights = torch.load(content, weights_only=True)
         dimension = int(weights["W0"].shape[1])
         network = TaylorNetwork.from_ring(ring, dimension)
         network.load_state_dict(weights)
     except Exception as error:
-        raise TmlatticeError(
-            f"'{path}' does not hold the weights of a network of '{ring.name}'; name the "
-            "network.pt that `tmlattice tune-fit` wrote for this lattice"
-        ) from error
+        raise TmlatticeError(f"'{path}' does not hold {wanted}") from error
     return network
