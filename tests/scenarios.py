@@ -425,7 +425,7 @@ def defect(name: str, damage: Change, *says: str, **more: Any) -> Scenario:
 
 
 RESPONSES = (
-    Scenario("response: nothing", verdicts=NOTHING),
+    Scenario("response: nothing", verdicts=NOTHING, lasts=True),
     one("quadrupole_gradient", "QF::2", -0.02),
     one("quadrupole_gradient", "QF::2", -0.05),
     one("quadrupole_roll", "QD::4", 0.01),
@@ -459,7 +459,7 @@ RESPONSES = (
         made={"kick": 1e-5, "noise": 2e-8, "engine": "ocelot", "rf_step": -3000.0},
         lasts=True,
     ),
-    Scenario("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY),
+    Scenario("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY, lasts=True),
     *(
         Scenario(
             f"response, usual errors: none, {k}", small=USUAL, seed=k, verdicts=SOUND, lasts=True
@@ -562,6 +562,7 @@ DEFECTS = (
             damage=exchanged_correctors(a, b),
             verdicts=LOCATED,
             found=(Cause("exchanged", f"{a},{b}", np.nan),),
+            lasts=True,
         )
         for a, b in (("v5", "v6"), ("v5", "v9"), ("generated_a", "v5"))
     ),
@@ -570,6 +571,7 @@ DEFECTS = (
         damage=exchanged_monitors("end_1", "end_14"),
         verdicts=LOCATED,
         found=(Cause("exchanged", "end_1,end_14", np.nan),),
+        lasts=True,
     ),
     defect("the noise is stated five times too small", noise_times([0.2, 1.0]), "the noise in x"),
     defect("the noise is stated ten times too large", noise_times(10.0), "it is too large"),

@@ -9,6 +9,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -53,11 +54,12 @@ def as_other(work):
 
 
 @pytest.fixture
-def open_folder(tmp_path):
-    """A folder that every user can enter and write to, as /tmp."""
-    for folder in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+def open_folder():
+    """A folder that everybody may write to, and reach: pytest's own are this user's alone."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         folder.chmod(0o1777)
-    return tmp_path
+        yield folder
 
 
 @pytest.fixture
