@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -181,15 +181,21 @@ def _number(value: float | None) -> float | None:
 # --- defects of the data ------------------------------------------------------------------------
 
 
-def readings(change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
-    """A change of a response's readings [corrector, monitor, plane] in place."""
+def changed(name: str, change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
+    """A change, in place, of a copy of an array of the record."""
 
-    def changed(data: Any, rng: np.random.Generator) -> Any:
-        response = data.response.copy()
-        change(response, data, rng)
-        return replace(data, response=response)
+    def made(data: Any, rng: np.random.Generator) -> Any:
+        values = getattr(data, name).copy()
+        change(values, data, rng)
+        return replace(data, **{name: values})
 
-    return changed
+    return made
+
+
+readings = partial(changed, "response")
+"""Of a response, [corrector, monitor, plane]."""
+in_turn = partial(changed, "readings")
+"""Of first turns or turns, [shot, turn, monitor, plane]."""
 
 
 def own_plane(data: Any) -> np.ndarray:
@@ -327,17 +333,6 @@ def no_noise(data: Any, rng: np.random.Generator) -> Any:
 def zeros_across(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
     for c, plane in enumerate(own_plane(data)):
         read[c, :, 1 - plane] = 0.0
-
-
-def in_turn(change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
-    """A change of the readings of first turns or turns, [shot, turn, monitor, plane], in place."""
-
-    def changed(data: Any, rng: np.random.Generator) -> Any:
-        read = data.readings.copy()
-        change(read, data, rng)
-        return replace(data, readings=read)
-
-    return changed
 
 
 def no_x(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:

@@ -16,6 +16,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -166,18 +167,12 @@ def hdf5(path: str) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     return arrays, attributes
 
 
-class _opened:
-    def __init__(self, path: str) -> None:
-        import h5py
+@contextmanager
+def _opened(path: str) -> Iterator["_Budget"]:
+    import h5py
 
-        self.file = h5py.File(path, "r")
-        self.size = Path(path).stat().st_size
-
-    def __enter__(self) -> "_Budget":
-        return _Budget(self.file, self.size)
-
-    def __exit__(self, *_: object) -> None:
-        self.file.close()
+    with h5py.File(path, "r") as file:
+        yield _Budget(file, Path(path).stat().st_size)
 
 
 class _Budget:

@@ -200,13 +200,8 @@ def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
     chain: list[list[tuple[Array, Array, Array]]] = []
     for element in ring.elements:
         own = vars(element.source.element).values()
-        key: Any = (
-            type(element.source),
-            element.kind,
-            *(v for v in own if isinstance(v, int | float)),
-        )
-        if element.kind in ("matrix", "wiggler", "solenoid"):  # arrays
-            key = id(element.source)
+        numbers = (v for v in own if isinstance(v, int | float | list | tuple | np.ndarray))
+        key = (type(element.source), element.kind, *(np.asarray(v).tobytes() for v in numbers))
         if key not in known:
             known[key] = _parts(element, ring.map_energy)
         chain.append(known[key])
