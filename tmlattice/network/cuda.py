@@ -12,12 +12,15 @@ This module needs torch and Triton alone. Benchmark and comparison with the CPU:
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+
+from tmlattice.network.autograd import Tensors
+from tmlattice.network.reference import packed
 
 CONFIGURATION: dict[str, dict[str, int]] = {
     "track": {"BLOCK": 256, "num_warps": 1},
@@ -37,17 +40,24 @@ def _pair(i: int, j: int, n: int) -> int:
 
 @triton.jit
 def _load(at, stride, n: tl.constexpr, inside):  # type: ignore[no-untyped-def]
-    """n rows as a tuple; zeros outside."""
+    """n rows as a tuple; zeros outside. They stay out of the first cache: it is for weights."""
     x = ()
     for i in tl.static_range(n):
-        x = x + (tl.load(at + i * stride, mask=inside, other=0.0),)
+        x = x + (tl.load(at + i * stride, mask=inside, other=0.0, cache_modifier=".cg"),)
     return x
 
 
 @triton.jit
 def _store(at, stride, x, n: tl.constexpr, inside):  # type: ignore[no-untyped-def]
     for i in tl.static_range(n):
-        tl.store(at + i * stride, x[i], mask=inside)
+        tl.store(at + i * stride, x[i], mask=inside, cache_modifier=".cs")
+
+
+@triton.jit
+def _ahead(w, n: tl.constexpr):  # type: ignore[no-untyped-def]
+    """One number of every cache line of the layer at w: all warps would wait for each line."""
+    place = 8 * tl.arange(0, 32)
+    return tl.load(w + place, mask=place < n * (n + 1) * (n + 2) // 2, other=0.0)
 
 
 @triton.jit
@@ -119,24 +129,24 @@ def _track(w, curved, history, turns, layers, batch, n: tl.constexpr, BLOCK: tl.
     inside = own < batch
     at = history + own
     x = _load(at, batch, n, inside)
+    seen = tl.zeros([32], tl.float64)
     for _turn in range(turns):
-        layer = w
         for k in range(layers):
-            x = _image(layer, tl.load(curved + k), x, n, n)
-            layer += n * width
+            seen += _ahead(w + (k + 1) % layers * n * width, n)
+            x = _image(w + k * n * width, tl.load(curved + k), x, n, n)
         at += n * batch
         _store(at, batch, x, n, inside)
+    tl.store(history + tl.arange(0, 32), seen, mask=tl.arange(0, 32) < -turns)  # never
 
 
 @triton.jit
-def _read(r, bent, first, last, x, readings, monitors, own, inside, n: tl.constexpr):  # type: ignore[no-untyped-def]
+def _read(r, bent, first, last, x, readings, batch, own, inside, n: tl.constexpr):  # type: ignore[no-untyped-def]
     """Readings of the monitors first to last - 1, that hang on one exit."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     for m in range(first, last):
         y = _image(r + m * 2 * width, tl.load(bent + m), x, 2, n)
-        at = readings + (own.to(tl.int64) * monitors + m) * 2
-        tl.store(at, y[0], mask=inside)
-        tl.store(at + 1, y[1], mask=inside)
+        at = readings + m * 2 * batch.to(tl.int64) + own
+        _store(at, batch, y, 2, inside)
 
 
 @triton.jit(do_not_specialize=["layers", "monitors", "batch"])
@@ -144,38 +154,40 @@ def _forward(  # type: ignore[no-untyped-def]
     w, curved, r, bent, start, states, readings, layers, monitors, batch,
     n: tl.constexpr, KEEP: tl.constexpr, READ: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Readings [batch, monitor, 2] of one pass from states[0]; fill states[1:] [layer + 1, n,
+    """Readings [monitor, 2, batch] of one pass from states[0]; fill states[1:] [layer + 1, n,
     batch] (KEEP), or replace states[0] by the last of them."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     own = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = own < batch
     at = states + own
     x = _load(at, batch, n, inside)
-    first = tl.load(start)
+    seen = tl.zeros([32], tl.float64)
     for k in range(layers):
+        seen += _ahead(w + (k + 1) % layers * n * width, n)
         if READ:
+            first = tl.load(start + k)
             last = tl.load(start + k + 1)
-            _read(r, bent, first, last, x, readings, monitors, own, inside, n)
-            first = last
-        x = _image(w, tl.load(curved + k), x, n, n)
-        w += n * width
+            _read(r, bent, first, last, x, readings, batch, own, inside, n)
+        x = _image(w + k * n * width, tl.load(curved + k), x, n, n)
         if KEEP:
             at += n * batch
             _store(at, batch, x, n, inside)
     if READ:
-        _read(r, bent, first, monitors, x, readings, monitors, own, inside, n)
+        first = tl.load(start + layers)
+        _read(r, bent, first, monitors, x, readings, batch, own, inside, n)
     if not KEEP:
         _store(at, batch, x, n, inside)
+    tl.store(states + tl.arange(0, 32), seen, mask=tl.arange(0, 32) < -layers)  # never
 
 
 @triton.jit
-def _sense(r, bent, first, last, x, below, pulls, strides, own, inside, n: tl.constexpr):  # type: ignore[no-untyped-def]
+def _sense(  # type: ignore[no-untyped-def]
+    r, bent, first, last, x, below, pulls, by_monitor, by_plane, inside, n: tl.constexpr
+):
     """Add to d loss / d x what the monitors of one exit contribute."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     for m in range(first, last):
-        at = pulls + own.to(tl.int64) * strides[0] + m * strides[1]
-        here = tl.load(at, mask=inside, other=0.0)
-        up = (here, tl.load(at + strides[2], mask=inside, other=0.0))
+        up = _load(pulls + m * by_monitor.to(tl.int64), by_plane, 2, inside)
         added = _pull(r + m * 2 * width, tl.load(bent + m), x, up, 2, n)
         total = ()
         for i in tl.static_range(n):
@@ -184,9 +196,9 @@ def _sense(r, bent, first, last, x, below, pulls, strides, own, inside, n: tl.co
     return below
 
 
-@triton.jit(do_not_specialize=["layers", "batch"])
+@triton.jit(do_not_specialize=["by_batch", "by_monitor", "by_plane", "layers", "batch"])
 def _reverse(  # type: ignore[no-untyped-def]
-    w, curved, r, bent, start, states, pulls, strides, adjoint, layers, batch,
+    w, curved, r, bent, start, states, pulls, by_batch, by_monitor, by_plane, adjoint, layers, batch,
     n: tl.constexpr, KEEP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Fill adjoint[:-1] [layer + 1, n, batch] = d loss / d states from adjoint[-1], of the states
@@ -199,28 +211,33 @@ def _reverse(  # type: ignore[no-untyped-def]
     at = adjoint + own
     if KEEP:
         at += layers.to(tl.int64) * n * batch
-    w += layers * n * width
     last = tl.load(start + layers + 1)
     first = tl.load(start + layers)
     up = _load(at, batch, n, inside)
     x = _load(x_at, batch, n, inside)
-    up = _sense(r, bent, first, last, x, up, pulls, strides, own, inside, n)
+    pulls += own.to(tl.int64) * by_batch
+    up = _sense(r, bent, first, last, x, up, pulls, by_monitor, by_plane, inside, n)
     if KEEP:
         _store(at, batch, up, n, inside)
+    seen = tl.zeros([32], tl.float64)
+    x_at -= n * batch
+    entrance = _load(x_at, batch, n, inside)
     for back in range(layers):
         k = layers - 1 - back
-        w -= n * width
+        seen += _ahead(w + tl.maximum(k - 1, 0) * n * width, n)
+        x = entrance
         x_at -= n * batch
-        x = _load(x_at, batch, n, inside)
-        up = _pull(w, tl.load(curved + k), x, up, n, n)
-        last = first
+        entrance = _load(x_at, batch, n, inside & (k > 0))
+        up = _pull(w + k * n * width, tl.load(curved + k), x, up, n, n)
         first = tl.load(start + k)
-        up = _sense(r, bent, first, last, x, up, pulls, strides, own, inside, n)
+        last = tl.load(start + k + 1)  # not carried from the step before: Triton 3.6 loses it
+        up = _sense(r, bent, first, last, x, up, pulls, by_monitor, by_plane, inside, n)
         if KEEP:
             at -= n * batch
             _store(at, batch, up, n, inside)
     if not KEEP:
         _store(at, batch, up, n, inside)
+    tl.store(adjoint + tl.arange(0, 32), seen, mask=tl.arange(0, 32) < -layers)  # never
 
 
 @triton.jit(do_not_specialize=["layers", "batch"])
@@ -259,36 +276,14 @@ def _sums(  # type: ignore[no-untyped-def]
         tl.store(at + m, tl.sum(total[m], 0))
 
 
-class ReadOuts(NamedTuple):
-    """The monitors of a ring: r [monitor, 2, 1 + n + n (n + 1) / 2]; bent [monitor], whether it has
-    a second order; start [layer + 2], see `RingMaps`."""
-
-    r: Tensor
-    bent: Tensor
-    start: Tensor
-
-
-def packed(W0: Tensor, W1: Tensor, W2: Tensor) -> Tensor:
-    """Coefficients of polynomials side by side, [..., row, 1 + n + n (n + 1) / 2]."""
-    return torch.cat([W0[..., None], W1, W2], dim=-1)
-
-
-def unpacked(w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The inverse of `packed`."""
-    n = w.shape[1]
-    return w[..., 0], w[..., 1 : 1 + n], w[..., 1 + n :]
-
-
-def read_outs(R: tuple[Tensor, Tensor, Tensor], start: Tensor) -> ReadOuts:
-    """Of R0 [monitor, 2], R1 [monitor, 2, n], R2 [monitor, 2, n (n + 1) / 2] on the card."""
-    return ReadOuts(packed(*R), _curved(R[2]), start.to(torch.int32))
-
-
-def _curved(W2: Tensor) -> Tensor:
-    return (W2 != 0).flatten(1).any(dim=1).to(torch.int32)
+def _curved(w: Tensor) -> Tensor:
+    """Which polynomials [layer, row, coefficient] have a second order, [layer]."""
+    n = (round((8 * w.shape[-1] + 1) ** 0.5) - 3) // 2
+    return (w[..., 1 + n :] != 0).flatten(1).any(dim=1).to(torch.int32)
 
 
 def _on(tensor: Tensor) -> AbstractContextManager[Any]:
+    """Triton starts kernels on the current device."""
     return torch.cuda.device_of(tensor)
 
 
@@ -296,137 +291,110 @@ def _programs(batch: int, kernel: str) -> tuple[int]:
     return (triton.cdiv(batch, CONFIGURATION[kernel]["BLOCK"]),)
 
 
-def _rows(launch: Tensor) -> Tensor:
-    """[batch, n] as [n, batch], a copy."""
-    return launch.detach().T.clone(memory_format=torch.contiguous_format)
-
-
 def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
-    """States [batch, turns + 1, n] at the start of every turn, from launch [batch, n]."""
+    """States [batch, turns + 1, n] at the start of every turn, from launch [batch, n].
+
+    Args:
+        launch: on the card.
+        w: all layers of the turn, as `reference.packed`.
+        turns: at least 1.
+    """
     layers, n, _ = w.shape
     batch = len(launch)
     history = launch.new_empty(turns + 1, n, batch)
     history[0] = launch.T
     with _on(w):
         _track[_programs(batch, "track")](
-            w, _curved(unpacked(w)[2]), history, turns, layers, batch, n, **CONFIGURATION["track"]
+            w, _curved(w), history, turns, layers, batch, n, **CONFIGURATION["track"]
         )
     return history.permute(2, 0, 1)
 
 
-def forward(launch: Tensor, w: Tensor, monitors: ReadOuts) -> tuple[Tensor, Tensor]:
-    """Readings [batch, monitor, 2] of one pass, and the states behind the last layer [batch, n]."""
-    states = _rows(launch)
-    readings = launch.new_empty(len(launch), len(monitors.r), 2)
-    _pass(w, _curved(unpacked(w)[2]), monitors, states, readings)
-    return readings, states.T
+class TritonSweep:
+    """See `autograd.BackEnd`. Nothing is kept from the forward sweep: the states are found once
+    more, a part of the trajectories at a time, so that a quarter of the card's memory is enough for
+    any batch."""
 
+    def __init__(self, r: Tensor, start: Tensor) -> None:
+        self.r, self.start = r, start
+        self.read_outs = r, _curved(r), start.to(torch.int32)
 
-def _pass(
-    w: Tensor, curved: Tensor, monitors: ReadOuts, states: Tensor, readings: Tensor | None
-) -> None:
-    layers, n, _ = w.shape
-    batch = states.shape[-1]
-    with _on(w):
-        _forward[_programs(batch, "forward")](
-            w, curved, *monitors, states, states if readings is None else readings, layers,
-            len(monitors.r), batch, n, KEEP=states.ndim == 3, READ=readings is not None,
-            **CONFIGURATION["forward"],
-        )  # fmt: skip
+    def forward(self, launch: Tensor, weights: Tensors) -> tuple[Tensor, Tensor, Tensor]:
+        """One pass through all layers."""
+        w = packed(*weights)
+        states = launch.T.clone(memory_format=torch.contiguous_format)
+        readings = launch.new_empty(len(self.r), 2, len(launch))
+        self.fill(w, _curved(w), states, readings)
+        return readings.permute(2, 0, 1), states.T, launch.new_empty(0)
 
+    def backward(
+        self, launch: Tensor, weights: Tensors, kept: Tensor, pulls: Tensors, wanted: bool
+    ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        """The adjoint sweep, then sums over trajectories."""
+        w = packed(*weights)
+        curved = _curved(w)
+        by_launch = torch.empty_like(launch)
+        total = torch.zeros_like(w)
+        for part in _parts(launch, len(w)):
+            states = launch.new_empty(len(w) + 1, launch.shape[1], part.stop - part.start)
+            states[0] = launch[part].T
+            self.fill(w, curved, states)
+            adjoint = torch.empty_like(states) if wanted else torch.empty_like(states[-1:])
+            adjoint[-1] = pulls[1][part].T
+            self.reverse(w, curved, states, pulls[0][part], adjoint)
+            by_launch[part] = adjoint[0].T
+            if wanted:
+                total += sums(states, adjoint)
+        n = launch.shape[1]
+        by_weights = total[..., 0], total[..., 1 : 1 + n], total[..., 1 + n :]
+        return by_launch, by_weights if wanted else (None, None, None)
 
-def backward(
-    launch: Tensor, w: Tensor, monitors: ReadOuts, pulls: Tensor, end: Tensor, weights: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Gradients by the launch [batch, n] and, if asked for, by w.
+    def fill(
+        self, w: Tensor, curved: Tensor, states: Tensor, readings: Tensor | None = None
+    ) -> None:
+        """Fill states [layer + 1, n, batch] from states[0]; or readings [monitor, 2, batch], and
+        replace states [n, batch] by the last ones."""
+        layers, n, _ = w.shape
+        batch = states.shape[-1]
+        with _on(w):
+            _forward[_programs(batch, "forward")](
+                w, curved, *self.read_outs, states, states if readings is None else readings,
+                layers, len(self.r), batch, n, KEEP=readings is None, READ=readings is not None,
+                **CONFIGURATION["forward"],
+            )  # fmt: skip
 
-    States are found once more, a part of the trajectories at a time, rather than kept: a fraction
-    `MEMORY` of the card holds them and the adjoint states, whatever the batch.
-
-    Args:
-        launch, w, monitors: of `forward`.
-        pulls: d loss / d readings, [batch, monitor, 2].
-        end: d loss / d states behind the last layer, [batch, n].
-        weights: whether the gradient by w is wanted.
-    """
-    gradient = torch.empty_like(launch)
-    total = torch.zeros_like(w) if weights else None
-    curved = _curved(unpacked(w)[2])
-    for part in _parts(launch, len(w)):
-        states = launch.new_empty(len(w) + 1, launch.shape[1], part.stop - part.start)
-        states[0] = launch[part].T
-        _pass(w, curved, monitors, states, None)
-        adjoint = torch.empty_like(states) if weights else states.new_empty(states.shape[1:])
-        (adjoint[-1] if weights else adjoint).copy_(end[part].T)
-        _back(w, curved, monitors, states, pulls[part], adjoint)
-        gradient[part] = (adjoint[0] if weights else adjoint).T
-        if total is not None:
-            total += _weights(states, adjoint)
-    return gradient, total
-
-
-MEMORY = 0.25
+    def reverse(
+        self, w: Tensor, curved: Tensor, states: Tensor, pulls: Tensor, adjoint: Tensor
+    ) -> None:
+        """Fill adjoint [layer + 1, n, batch] from adjoint[-1] and pulls [batch, monitor, 2]; of one
+        layer alone, it is replaced by that of the first."""
+        layers, n, _ = w.shape
+        batch = states.shape[-1]
+        with _on(w):
+            _reverse[_programs(batch, "reverse")](
+                w, curved, *self.read_outs, states, pulls, *pulls.stride(), adjoint, layers, batch,
+                n, KEEP=len(adjoint) > 1, **CONFIGURATION["reverse"],
+            )  # fmt: skip
 
 
 def _parts(launch: Tensor, layers: int) -> Iterator[slice]:
-    """Equal parts of the trajectories, few enough for the card's memory."""
+    """Equal parts of the trajectories, few enough for a quarter of the card's memory."""
     batch, n = launch.shape
-    room = MEMORY * torch.cuda.get_device_properties(launch.device).total_memory
-    largest = max(int(room / (2 * (layers + 1) * n * 8)), 1)
-    size = triton.cdiv(batch, max(triton.cdiv(batch, largest), 1))
+    room = torch.cuda.get_device_properties(launch.device).total_memory // 4
+    largest = max(room // (2 * (layers + 1) * n * launch.itemsize), 1)
+    size = triton.cdiv(batch, triton.cdiv(batch, largest))
     for first in range(0, batch, size):
         yield slice(first, min(first + size, batch))
 
 
-def _back(
-    w: Tensor, curved: Tensor, monitors: ReadOuts, states: Tensor, pulls: Tensor, adjoint: Tensor
-) -> None:
-    layers, n, _ = w.shape
-    batch = states.shape[-1]
-    with _on(w):
-        _reverse[_programs(batch, "reverse")](
-            w, curved, *monitors, states, pulls, pulls.stride(), adjoint, layers, batch, n,
-            KEEP=adjoint.ndim == 3, **CONFIGURATION["reverse"],
-        )  # fmt: skip
-
-
-def _weights(states: Tensor, adjoint: Tensor) -> Tensor:
-    """The gradient by w, [layer, n, 1 + n + n (n + 1) / 2]."""
+def sums(states: Tensor, adjoint: Tensor) -> Tensor:
+    """The gradient by the weights, [layer, n, 1 + n + n (n + 1) / 2]."""
     steps, n, batch = states.shape
     rows = 4 if n == 4 else 2  # as many sums as registers hold
     parts = triton.cdiv(batch, CONFIGURATION["sums"]["PART"])
-    sums = states.new_empty(parts, steps - 1, n, (n + 1) * (n + 2) // 2)
+    partial = states.new_empty(parts, steps - 1, n, (n + 1) * (n + 2) // 2)
     with _on(states):
         _sums[(steps - 1, parts, n // rows)](
-            states, adjoint, sums, steps - 1, batch, n, rows, **CONFIGURATION["sums"]
+            states, adjoint, partial, steps - 1, batch, n, rows, **CONFIGURATION["sums"]
         )
-    return sums.sum(dim=0)
-
-
-def symplectic_coefficients(W1: Tensor, W2: Tensor, form: Tensor) -> Tensor:
-    """`tmlattice.network.symplectic.symplectic_coefficients` in torch's own operations,
-    differentiable; `form` is the matrix S [n, n]."""
-    layers, n, _ = W1.shape
-    i, j = torch.triu_indices(n, n, device=W1.device)
-    second = W2.new_zeros(layers, n, n, n)
-    second[:, :, i, j] = W2
-    second = second + second.mT
-    G = torch.cat([W1[:, :, None], second], dim=2).flatten(2)  # [layer, image, (u, b)]
-    M = (G.mT @ (form @ G)).unflatten(2, (n + 1, n)).unflatten(1, (n + 1, n))  # [layer, u, b, v, c]
-    M = M + M.permute(0, 3, 2, 1, 4)
-    u, v = torch.triu_indices(n + 1, n + 1, device=W1.device)
-    b, c = torch.triu_indices(n, n, 1, device=W1.device)
-    M = M[:, u[:, None], b, v[:, None], c] * torch.where(u == v, 0.5, 1.0)[:, None].to(M)
-    constant = torch.zeros_like(M[0])
-    constant[0] = form[b, c]
-    return M - constant
-
-
-def penalty_parts(W1: Tensor, W2: Tensor, form: Tensor, design: Tensor | None = None) -> Tensor:
-    """Sums of squares of these coefficients by degree, [layer, 3], less those of a `design`."""
-    n = W1.shape[1]
-    M = symplectic_coefficients(W1, W2, form)
-    squares = (M if design is None else M - design).square().sum(dim=2)
-    return torch.stack(
-        [squares[:, 0], squares[:, 1 : n + 1].sum(dim=1), squares[:, n + 1 :].sum(dim=1)], dim=1
-    )
+    return partial.sum(dim=0)
