@@ -59,7 +59,10 @@ class Sweep(torch.autograd.Function):
     def backward(ctx: Any, pulls: Tensor, end: Tensor, _: Tensor) -> Any:  # type: ignore[override]
         """Gradients by the launch and all weights."""
         wanted = any(ctx.needs_input_grad[1:4])
-        return *_Gradient.apply(pulls, end, *ctx.saved_tensors, ctx.back_end, wanted), None
+        gradients = _Gradient.apply(  # type: ignore[no-untyped-call]
+            pulls, end, *ctx.saved_tensors, ctx.back_end, wanted
+        )
+        return *gradients, None
 
     @staticmethod
     def vmap(*_: Any) -> Any:

@@ -51,6 +51,9 @@ class TaylorNetwork(NetworkChain, Chain):
     """
 
     DEVICES = ("cpu", "cuda")
+    _read_outs: Tensor
+    _closing: Tensor
+    _first_monitor: Tensor
 
     def __init__(self, maps: RingMaps) -> None:
         torch.nn.Module.__init__(self)
@@ -90,7 +93,8 @@ class TaylorNetwork(NetworkChain, Chain):
     def sweep(self) -> BackEnd:
         """What runs the sweeps on the device of the weights."""
         if self.W0.is_cuda:
-            return _cuda().TritonSweep(self._read_outs, self._first_monitor)
+            on_card: BackEnd = _cuda().TritonSweep(self._read_outs, self._first_monitor)
+            return on_card
         return CompiledSweep(self.maps, self._read_outs, self._first_monitor)
 
     def forward(

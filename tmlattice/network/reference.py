@@ -64,14 +64,15 @@ def plain_coefficients(W1: Tensor, W2: Tensor, form: Tensor) -> Tensor:
     second[:, :, i, j] = W2
     second = second + second.mT
     G = torch.cat([W1[:, :, None], second], dim=2).flatten(2)  # [layer, image, (u, b)]
-    M = (G.mT @ (form @ G)).unflatten(2, (n + 1, n)).unflatten(1, (n + 1, n))
+    M = (G.mT @ (form @ G)).reshape(layers, n + 1, n, n + 1, n)
     M = M + M.permute(0, 3, 2, 1, 4)  # [layer, u, b, v, c]
     u, v = torch.triu_indices(n + 1, n + 1, device=W1.device)
     b, c = torch.triu_indices(n, n, 1, device=W1.device)
     M = M[:, u[:, None], b, v[:, None], c] * torch.where(u == v, 0.5, 1.0)[:, None].to(M)
     constant = torch.zeros_like(M[0])
     constant[0] = form[b, c]
-    return M - constant
+    difference: Tensor = M - constant
+    return difference
 
 
 def plain_penalty_parts(
