@@ -10,6 +10,7 @@ from tmlattice.errors import missing_package
 
 try:
     from tmlattice.network.network import TaylorNetwork
+    from tmlattice.network.reference import plain_readings
     from tmlattice.network.stored import load_network, save_network
     from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
     from tmlattice.network.symplectic_network import SymplecticNetwork
@@ -21,6 +22,7 @@ __all__ = [
     "TaylorNetwork",
     "load_network",
     "penalty_parts",
+    "plain_readings",
     "save_network",
     "symplectic_penalty",
 ]

@@ -208,8 +208,8 @@ def reverse(
         k = layers - 1 - back
         seen += _ahead(w + tl.maximum(k - 1, 0) * n * width, n)
         x = entrance
-        x_at -= n * batch
-        entrance = _load(x_at, batch, n, inside & (k > 0))
+        x_at -= tl.minimum(k, 1) * n * batch  # of the layer before, early enough
+        entrance = _load(x_at, batch, n, inside)
         up = _pull(w + k * n * width, tl.load(curved + k), x, up, n, n)
         first = tl.load(start + k)
         last = tl.load(start + k + 1)  # not carried from the step before: Triton 3.6 loses it
