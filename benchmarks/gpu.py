@@ -183,7 +183,10 @@ class Run:
 
     def tracking(self):
         w, design = self.turn(self.network), self.turn(self.design)
-        options = [{"BLOCK": b, "num_warps": n} for b, n in TRACK]
+        options = [
+            {"BLOCK": b, "num_warps": n, "UNROLL": u, **({"maxnreg": r} if r else {})}
+            for b, n, u, r in TRACK
+        ]
         for count in (100_000, 1_000_000):
             x = self.launches(count)
 
@@ -208,12 +211,8 @@ class Run:
         states[0] = x.T
         adjoint = torch.randn_like(states)
         ones = [{"BLOCK": b, "num_warps": n} for b, n in PASS]
-        self.choose(
-            "forward", "readings", ones, lambda: sweep.fill(w, curved, x.T.clone(), readings)
-        )
-        read = self.cuda.CONFIGURATION["forward"]
-        self.choose("forward", "states", ones, lambda: sweep.fill(w, curved, states))
-        self.cuda.CONFIGURATION["forward"] = read
+        self.choose("readings", count, ones, lambda: sweep.fill(w, curved, x.T.clone(), readings))
+        self.choose("states", count, ones, lambda: sweep.fill(w, curved, states))
         pulls = readings.permute(2, 0, 1)
         self.choose(
             "reverse", count, ones, lambda: sweep.reverse(w, curved, states, pulls, adjoint)
@@ -258,7 +257,10 @@ class Run:
             self.say(f"network.track, {count} x {turns}, s", time.perf_counter() - begun)
 
 
-TRACK = ((64, 1), (128, 1), (256, 1), (128, 2), (256, 2), (512, 2))
+TRACK = (
+    (128, 1, 1, 0), (128, 1, 2, 0), (128, 1, 4, 0), (256, 1, 1, 0), (256, 1, 2, 0),
+    (256, 1, 4, 0), (256, 1, 2, 168), (256, 2, 2, 0), (512, 2, 2, 0),
+)  # fmt: skip
 PASS = ((32, 1), (64, 1), (128, 1), (64, 2))
 SUMS = ((32, 1, 8192), (32, 1, 16384), (64, 2, 16384))
 

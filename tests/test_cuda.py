@@ -25,6 +25,7 @@ from tmlattice.network import cuda
 from tmlattice.network.reference import packed, plain_pass
 
 cuda._parts = lambda launch, layers: [slice(0, 3), slice(3, len(launch))]
+cuda._multiprocessors = lambda tensor: 1
 torch.manual_seed(1)
 network = TaylorNetwork.from_ring(load_ring(sys.argv[1]), int(sys.argv[2]))
 n, layers = network.dimension, len(network.layers)
@@ -55,9 +56,14 @@ for wanted in (True, False):
             differ(got, slope)
         else:
             assert got is None
-turns = cuda.track(launch, packed(*weights), 2)
-second = plain_pass(end, weights, sweep.r, sweep.start)[1]
-differ(turns, torch.stack([launch, end, second], dim=1))
+for order in ([0, 1], [0, 1, 0], [1, 1, 1]):  # some layers linear, an odd number, all curved
+    chain = [w[order] for w in weights]
+    start = torch.zeros(len(order) + 2, dtype=torch.int64)
+    start[-1] = 1
+    first = plain_pass(launch, chain, sweep.r[:1], start)[1]
+    second = plain_pass(first, chain, sweep.r[:1], start)[1]
+    turns = cuda.track(launch, packed(*chain), 2)
+    differ(turns, torch.stack([launch, first, second], dim=1))
 """
 
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tmlattice import TaylorNetwork, load_ring
-from tmlattice.errors import BeamLostError
-from tmlattice.network import plain_readings
+from tmlattice.errors import BeamLostError, LatticeError
+from tmlattice.network import FreeLayers, plain_readings
 
 
 @pytest.fixture
@@ -150,3 +150,47 @@ def test_any_transform_works_on_the_plain_loop(short):
     for i in range(4):
         moved = (slope(launch[0] + step[i]) - slope(launch[0] - step[i])) / 2e-6
         assert torch.allclose(moved, hessian[i], rtol=1e-6, atol=1e-8)
+
+
+def test_only_the_layers_of_a_group_move(small_ring, rng):
+    network = TaylorNetwork.from_ring(small_ring)
+    quadrupoles = [m.kind == "quadrupole" for m in small_ring.magnets]
+    part = FreeLayers(network, {"quadrupoles": "quadrupole"}, weights=("W1",))
+    assert [tuple(p.shape) for p in part.parameters() if p.requires_grad] == [
+        (sum(quadrupoles), 4, 4)
+    ]
+    launch = 1e-5 * rng.standard_normal((4, 4))
+    assert (part(launch) == network(launch)).all()
+    target = 1.01 * network(launch).detach()
+    before = (part(launch) - target).square().sum().item()
+    free = part.groups["quadrupoles"].parameters()
+    optimiser = torch.optim.Adam([{"params": free, "lr": 1e-6}])
+    for _ in range(20):
+        optimiser.zero_grad()
+        loss = (part(launch) - target).square().sum()
+        loss.backward()
+        optimiser.step()
+    assert loss.item() < before
+    moved = (part.merged().W1 != network.W1).any(dim=(1, 2)).tolist()
+    assert moved == quadrupoles
+    assert (part.merged().W2 == network.W2).all()
+
+
+def test_the_gradient_of_a_group_is_that_of_its_layers(small_ring, rng):
+    network = TaylorNetwork.from_ring(small_ring)
+    names = network.layers[3], network.layers[10]
+    part = FreeLayers(network, {"two": names})
+    launch = 1e-5 * rng.standard_normal((4, 4))
+    for model in (part, network):
+        model(launch, turns=2).square().sum().backward()
+    for name in ("W1", "W2"):
+        got = part.groups["two"][name].grad
+        assert (got == getattr(network, name).grad[[3, 10]]).all()
+
+
+def test_groups_that_are_empty_or_share_a_layer_are_refused(small_ring):
+    network = TaylorNetwork.from_ring(small_ring)
+    with pytest.raises(LatticeError, match="group 'a': no layer is a 'wiggler' or has such a name"):
+        FreeLayers(network, {"a": "wiggler"})
+    with pytest.raises(LatticeError, match="groups 'a' and 'b' share the layer"):
+        FreeLayers(network, {"a": "*", "b": "quadrupole"})

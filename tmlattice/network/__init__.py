@@ -9,6 +9,7 @@
 from tmlattice.errors import missing_package
 
 try:
+    from tmlattice.network.free_layers import FreeLayers
     from tmlattice.network.network import TaylorNetwork
     from tmlattice.network.reference import plain_readings
     from tmlattice.network.stored import load_network, save_network
@@ -18,6 +19,7 @@ except ModuleNotFoundError as error:  # torch, of which a diagnosis needs nothin
     raise missing_package(error, "networks, and fits of their weights, need", "network") from error
 
 __all__ = [
+    "FreeLayers",
     "SymplecticNetwork",
     "TaylorNetwork",
     "load_network",

@@ -15,12 +15,14 @@ from tmlattice.network.autograd import Tensors
 from tmlattice.network.reference import packed
 
 CONFIGURATION: dict[str, dict[str, int]] = {
-    "track": {"BLOCK": 256, "num_warps": 1},
-    "forward": {"BLOCK": 128, "num_warps": 1},
+    "track": {"BLOCK": 256, "num_warps": 1, "UNROLL": 2},
+    "readings": {"BLOCK": 64, "num_warps": 1},
+    "states": {"BLOCK": 128, "num_warps": 1},
     "reverse": {"BLOCK": 64, "num_warps": 1},
     "sums": {"BLOCK": 32, "num_warps": 1, "PART": 8192},
 }
-"""Of each kernel: trajectories and warps of a program; trajectories of a partial sum."""
+"""Of each kernel: trajectories (at most) and warps of a program; layers in a row; trajectories of a
+partial sum. Measured on one H100, see benchmarks/gpu.py."""
 
 
 def _curved(w: Tensor) -> Tensor:
@@ -38,8 +40,18 @@ def _on(tensor: Tensor) -> AbstractContextManager[Any]:
     return torch.cuda.device_of(tensor)  # type: ignore[no-untyped-call]
 
 
-def _programs(batch: int, kernel: str) -> tuple[int]:
-    return (_ceil(batch, CONFIGURATION[kernel]["BLOCK"]),)
+def _programs(states: Tensor, kernel: str) -> tuple[tuple[int], dict[str, int]]:
+    """The grid, and the constants, for states [..., batch]: few trajectories to a program where
+    there are few for the card's schedulers, four on each multiprocessor."""
+    options = dict(CONFIGURATION[kernel])
+    batch = states.shape[-1]
+    while options["BLOCK"] > 32 and batch < 4 * _multiprocessors(states) * options["BLOCK"]:
+        options["BLOCK"] //= 2
+    return (_ceil(batch, options["BLOCK"]),), options
+
+
+def _multiprocessors(tensor: Tensor) -> int:
+    return torch.cuda.get_device_properties(tensor.device).multi_processor_count
 
 
 def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
@@ -50,14 +62,18 @@ def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
         w: all layers of the turn, as `reference.packed`.
         turns: at least 1.
     """
-    layers, n, _ = w.shape
-    batch = len(launch)
-    history = launch.new_empty(turns + 1, n, batch)
+    n = launch.shape[1]
+    history = launch.new_empty(turns + 1, n, len(launch))
     history[0] = launch.T
+    grid, options = _programs(history, "track")
+    if missing := -len(w) % options["UNROLL"]:
+        still = torch.eye(n, w.shape[2] - 1, dtype=w.dtype, device=w.device)
+        still = torch.nn.functional.pad(still, (1, 0))  # a layer that changes nothing
+        w = torch.cat([w, still.expand(missing, -1, -1)])
+    curved = _curved(w)
+    skip = bool(curved.sum() < 0.9 * len(w))
     with _on(w):
-        kernels.track[_programs(batch, "track")](
-            w, _curved(w), history, turns, layers, batch, n, **CONFIGURATION["track"]
-        )
+        kernels.track[grid](w, curved, history, turns, len(w), len(launch), n, SKIP=skip, **options)
     return history.permute(2, 0, 1)
 
 
@@ -106,12 +122,12 @@ class TritonSweep:
         """Fill states [layer + 1, n, batch] from states[0]; or readings [monitor, 2, batch], and
         replace states [n, batch] by the last ones."""
         layers, n, _ = w.shape
-        batch = states.shape[-1]
+        grid, options = _programs(states, "states" if readings is None else "readings")
         with _on(w):
-            kernels.forward[_programs(batch, "forward")](
+            kernels.forward[grid](
                 w, curved, *self.read_outs, states, states if readings is None else readings,
-                layers, len(self.r), batch, n, KEEP=readings is None, READ=readings is not None,
-                **CONFIGURATION["forward"],
+                layers, len(self.r), states.shape[-1], n, KEEP=readings is None,
+                READ=readings is not None, **options,
             )  # fmt: skip
 
     def reverse(
@@ -120,11 +136,11 @@ class TritonSweep:
         """Fill adjoint [layer + 1, n, batch] from adjoint[-1] and pulls [batch, monitor, 2]; of one
         layer alone, it is replaced by that of the first."""
         layers, n, _ = w.shape
-        batch = states.shape[-1]
+        grid, options = _programs(states, "reverse")
         with _on(w):
-            kernels.reverse[_programs(batch, "reverse")](
-                w, curved, *self.read_outs, states, pulls, *pulls.stride(), adjoint, layers, batch,
-                n, KEEP=len(adjoint) > 1, **CONFIGURATION["reverse"],
+            kernels.reverse[grid](
+                w, curved, *self.read_outs, states, pulls, *pulls.stride(), adjoint, layers,
+                states.shape[-1], n, KEEP=len(adjoint) > 1, **options,
             )  # fmt: skip
 
 

@@ -106,8 +106,12 @@ def _pull(w, curved, x, up, rows: tl.constexpr, n: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["turns", "layers", "batch"])
-def track(w, curved, history, turns, layers, batch, n: tl.constexpr, BLOCK: tl.constexpr):
-    """Fill history[1:] [turn, n, batch] from history[0]."""
+def track(
+    w, curved, history, turns, layers, batch, n: tl.constexpr, SKIP: tl.constexpr,
+    UNROLL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Fill history[1:] [turn, n, batch] from history[0]; the layers are a multiple of UNROLL, and
+    `curved` is looked at only with SKIP."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     own = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = own < batch
@@ -115,9 +119,14 @@ def track(w, curved, history, turns, layers, batch, n: tl.constexpr, BLOCK: tl.c
     x = _load(at, batch, n, inside)
     seen = tl.zeros([32], tl.float64)
     for _turn in range(turns):
-        for k in range(layers):
-            seen += _ahead(w + (k + 1) % layers * n * width, n)
-            x = _image(w + k * n * width, tl.load(curved + k), x, n, n)
+        for first in range(0, layers, UNROLL):
+            for k in tl.static_range(UNROLL):
+                here = w + (first + k) * n * width
+                seen += _ahead(w + (first + k + 1) % layers * n * width, n)
+                if SKIP:
+                    x = _image(here, tl.load(curved + first + k), x, n, n)
+                else:
+                    x = _polynomial(here, x, n, True, n)
         at += n * batch
         _store(at, batch, x, n, inside)
     tl.store(history + tl.arange(0, 32), seen, mask=tl.arange(0, 32) < -turns)  # never
