@@ -113,3 +113,15 @@ def test_what_several_measurements_say_together(place, monkeypatch):
     right(finding.remedy)
     (printed,) = re.findall(r"seen_by  # (.*)", code)
     assert finding.seen_by == pytest.approx(json.loads(printed), abs=0.05)
+
+
+def test_the_ring_as_a_layer_learns_as_written():
+    names = {}
+    exec("\n".join(blocks("network_layer.md", "python")), names)
+    assert names["losses"][-1] < 0.5 * names["losses"][0]
+    assert names["closure"]().item() < 1e6 * names["losses"][-1]  # LBFGS goes further
+    moved = (names["tuned"].W1 != names["network"].W1).any(dim=(1, 2)).tolist()
+    magnets = names["ring"].magnets
+    free = [m.kind == "sextupole" or m.name.startswith("qd") for m in magnets]
+    assert moved == free
+    assert names["two"].shape == (32, 2, 246, 2)
