@@ -125,3 +125,8 @@ def test_the_ring_as_a_layer_learns_as_written():
     free = [m.kind == "sextupole" or m.name.startswith("qd") for m in magnets]
     assert moved == free
     assert names["two"].shape == (32, 2, 246, 2)
+    small = names["tunes"].fraction[0]
+    assert small == pytest.approx(names["optics"].tunes, abs=1e-3)
+    motion = names["optics"].normalised(names["centroid"])[:, 0]  # of a rigid beam its size is kept
+    assert abs(motion[0]) == pytest.approx(2e-5 * names["optics"].beta[0] ** 0.5, rel=0.1)
+    assert abs(motion[-1]) < 1.05 * abs(motion[0])
