@@ -125,6 +125,7 @@ def test_the_ring_as_a_layer_learns_as_written():
     free = [m.kind == "sextupole" or m.name.startswith("qd") for m in magnets]
     assert moved == free
     assert names["two"].shape == (32, 2, 246, 2)
+    assert names["found"].shape == (2, 32, 246, 2)
     small = names["tunes"].fraction[0]
     assert small == pytest.approx(names["optics"].tunes, abs=1e-3)
     motion = names["optics"].normalised(names["centroid"])[:, 0]  # of a rigid beam its size is kept

@@ -190,7 +190,7 @@ def test_the_gradient_of_a_group_is_that_of_its_layers(small_ring, rng):
 
 def test_groups_that_are_empty_or_share_a_layer_are_refused(small_ring):
     network = TaylorNetwork.from_ring(small_ring)
-    with pytest.raises(LatticeError, match="group 'a': no layer is a 'wiggler' or has such a name"):
-        FreeLayers(network, {"a": "wiggler"})
+    with pytest.raises(LatticeError, match="group 'a': no layer is a 'qx' or has such a name"):
+        FreeLayers(network, {"a": "qx"})
     with pytest.raises(LatticeError, match="groups 'a' and 'b' share the layer"):
         FreeLayers(network, {"a": "*", "b": "quadrupole"})

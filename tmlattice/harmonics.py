@@ -121,7 +121,9 @@ def normalised(states: Array, optics: Optics | None = None) -> ComplexArray:
 def levelled(signals: ComplexArray) -> ComplexArray:
     """Complex signals [..., turns] without their exponential growth; first amplitudes stay."""
     size = np.abs(signals)
-    moves = np.asarray((size > 0).all(axis=-1))  # not: no motion at all, or motion that passes through zero
+    moves = np.asarray(
+        (size > 0).all(axis=-1)
+    )  # not: no motion at all, or motion that passes through zero
     turn = np.arange(signals.shape[-1])
     centred = turn - turn.mean()
     growth = np.log(np.where(moves[..., None], size, 1.0))

@@ -10,8 +10,7 @@ from tmlattice.errors import missing_package
 
 try:
     from tmlattice.network.free_layers import FreeLayers
-    from tmlattice.network.network import TaylorNetwork
-    from tmlattice.network.reference import plain_readings
+    from tmlattice.network.network import TaylorNetwork, plain_readings
     from tmlattice.network.stored import load_network, save_network
     from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
     from tmlattice.network.symplectic_network import SymplecticNetwork

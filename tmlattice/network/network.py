@@ -16,7 +16,7 @@ from tmlattice.maps import RingMaps
 from tmlattice.network.autograd import BackEnd, Sweep
 from tmlattice.network.base import NetworkChain
 from tmlattice.network.compiled_sweep import CompiledSweep
-from tmlattice.network.reference import monomials, packed
+from tmlattice.network.reference import monomials, packed, plain_pass
 from tmlattice.network.symplectic_network import SymplecticNetwork
 
 Array = NDArray[np.float64]
@@ -168,3 +168,14 @@ def _cuda() -> Any:
         return import_module("tmlattice.network.cuda")
     except ModuleNotFoundError as error:
         raise missing_package(error, "networks on a graphics card need", "cuda") from error
+
+
+def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
+    """Readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
+
+    The same mathematics as `network(launch)`, differentiated by torch alone: any order, any
+    `torch.func` transform.
+    """
+    sweep = network.sweep()
+    weights = network.W0, network.W1, network.W2
+    return plain_pass(launch, weights, sweep.r, sweep.start)[0]

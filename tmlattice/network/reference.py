@@ -3,13 +3,9 @@ the referee of the compiled sweeps. The loop over layers is slow; the penalty, w
 what a graphics card uses."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from tmlattice.network.network import TaylorNetwork
 
 
 def packed(W0: Tensor, W1: Tensor, W2: Tensor) -> Tensor:
@@ -43,17 +39,6 @@ def plain_pass(
         if k < len(w):
             state = terms @ w[k].mT
     return torch.stack(readings, dim=1), state
-
-
-def plain_readings(network: "TaylorNetwork", launch: Tensor) -> Tensor:
-    """Readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
-
-    The same mathematics as `network(launch)`, differentiated by torch alone: any order, any
-    `torch.func` transform.
-    """
-    sweep = network.sweep()
-    weights = network.W0, network.W1, network.W2
-    return plain_pass(launch, weights, sweep.r, sweep.start)[0]
 
 
 def plain_coefficients(W1: Tensor, W2: Tensor, form: Tensor) -> Tensor:
