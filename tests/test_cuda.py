@@ -26,6 +26,7 @@ from tmlattice.network.reference import packed, plain_pass
 
 cuda._parts = lambda launch, layers: [slice(0, 3), slice(3, len(launch))]
 cuda._multiprocessors = lambda tensor: 1
+cuda.CONFIGURATION["track"]["UNROLL"] = 2
 torch.manual_seed(1)
 network = TaylorNetwork.from_ring(load_ring(sys.argv[1]), int(sys.argv[2]))
 n, layers = network.dimension, len(network.layers)

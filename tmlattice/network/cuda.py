@@ -15,14 +15,14 @@ from tmlattice.network.autograd import Tensors
 from tmlattice.network.reference import packed
 
 CONFIGURATION: dict[str, dict[str, int]] = {
-    "track": {"BLOCK": 256, "num_warps": 1, "UNROLL": 2},
+    "track": {"BLOCK": 256, "num_warps": 1},
     "readings": {"BLOCK": 64, "num_warps": 1},
     "states": {"BLOCK": 128, "num_warps": 1},
     "reverse": {"BLOCK": 64, "num_warps": 1},
     "sums": {"BLOCK": 32, "num_warps": 1, "PART": 8192},
 }
-"""Of each kernel: trajectories (at most) and warps of a program; layers in a row; trajectories of a
-partial sum. Measured on one H100, see benchmarks/gpu.py."""
+"""Of each kernel: trajectories (at most) and warps of a program; trajectories of a partial sum.
+Measured on one H100, docs/results/gpu.json."""
 
 
 def _curved(w: Tensor) -> Tensor:
@@ -66,6 +66,7 @@ def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
     history = launch.new_empty(turns + 1, n, len(launch))
     history[0] = launch.T
     grid, options = _programs(history, "track")
+    options.setdefault("UNROLL", max(options["BLOCK"] // 64, 1))  # layers in a row, as measured
     if missing := -len(w) % options["UNROLL"]:
         still = torch.eye(n, w.shape[2] - 1, dtype=w.dtype, device=w.device)
         still = torch.nn.functional.pad(still, (1, 0))  # a layer that changes nothing
