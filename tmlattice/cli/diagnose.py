@@ -206,6 +206,8 @@ def diagnose(
         source: dict[str, Any] = {"measurement": " ".join(map(str, measurements))}
         if said:
             source["assumed_of_files"] = said
+        if lattice_out:
+            source["lattice_out"] = str(lattice_out.absolute())
         _write(result, source, folder, extra)
         written = _write_rings(result, lattice_out, repaired_out)
         if folder and reading:
