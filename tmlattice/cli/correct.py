@@ -99,7 +99,8 @@ def correct(
     from tmlattice.correction.estimate import read_estimate
     from tmlattice.correction.knobs import write_knobs
     from tmlattice.files import output_file, output_folder, write_json
-    from tmlattice.report.correction import correction_text, write_files
+    from tmlattice.report.correction_texts import correction_text
+    from tmlattice.report.speaking import write_correction
 
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out)) if out else None
@@ -121,7 +122,7 @@ def correct(
         options: dict[str, Any] = {"targets": dict(targets)} if targets else {}
         found = run(estimate, goal=wanted, knobs=devices, seed=seed, progress=tell, **options)
         if folder:
-            write_files(found, folder)
+            write_correction(found, folder)
         if extra:
             write_json(extra, found.as_json())
     if not quiet:

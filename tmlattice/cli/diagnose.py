@@ -27,6 +27,7 @@ from tmlattice.cli.options import (
 from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
+    from tmlattice.correction import Correction
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
@@ -208,12 +209,19 @@ def diagnose(
             source["assumed_of_files"] = said
         if lattice_out:
             source["lattice_out"] = str(lattice_out.absolute())
-        _write(result, source, folder, extra)
-        written = _write_rings(result, lattice_out, repaired_out)
+        known = None
+        if lattice_out:
+            tell("what is left known")  # minutes, of a large response
+            from tmlattice.diagnosis.twin import known_of
+
+            known = known_of(result)
+        correction = _correction(result, known)
+        _write(result, source, folder, extra, correction)
+        written = _write_rings(result, known, lattice_out, repaired_out)
         if folder and reading:
             _write_weights(reading, folder)
     if not quiet:
-        _print(result, out, json_file, written)
+        _print(result, correction, out, json_file, written)
         if reading:
             _print_weights(ring, reading)
 
@@ -274,6 +282,7 @@ def _write(
     source: dict[str, Any],
     folder: Path | None,
     extra: Path | None,
+    correction: "Correction | None",
 ) -> None:
     """What was asked for."""
     from tmlattice.files import write_json
@@ -282,18 +291,37 @@ def _write(
     document["provenance"] = {**document["provenance"], **source}
     if folder:
         tell("figures")
-        _write_folder(result, folder, document)
+        _write_folder(result, folder, document, correction)
     if extra:
         write_json(extra, document)
 
 
+def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | None":
+    """Settings of supplies that bring the estimated ring to the design, where the covariance of its
+    errors is known and they have an expected gain."""
+    from tmlattice.correction import correct
+    from tmlattice.correction.estimate import estimate_of
+    from tmlattice.errors import TmlatticeError
+
+    if known is None:
+        return None
+    tell("correction")
+    try:
+        found = correct(estimate_of(result, known))
+    except TmlatticeError:  # no supply acts, or the ring stores no beam
+        log.info("no correction", exc_info=True)
+        return None
+    return None if found.refused else found
+
+
 def _write_rings(
     result: "Diagnosis",
+    known: "Known | None",
     lattice_out: Path | None,
     repaired_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
-    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document, known_of
+    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
@@ -301,8 +329,6 @@ def _write_rings(
 
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
-        tell("what is left known")  # minutes, of a large response
-        known = known_of(result)
         ring = result.as_found
         ring = ring if known is None else replace(ring, model=ESTIMATED)
         written[str(lattice_out)] = write_ring(ring, lattice_out)
@@ -401,22 +427,30 @@ def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
         raise MeasurementError(f"{where}: {no_numbers(error)}") from error
 
 
-def _write_folder(result: "Diagnosis", folder: Path, document: dict[str, Any]) -> None:
+def _write_folder(
+    result: "Diagnosis", folder: Path, document: dict[str, Any], correction: "Correction | None"
+) -> None:
     from tmlattice.report.speaking import write_files
 
-    write_files(result, folder, document)
+    write_files(result, folder, document, correction)
 
 
 def _print(
     result: "Diagnosis",
+    correction: "Correction | None",
     out: Path | None,
     json_file: Path | None,
     rings: dict[str, tuple[str, ...]],
 ) -> None:
     from tmlattice.report.plain import report_text
+    from tmlattice.report.text import wrapped
 
     screen = console()
-    screen.print(report_text(result, min(screen.width, 120)), soft_wrap=True)
+    width = min(screen.width, 120)
+    screen.print(report_text(result, width), soft_wrap=True)
+    if correction is not None:
+        text = "\n".join(wrapped(f"Correction: {correction.words}", "", width))
+        screen.print(f"\n{text}", soft_wrap=True)
     if result.parts:
         what = ", ".join(f"{part.label} ({part.readings} readings)" for part in result.parts)
     elif result.kind == "trajectory":

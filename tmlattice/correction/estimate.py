@@ -102,13 +102,17 @@ def estimate_with(ring: Ring, settings: Ring, known: Known | None) -> Estimate:
     )
 
 
-def estimate_of(diagnosis: Diagnosis) -> Estimate:
+def estimate_of(diagnosis: Diagnosis, known: Known | None = None) -> Estimate:
     """The estimate of a diagnosis: the ring with what was found, and its posterior.
+
+    Args:
+        diagnosis: of any measurement.
+        known: its `known_of`, where that is at hand.
 
     Of a change since a reference, and where no covariance of the small errors is known, each
     amount has its own standard deviation.
     """
-    known = known_of(diagnosis)
+    known = known_of(diagnosis) if known is None else known
     if known is None:
         known = _each_alone(diagnosis)
     found = estimate_with(diagnosis.as_found, diagnosis.ring, known)

@@ -117,11 +117,16 @@ class Correction(Speaks):
         devices = f"The device {names} takes" if count == 1 else f"The {count} devices {names} take"
         return f"{devices} {'; '.join(text for _, text in most)}."
 
-    report = Method("tmlattice.report.correction", "correction_text", "The whole as plain text.")
+    report = Method(
+        "tmlattice.report.correction_texts", "correction_text", "The whole as plain text."
+    )
     save = Method(
-        "tmlattice.report.correction",
-        "save",
+        "tmlattice.report.speaking",
+        "save_correction",
         "Write settings.csv, correction.json and .txt, snippets and report.html into a folder.",
+    )
+    plot = Method(
+        "tmlattice.plots.correction", "plot_correction", "Draw the beta beating now and expected."
     )
 
     def as_json(self) -> dict[str, Any]:

@@ -1,11 +1,7 @@
-"""A correction as text and as a page."""
-
-from os import PathLike
-from pathlib import Path
+"""The sentences and rows of a correction: those of the terminal and of the page."""
 
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.targets import TARGETS
-from tmlattice.files import output_folder, write_json
 from tmlattice.report.text import columns, wrapped
 
 MOST = 20
@@ -28,6 +24,11 @@ def setting_row(setting: Setting) -> list[str]:
         limits + (" (at its limit)" if setting.at_limit else ""),
         f"{100 * setting.gain:.1f} %",
     ]  # fmt: skip
+
+
+def setting_rows(correction: Correction) -> list[list[str]]:
+    """Of the settings' table, the first `MOST`."""
+    return [setting_row(own) for own in correction.settings[:MOST]]
 
 
 def expected_head() -> list[str]:
@@ -60,6 +61,11 @@ def amount(name: str, value: float) -> str:
     return f"{value:.2g}"
 
 
+def gain_head(correction: Correction) -> list[str]:
+    """Of the table of gains."""
+    return ["devices", *(TARGETS[name].words for name in correction.counted)]
+
+
 def gain_rows(correction: Correction) -> list[list[str]]:
     """Devices, and the expected rms of each target with so many of them, the worse plane's."""
     return [
@@ -72,15 +78,13 @@ def correction_text(correction: Correction, width: int = 100) -> str:
     """The whole report as plain text."""
     lines = wrapped(correction.words, "", width)
     if correction.settings:
-        rows = [setting_row(own) for own in correction.settings[:MOST]]
-        lines += ["", *columns([settings_head(), *rows])]
+        lines += ["", *columns([settings_head(), *setting_rows(correction)])]
         if len(correction.settings) > MOST:
             lines += [f"and {len(correction.settings) - MOST} more (settings.csv)"]
     lines += ["", *columns([expected_head(), *expected_rows(correction)])]
     if correction.gains:
-        head = ["devices", *(TARGETS[name].words for name in correction.counted)]
         lines += ["", "Expected rms with the first devices:"]
-        lines += columns([head, *gain_rows(correction)])
+        lines += columns([gain_head(correction), *gain_rows(correction)])
     for sentence in sentences(correction):
         lines += ["", *wrapped(sentence, "", width)]
     return "\n".join(lines)
@@ -94,31 +98,3 @@ def sentences(correction: Correction) -> list[str]:
         f"tolerances. Measurements and corrections that this ring needs: {correction.iterations}."
     ]  # fmt: skip
     return found + [f"Note: {text}." for text in correction.warnings]
-
-
-def save(correction: Correction, folder: str | PathLike[str]) -> Path:
-    """Write the files of a correction.
-
-    Args:
-        correction: of `correct`.
-        folder: made where it is not there; files of these names are replaced, all or none.
-
-    Returns:
-        The report's path, `report.html`.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    place = Path(folder)
-    with output_folder(place) as temporary:
-        write_files(correction, temporary)
-    return place / "report.html"
-
-
-def write_files(correction: Correction, folder: Path) -> None:
-    """The files of `save`, into a folder that is there."""
-    (folder / "settings.csv").write_text(correction.table(), encoding="utf-8")
-    (folder / "correction.txt").write_text(correction_text(correction) + "\n", encoding="utf-8")
-    for name, suffix in (("madx", "madx"), ("at", "at.py"), ("elegant", "ele")):
-        (folder / f"settings.{suffix}").write_text(correction.snippet(name), encoding="utf-8")
-    write_json(folder / "correction.json", correction.as_json())
