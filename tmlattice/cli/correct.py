@@ -57,7 +57,8 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
     type=TargetText(),
     multiple=True,
     help="Repeat for more: beta_beating, phase_advance, dispersion, tunes, chromaticity, coupling, "
-    "closed_orbit, with the rms error that is tolerated. Else the optics.",
+    "closed_orbit, with the rms error that is tolerated; or first_turn alone, which threads a beam "
+    "that is not stored. Else the optics.",
 )
 @click.option("--example", type=FILE, metavar="FILE", help="Write the table of the knobs, and end.")
 @click.option(
@@ -158,11 +159,11 @@ def _sources(estimated: Path) -> tuple[Path, str | None]:
 
 
 def _devices(knobs: str | None, settings: "Ring", targets: dict[str, float | None]) -> list[Any]:
-    from tmlattice.correction.knobs import default_knobs, read_knobs
+    from tmlattice.correction.knobs import default_knobs, kinds_for, read_knobs
+    from tmlattice.correction.targets import OPTICS
 
     if knobs is None:
-        kinds = ["supplies", "skew_quadrupoles", *["correctors"] * ("closed_orbit" in targets)]
-        return default_knobs(settings, kinds)
+        return default_knobs(settings, kinds_for(targets or OPTICS))
     if Path(knobs).suffix:
         return read_knobs(Path(knobs), settings)
     return default_knobs(settings, [kind.strip() for kind in knobs.split(",")])

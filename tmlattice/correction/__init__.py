@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
-from tmlattice.correction.knobs import Knob, default_knobs, read_knobs
+from tmlattice.correction.first_turn import Threading
+from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
 from tmlattice.correction.result import Correction, Setting, with_gains
 from tmlattice.correction.solve import (
     Point,
@@ -23,7 +24,7 @@ from tmlattice.correction.solve import (
     rounded,
     settled,
 )
-from tmlattice.correction.targets import TARGETS, Targets, rms_of
+from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.lattice import Ring
@@ -32,8 +33,6 @@ __all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_kn
 
 Array = np.ndarray
 
-OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
-"""Targets that every estimated ring has."""
 DRAWS = 200
 """From the posterior: the ends of an interval scatter by a tenth of its half width."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
@@ -78,8 +77,13 @@ def correct(
         chosen = (*OPTICS, "closed_orbit") if orbit else OPTICS
     progress("posterior")
     estimate = _estimate(diagnosis, goal)
-    judged = Targets(estimate.settings if goal is None else goal, chosen)
-    devices = _knobs(knobs, estimate.settings, judged)
+    wanted = estimate.settings if goal is None else goal
+    judged: Targets | Threading
+    if [*chosen] == [THREADING]:
+        judged = Threading(wanted, dict(chosen)[THREADING] if isinstance(chosen, Mapping) else None)
+    else:
+        judged = Targets(wanted, chosen)
+    devices = _knobs(knobs, estimate.settings, judged.names)
     progress("correction")
     problem = drawn(estimate, devices, judged, DRAWS, seed)
     try:
@@ -106,11 +110,12 @@ def _estimate(diagnosis: Diagnosis | Estimate | Ring, goal: Ring | None) -> Esti
 
 
 def _knobs(
-    knobs: Sequence[Knob] | Iterable[str] | str | Path | None, settings: Ring, targets: Targets
+    knobs: Sequence[Knob] | Iterable[str] | str | Path | None,
+    settings: Ring,
+    names: Sequence[str],
 ) -> list[Knob]:
     if knobs is None:
-        kinds = ["supplies", "skew_quadrupoles"]
-        return default_knobs(settings, kinds + ["correctors"] * ("closed_orbit" in targets.names))
+        return default_knobs(settings, kinds_for(names))
     if isinstance(knobs, str | Path):
         return read_knobs(Path(knobs), settings)
     some = list(knobs)
@@ -139,6 +144,7 @@ def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     change = 2 * rows @ (begin.rows - end.rows)
     gained = begin.square - end.square
     error = float(np.std(change))
+    whole = max(begin.square + float(np.mean(np.sum(rows**2, axis=1))), 1e-30)
     refused = _refusal(begin, gained, error)
     if refused:
         end = begin
@@ -163,13 +169,15 @@ def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
         name: (_pair(rms_of(end.errors)[name]), _pair(np.median(own, axis=0)))
         for name, own in rms_of(end.open).items()
     }
-    beating = tuple(
-        np.moveaxis(np.percentile(p.errors["beta_beating"] + p.open["beta_beating"], INTERVAL,
-                                  axis=0), 0, -1)
+    shown = targets.names[0] if "beta_beating" not in end.errors else "beta_beating"
+    profile = tuple(
+        np.moveaxis(np.percentile(p.errors[shown] + p.open[shown], INTERVAL, axis=0), 0, -1)
         for p in (begin, end)
-    )  # fmt: skip
-    tunes = {"goal": targets.goal.tunes, "now": begin.optics.values.tunes,
-             "expected": end.optics.values.tunes}  # fmt: skip
+    )
+    tunes = {}
+    if isinstance(targets, Targets):
+        tunes = {"goal": targets.goal.tunes, "now": begin.look.values.tunes,
+                 "expected": end.look.values.tunes}  # fmt: skip
     return {
         "settings": rows_of,
         "refused": refused,
@@ -177,10 +185,11 @@ def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
         "after": after,
         "stays": stays,
         "gains": tuple(gains),
-        "gain": gained / (begin.square + float(np.mean(np.sum(rows**2, axis=1)))),
-        "gain_error": error / (begin.square + float(np.mean(np.sum(rows**2, axis=1)))),
+        "gain": gained / whole,
+        "gain_error": error / whole,
         "tunes": {name: _pair(value % 1.0) for name, value in tunes.items()},
-        "beating": beating,
+        "shown": shown,
+        "profile": profile,
         "s": targets.s,
         "counted": targets.tolerance,
         "iterations": _iterations(end),
@@ -204,7 +213,7 @@ def _intervals(point: Point) -> dict[str, Any]:
     """Of the rms of each target over the draws."""
     open_, errors = point.open, point.errors
     found = {}
-    for name in TARGETS:
+    for name in errors:
         rms = rms_of({name: errors[name] + open_[name]})[name]
         ends = np.percentile(rms, INTERVAL, axis=0)
         found[name] = tuple(tuple(ends[:, p].tolist()) for p in (0, 1))
@@ -235,7 +244,9 @@ def _warnings(end: Point, settings: Sequence[Setting]) -> Iterable[str]:
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:
         yield f"held by their limits: {', '.join(held)}"
-    tunes = end.optics.values.tunes + end.open["tunes"][:, 0]
+    if "tunes" not in end.errors:
+        return
+    tunes = end.look.values.tunes + end.open["tunes"][:, 0]
     mean, sigma = tunes.mean(axis=0), tunes.std(axis=0)
     for plane, (q, s) in enumerate(zip(mean, sigma, strict=True)):
         near = abs(2 * q - round(2 * q)) / 2

@@ -9,7 +9,7 @@ its supply; an excitation curve says what strength a setting makes.
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -137,6 +137,13 @@ class Knob:
         if effect is None or not amount:
             return []
         return [Cause(effect, member, amount) for member in self.members]
+
+
+def kinds_for(targets: Collection[str]) -> list[str]:
+    """The kinds of knobs that some targets are corrected with, where nobody names any."""
+    orbit = {"closed_orbit", "first_turn"} & set(targets)
+    kinds = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
+    return kinds + ["correctors"] * bool(orbit)
 
 
 def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:

@@ -75,8 +75,9 @@ class Correction(Speaks):
         gain, gain_error: share of the expected square, in units of the tolerances, that the
             correction takes away, and its standard deviation.
         tunes: fractions, of the goal, now and expected.
-        beating: at the BPMs the beta beating now and expected, each [BPM, plane, 3] (`Interval`).
-        s: of the BPMs, m.
+        shown: the target that figures show: beta beating, or the trajectory.
+        profile: its errors at the readings now and expected, each [reading, plane, 3] (`Interval`).
+        s: of the readings, m.
         counted: the targets, with their tolerances.
         iterations: of measurement and correction that a ring like this needs.
         warnings: what a reader should know.
@@ -93,7 +94,8 @@ class Correction(Speaks):
     gain: float
     gain_error: float
     tunes: Mapping[str, tuple[float, float]]
-    beating: tuple[np.ndarray, np.ndarray] = field(repr=False)
+    shown: str
+    profile: tuple[np.ndarray, np.ndarray] = field(repr=False)
     s: np.ndarray = field(repr=False)
     counted: Mapping[str, float]
     iterations: int
@@ -163,8 +165,8 @@ class Correction(Speaks):
             "gain": self.gain,
             "gain_sigma": self.gain_error,
             "tunes": {name: list(pair) for name, pair in self.tunes.items()},
-            "beta_beating": {"s": self.s.tolist(), "before": self.beating[0].tolist(),
-                             "after": self.beating[1].tolist()},
+            "profile": {"target": self.shown, "s": self.s.tolist(),
+                        "before": self.profile[0].tolist(), "after": self.profile[1].tolist()},
             "iterations": self.iterations,
             "warnings": list(self.warnings),
             "provenance": dict(self.provenance),

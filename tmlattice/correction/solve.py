@@ -14,20 +14,23 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.correction.estimate import Estimate
+from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import KINDS, Knob
-from tmlattice.correction.targets import StoredOptics, Targets
+from tmlattice.correction.targets import Targets
 from tmlattice.effects import apply
 from tmlattice.errors import UnstableRingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Look = Any
+"""What a ring shows, as its targets see it: `StoredOptics` or `Trajectory`."""
 
 log = logging.getLogger(__name__)
 
@@ -58,16 +61,19 @@ class Problem:
 
     estimate: Estimate
     knobs: tuple[Knob, ...]
-    targets: Targets
+    targets: Targets | Threading
     draws: Array
     noise: Array
     energies: Array
 
     @cached_property
-    def model(self) -> ResponseModel:
-        """Of the estimated ring at the beam's energy."""
-        model = ResponseModel(self.estimate.ring)
-        return model.at_energy(self.estimate.energy) if self.estimate.energy else model
+    def begin(self) -> Look:
+        """What the estimated ring shows.
+
+        Raises:
+            UnstableRingError: it stores no beam.
+        """
+        return self.targets.begin(self.estimate.ring, self.estimate.energy)
 
     @cached_property
     def sigma(self) -> Array:
@@ -86,13 +92,10 @@ class Problem:
             UnstableRingError: it stores no beam.
         """
         causes = [c for k, a in zip(self.knobs, amounts.tolist(), strict=True) for c in k.causes(a)]
-        model = self.model
-        if causes:
-            model = model.changed_to(apply(self.estimate.ring, causes))
         shift = sum(a for k, a in zip(self.knobs, amounts, strict=True) if k.kind == "rf")
-        if shift:
-            model = model.at_frequency(model.frequency + shift)
-        return Point(self, amounts, StoredOptics(model, self.targets.step), model)
+        ring = self.estimate.ring
+        look = self.begin.moved(apply(ring, causes), shift) if causes or shift else self.begin
+        return Point(self, amounts, look)
 
     def better(self, amounts: Array, least: float) -> "Point | None":
         """The point, if it stores a beam and its expected square is below."""
@@ -109,19 +112,19 @@ class Point:
 
     Attributes:
         problem, amounts: what it was made from, [knob].
-        optics, model: of the ring.
+        look: what the ring shows.
     """
 
     problem: Problem
     amounts: Array
-    optics: StoredOptics
-    model: ResponseModel
+    look: Look
 
     @cached_property
     def errors(self) -> dict[str, Array]:
         """Of all targets, see `Targets.errors`."""
-        errors = self.problem.targets.errors(self.optics.values)
-        errors["dispersion"] = errors["dispersion"] + self.problem.estimate.dispersion
+        errors = self.problem.targets.errors(self.look.values)
+        if "dispersion" in errors:
+            errors["dispersion"] = errors["dispersion"] + self.problem.estimate.dispersion
         return errors
 
     @cached_property
@@ -132,7 +135,7 @@ class Point:
     @cached_property
     def by_frequency(self) -> dict[str, Array]:
         """d errors / d relative RF frequency, [1, reading, plane] each."""
-        return self.problem.targets.changes(self.optics.by_frequency())
+        return self.problem.targets.changes(self.look.by_frequency())
 
     @cached_property
     def by_knobs(self) -> dict[str, Array]:
@@ -146,7 +149,7 @@ class Point:
                 continue
             hypotheses += [(effect, member) for member in knob.members]
             owner += [k] * len(knob.members)
-        changes = targets.changes(self.optics.derivatives(hypotheses))
+        changes = targets.changes(self.look.derivatives(hypotheses))
         found = {}
         for name, errors in self.errors.items():
             found[name] = np.zeros((len(self.problem.knobs), *errors.shape))
@@ -168,12 +171,12 @@ class Point:
         noise = problem.noise * problem.sigma * self.amounts
         total = {name: np.tensordot(noise, part, 1) for name, part in self.by_knobs.items()}
         if estimate.energy_error:
-            shift = problem.energies / float(self.model.rf_start[5])
+            shift = problem.energies * self.look.per_energy
             for name, part in self.by_frequency.items():
                 total[name] += shift[:, None, None] * part
         for first in range(0, len(estimate.hypotheses), AT_ONCE):
             some = slice(first, first + AT_ONCE)
-            changes = self.optics.derivatives(estimate.hypotheses[some])
+            changes = self.look.derivatives(estimate.hypotheses[some])
             for name, part in problem.targets.changes(changes).items():
                 total[name] += np.tensordot(problem.draws[:, some], part, 1)
         return total
@@ -277,7 +280,7 @@ def rounded(problem: Problem, point: Point) -> Point:
 
 
 def drawn(
-    estimate: Estimate, knobs: Sequence[Knob], targets: Targets, count: int, seed: int
+    estimate: Estimate, knobs: Sequence[Knob], targets: Targets | Threading, count: int, seed: int
 ) -> Problem:
     """The problem with draws from the posterior."""
     random = np.random.default_rng(seed)

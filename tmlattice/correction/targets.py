@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.errors import unknown_choice
+from tmlattice.errors import TmlatticeError, unknown_choice
 from tmlattice.lattice import Ring
 from tmlattice.optics import short_way
 
@@ -54,9 +54,16 @@ TARGETS: dict[str, Target] = {
         "coupling (amplitude in the other plane)", "relative", 0.01, ("x to y", "y to x")
     ),
     "closed_orbit": Target("closed orbit", "m", 1e-4, ("x", "y")),
+    "first_turn": Target("trajectory on the first two turns", "m", 1e-3, ("x", "y")),
 }
 """The usual targets. One percent of beta beating comes with 1e-3 of phase advance; an amplitude of
 one percent in the other plane is an emittance ratio of 1e-4."""
+
+
+OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
+"""Targets that every estimated ring has."""
+THREADING = "first_turn"
+"""The target of a beam that is not stored: it is corrected alone."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,18 @@ class StoredOptics:
         ]
         self.values = _means([_shown(beam.shown, beam.shown) for beam in self._beams], value=True)
         self.model, self.step = model, step
+
+    def moved(self, ring: Ring, frequency: float) -> "StoredOptics":
+        """Of a ring with other elements, at an RF frequency that differs by so much, relative."""
+        model = self.model.changed_to(ring)
+        if frequency:
+            model = model.at_frequency(model.frequency + frequency)
+        return StoredOptics(model, self.step)
+
+    @property
+    def per_energy(self) -> float:
+        """Relative change of the RF frequency for one of the energy."""
+        return 1 / float(self.model.rf_start[5])
 
     def by_frequency(self) -> Optics:
         """Change per relative change of the RF frequency, with an axis of one hypothesis."""
@@ -155,7 +174,30 @@ def _means(sides: Sequence[dict[str, np.ndarray]], value: bool = False) -> Optic
     )
 
 
-class Targets:
+class Weighted:
+    """Targets that count, each in units of its tolerance.
+
+    Attributes:
+        names: of the targets, in the order of `TARGETS`.
+        tolerance: of these, in their units.
+        s: of their readings, m.
+    """
+
+    names: tuple[str, ...]
+    tolerance: dict[str, float]
+    s: Array
+
+    def rows(self, parts: Mapping[str, Array]) -> Array:
+        """Errors or changes of the targets that count, in units of their tolerances, so that the
+        square of all rows is the sum of mean squares, [..., row]."""
+        own = []
+        for name in self.names:
+            part = parts[name].reshape(*parts[name].shape[:-2], -1)
+            own.append(part / (self.tolerance[name] * np.sqrt(part.shape[-1])))
+        return np.concatenate(own, axis=-1)
+
+
+class Targets(Weighted):
     """Errors of the optics from a goal, those that count in units of their tolerances.
 
     Args:
@@ -167,9 +209,10 @@ class Targets:
         tolerance: of these, in their units.
         step: relative change of the RF frequency that changes the goal's energy by `ENERGY`.
         goal: its optics.
-        monitors: names of the BPMs.
+        s: of the BPMs, m.
 
     Raises:
+        TmlatticeError: threading beside other targets.
         ChoiceError: no such target.
         UnstableRingError: the goal stores no beam.
     """
@@ -179,8 +222,11 @@ class Targets:
         for name in given:
             if name not in TARGETS:
                 raise unknown_choice("target", name, TARGETS)
+        if THREADING in given:
+            raise TmlatticeError(
+                f"'{THREADING}' is the target of a beam that is not stored; give it alone"
+            )
         model = ResponseModel(goal)
-        self.monitors = model.monitors
         self.s = np.array([monitor.s for monitor in goal.monitors])
         self.step = ENERGY / float(model.rf_start[5])
         self.goal = StoredOptics(model, self.step).values
@@ -191,8 +237,17 @@ class Targets:
             for name in self.names
         }
 
+    def begin(self, ring: Ring, energy: float) -> StoredOptics:
+        """Optics of a ring whose beam has this energy beside the ring's, relative.
+
+        Raises:
+            UnstableRingError: it stores no beam.
+        """
+        model = ResponseModel(ring)
+        return StoredOptics(model.at_energy(energy) if energy else model, self.step)
+
     def errors(self, optics: Optics) -> dict[str, Array]:
-        """Errors of all of `TARGETS`, [reading, plane] each, in its unit."""
+        """Errors of all targets of a stored beam, [reading, plane] each, in their units."""
         goal = self.goal
         change = Optics(*(getattr(optics, f.name) - getattr(goal, f.name) for f in fields(goal)))
         found = self._parts(change)
@@ -218,15 +273,6 @@ class Targets:
             "coupling": np.concatenate([across.real, across.imag], axis=-2),
             "closed_orbit": change.orbit,
         }
-
-    def rows(self, parts: Mapping[str, Array]) -> Array:
-        """Errors or changes of the targets that count, in units of their tolerances, so that the
-        square of all rows is the sum of mean squares, [..., row]."""
-        own = []
-        for name in self.names:
-            part = parts[name].reshape(*parts[name].shape[:-2], -1)
-            own.append(part / (self.tolerance[name] * np.sqrt(part.shape[-1])))
-        return np.concatenate(own, axis=-1)
 
 
 def rms_of(parts: Mapping[str, Array]) -> dict[str, Array]:
