@@ -326,3 +326,33 @@ def test_the_written_table_is_that_of_the_result(small_ring, wrong, tmp_path):
         assert float(row["new"]) - float(row["present"]) == pytest.approx(
             float(row["change"]), abs=1e-8
         )
+
+
+# --- a beam that is not stored --------------------------------------------------------------------
+def turns_of_at(ring, turns=20):
+    """Share of the readings that a beam launched on the axis reaches, and its rms, m."""
+    readings = AtEngine(ring).track(np.zeros((1, 6)), turns)[0]
+    alive = np.isfinite(readings).all(axis=-1)
+    return float(np.mean(np.cumsum(~alive.ravel()) == 0)), float(np.sqrt(np.nanmean(readings**2)))
+
+
+def test_threading_brings_a_lost_beam_round(ring_kicking_x):
+    """Displaced quadrupoles lose the first turn; steered, AT's beam stays for twenty turns."""
+    ring = ring_kicking_x("i % 2")
+    rng = np.random.default_rng(2)
+    quadrupoles = [e.name for e in ring.elements if e.kind == "quadrupole"]
+    causes = [
+        Cause(f"quadrupole_offset_{plane}", name, 3e-3 * rng.standard_normal())
+        for name in quadrupoles for plane in "xy"
+    ]  # fmt: skip
+    machine = apply(ring, causes)
+    reached, _ = turns_of_at(machine)
+    assert reached < 0.1
+    found = correct(machine, goal=ring, targets=["first_turn"])
+    assert {s.knob.kind for s in found.settings} == {"hcorrector", "vcorrector"}
+    reached, rms = turns_of_at(set_to(machine, found))
+    assert reached == 1.0
+    assert rms < 1e-2
+    assert "trajectory" in found.words
+    with pytest.raises(TmlatticeError, match="give it alone"):
+        correct(ring, goal=ring, targets=["first_turn", "tunes"])

@@ -16,6 +16,7 @@ from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
 from tmlattice.correction.result import Correction, Setting, with_gains
 from tmlattice.correction.solve import (
+    ENOUGH,
     Point,
     Problem,
     by_gain,
@@ -134,7 +135,10 @@ def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
     chosen = np.array(order[:number], dtype=np.int64)
     goal, _ = whole.step(chosen)
     start = problem.better(goal, begin.square) or begin
-    return rounded(problem, settled(problem, start, chosen)), order[:number]
+    end = settled(problem, start, chosen)
+    if end.square > (1 + 2 * ENOUGH) * whole.square:  # not as linear as that
+        end, number = whole, len(order)
+    return rounded(problem, end), order[:number]
 
 
 def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:

@@ -4,7 +4,8 @@ The target is the trajectory of a beam that is launched on the axis, at the BPMs
 trajectory that stays near the axis on both has come round, and has closed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,9 @@ Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
 
 TURNS = 2
-LOST = 0.03
-"""m: what a reading of a lost beam counts as, a usual half aperture; beyond it the beam is lost."""
+LOST = 0.1
+"""m: what a reading of a lost beam counts as. It is beyond any aperture, so that the first readings
+outside of one still say where the beam went."""
 
 
 class Trajectory:
@@ -33,10 +35,16 @@ class Trajectory:
 
     def __init__(self, ring: Ring) -> None:
         self._model = Model(ring, [{}], TURNS)
-        self._paths = self._model.paths(np.zeros((1, 5)))
-        beam = self._paths.beam[0]
-        lost = ~(np.abs(beam) < LOST).all(axis=1)
-        self._alive = np.cumsum(lost) == 0
+        paths = self._model.paths(np.zeros((1, 5)))
+        beam = paths.beam[0]
+        self._alive = np.cumsum(~(np.abs(beam) < LOST).all(axis=1)) == 0
+        if not self._alive.all():  # behind, the maps have grown beyond all bounds
+            behind = int(self._model.where[int(np.argmin(self._alive))]) + 1
+            states, tangents = paths.states.copy(), paths.tangents.copy()
+            states[:, behind:], tangents[:, behind:] = 0.0, np.eye(states.shape[-1])
+            slopes = np.where(self._alive[:, None, None], paths.beam_launch, 0.0)
+            paths = replace(paths, states=states, tangents=tangents, beam_launch=slopes)
+        self._paths = paths
         self.values = np.where(self._alive[:, None], np.nan_to_num(beam), LOST)
 
     def moved(self, ring: Ring, frequency: float) -> "Trajectory":
@@ -78,8 +86,3 @@ class Threading(Weighted):
     def changes(self, derivatives: Array) -> dict[str, Array]:
         """The derivatives of `errors`."""
         return {THREADING: derivatives}
-
-
-def survived(parts: Mapping[str, Array]) -> float:
-    """Share of the readings of two turns that the beam reaches."""
-    return float(np.mean(np.abs(parts[THREADING]).max(axis=-1) < LOST))

@@ -34,8 +34,8 @@ Look = Any
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 4
-"""Linearisations at most."""
+ROUNDS = 30
+"""Linearisations at most: a beam that is threaded gets further with each of them."""
 SETTLED = 1e-3
 """Relative fall of the expected square at which a linearisation was the last."""
 HALVES = 6
