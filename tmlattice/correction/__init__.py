@@ -158,7 +158,7 @@ def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
         amounts, square = end.step(np.array(order[:n], dtype=np.int64))
         squares.append(square)
         if n in COUNTS or n == len(order):
-            gains.append((n, _expected(problem, amounts, end)))
+            gains.append((n, _expected(amounts, end)))
     shares = -np.diff([begin.square, *squares]) / max(
         begin.square - min(squares, default=0.0), 1e-30
     )
@@ -224,24 +224,20 @@ def _intervals(point: Point) -> dict[str, Any]:
     return found
 
 
-def _expected(problem: Problem, amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
-    """Median rms of the targets with these amounts, the uncertainty that of the end."""
-    try:
-        errors = problem.at(amounts).errors
-    except UnstableRingError:
-        return {name: (float("nan"),) * 2 for name in problem.targets.names}
-    return {
-        name: _pair(np.median(rms_of({name: errors[name] + end.open[name]})[name], axis=0))
-        for name in problem.targets.names
-    }
+def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
+    """Median rms of the targets with these amounts, linear about the end."""
+    found = {}
+    for name in end.problem.targets.names:
+        change = np.tensordot(amounts - end.amounts, end.by_knobs[name], 1)
+        errors = end.errors[name] + change + end.open[name]
+        found[name] = _pair(np.median(rms_of({name: errors})[name], axis=0))
+    return found
 
 
 def _iterations(end: Point) -> int:
     """One, and another one where most of what stays comes from errors of the knobs' changes, which
     a second measurement shows."""
-    problem = end.problem
-    unsure = problem.sigma * np.linalg.norm(end.slopes, axis=0) * end.amounts
-    return 2 if float(unsure @ unsure) > float(end.rows @ end.rows) else 1
+    return 2 if float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
 
 
 def _warnings(end: Point, settings: Sequence[Setting]) -> Iterable[str]:

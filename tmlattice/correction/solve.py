@@ -81,6 +81,13 @@ class Problem:
         return np.array([knob.error for knob in self.knobs])
 
     @cached_property
+    def sizes(self) -> Array:
+        """Norm of the rows' derivatives by each knob in the estimated ring, [knob]; 1 where it
+        changes nothing."""
+        size = np.linalg.norm(Point(self, np.zeros(len(self.knobs)), self.begin).slopes, axis=0)
+        return np.asarray(np.where(size > 0, size, 1.0))
+
+    @cached_property
     def bounds(self) -> Array:
         """Of the amounts, [2, knob]."""
         return np.array([knob.bounds for knob in self.knobs]).reshape(-1, 2).T
@@ -182,36 +189,39 @@ class Point:
         return total
 
     @property
+    def unsure(self) -> Array:
+        """Errors of the knobs' changes in the rows, rms of each, [knob]."""
+        return self.problem.sigma * self.problem.sizes * self.amounts
+
+    @property
     def square(self) -> float:
         """Expected square of the rows, without what the data do not determine."""
-        unsure = self.problem.sigma * np.linalg.norm(self.slopes, axis=0) * self.amounts
-        return float(self.rows @ self.rows + unsure @ unsure)
+        return float(self.rows @ self.rows + self.unsure @ self.unsure)
+
+    @cached_property
+    def _triangle(self) -> tuple[Array, Array, float]:
+        """Of the slopes in units of the knobs' sizes: the triangle R, and in its coordinates what
+        stays without any change, [knob]; and the square of what no knob moves."""
+        q, r = np.linalg.qr(self.slopes / self.problem.sizes)
+        start = self.rows - self.slopes @ self.amounts
+        inside = q.T @ start
+        return r, inside, float(start @ start - inside @ inside)
 
     def step(self, knobs: Indices) -> tuple[Array, float]:
         """The amounts of some knobs, the others at zero, that make the expected square least as it
         is about here, within the limits; and that square."""
-        J, x = self.slopes[:, knobs], self.amounts[knobs]
-        size = np.linalg.norm(J, axis=0)
-        used = size > 0
-        J, size = J[:, used], size[used]
-        full = np.zeros(len(self.amounts))
-        start = self.rows - self.slopes @ self.amounts
-        if not len(size):
-            return full, float(start @ start)
-        ridge = self.problem.sigma[knobs][used]
-        q, r = np.linalg.qr(J / size)
-        matrix = np.vstack([r, np.diag(ridge)])
-        right = np.concatenate([-q.T @ start, np.zeros(len(size))])
-        low, high = self.problem.bounds[:, knobs][:, used] * size
+        r, start, fixed = self._triangle
+        matrix = np.vstack([r[:, knobs], np.diag(self.problem.sigma[knobs])])
+        right = np.concatenate([-start, np.zeros(len(knobs))])
+        low, high = self.problem.bounds[:, knobs] * self.problem.sizes[knobs]
         if np.isfinite([low, high]).any():
             found = lsq_linear(matrix, right, (low, np.maximum(high, low + 1e-300))).x
         else:
             found = np.linalg.lstsq(matrix, right, rcond=None)[0]
-        amounts = np.zeros(len(x))
-        amounts[used] = found / size
-        full[knobs] = amounts
-        left = start + J @ amounts[used]
-        return full, float(left @ left + np.sum((ridge * found) ** 2))
+        left = matrix @ found - right
+        amounts = np.zeros(len(self.amounts))
+        amounts[knobs] = found / self.problem.sizes[knobs]
+        return amounts, fixed + float(left @ left)
 
 
 def settled(problem: Problem, begin: Point, knobs: Indices) -> Point:
@@ -243,14 +253,11 @@ def settled(problem: Problem, begin: Point, knobs: Indices) -> Point:
 def by_gain(point: Point) -> list[int]:
     """The knobs in the order in which each next one lowers the expected square most, with the
     others adjusted to it (orthogonal matching pursuit, as MICADO)."""
-    size = np.linalg.norm(point.slopes, axis=0)
-    left_over = [k for k in np.argsort(-size).tolist() if size[k] > 0]
-    ridge = point.problem.sigma
-    count = point.slopes.shape[1]
-    J = np.vstack([point.slopes / np.where(size > 0, size, 1.0), np.diag(ridge)])
-    left = np.concatenate([point.rows - point.slopes @ point.amounts, np.zeros(count)])
-    q, J = np.linalg.qr(J)
-    left = q.T @ left
+    r, start, _ = point._triangle
+    count = len(point.amounts)
+    left_over = [k for k in range(count) if r[:, k].any()]
+    J = np.vstack([r, np.diag(point.problem.sigma)])
+    left = np.concatenate([start, np.zeros(count)])
     order: list[int] = []
     while left_over:
         inner, norm = left @ J[:, left_over], np.linalg.norm(J[:, left_over], axis=0)
