@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tmlattice import correct
+from tmlattice import correct, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
 from tmlattice.correction.estimate import estimate_with
@@ -23,6 +23,7 @@ from tmlattice.inference.among import Known
 from tmlattice.lattice import save_ring, write_ring
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
+from tmlattice.machine.response import simulate_response
 
 NO_ORBIT = ("beta_beating", "phase_advance", "dispersion", "tunes")
 
@@ -356,3 +357,28 @@ def test_threading_brings_a_lost_beam_round(ring_kicking_x):
     assert "trajectory" in found.words
     with pytest.raises(TmlatticeError, match="give it alone"):
         correct(ring, goal=ring, targets=["first_turn", "tunes"])
+
+
+def test_diagnose_states_the_correction(small_ring, tmp_path):
+    """A wrong supply: the terminal, the page and the table say how to set it."""
+    save_ring(small_ring, tmp_path / "design.json")
+    data = simulate_response(
+        small_ring, [Cause("family_gradient", "QD", 0.01)], engine="ocelot", progress=False,
+        noise=1e-7,
+    ).measured  # fmt: skip
+    write_measurement(tmp_path / "day_1", data)
+    done = CliRunner().invoke(tmlattice, [
+        "diagnose", str(tmp_path / "design.json"), str(tmp_path / "day_1"), "--effects",
+        "quadrupole_gradient", "--lattice-out", str(tmp_path / "found.json"), "--out",
+        str(tmp_path / "out"),
+    ])  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "Correction: The " in done.output
+    assert '<h2 id="correction">' in (tmp_path / "out" / "report.html").read_text()
+    rows = {r["device"]: r for r in csv.DictReader((tmp_path / "out" / "settings.csv").open())}
+    k1 = small_ring["QD::0"].k1
+    assert float(rows["QD"]["new"]) == pytest.approx(k1 / 1.01, rel=1e-3)
+    again = CliRunner().invoke(tmlattice, ["correct", str(tmp_path / "out"), "--design",
+                                           str(tmp_path / "design.json")])  # fmt: skip
+    assert again.exit_code == 0, again.output
+    assert "QD" in again.output
