@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tmlattice import correct, write_measurement
+from tmlattice import correct, diagnose, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
+from tmlattice.correction.applied import applied, read_settings
 from tmlattice.correction.estimate import estimate_with
 from tmlattice.correction.knobs import write_knobs
 from tmlattice.diagnosis.twin import known_document
@@ -382,3 +383,22 @@ def test_diagnose_states_the_correction(small_ring, tmp_path):
                                            str(tmp_path / "design.json")])  # fmt: skip
     assert again.exit_code == 0, again.output
     assert "QD" in again.output
+
+
+def test_applied_settings_have_a_calibration(small_ring, tmp_path):
+    """A supply that makes four fifths of what it is asked for."""
+    path = tmp_path / "settings.csv"
+    path.write_text("device,present,new,change,unit,low,high,gain\nQF,0.9,0.909,0.009,1/m2,,,1\n")
+    made = [simulate_response(small_ring, [Cause("family_gradient", "QF", amount)] * (amount != 0),
+                              engine="ocelot", progress=False, noise=1e-7).measured
+            for amount in (0.0, 0.008)]  # fmt: skip
+    found = diagnose(small_ring, made[1], reference=made[0])
+    (own,) = applied(found, read_settings(path))
+    assert own.asked == pytest.approx(0.01)
+    assert own.ratio == pytest.approx(0.8, abs=max(0.01, 3 * own.ratio_error))
+    assert own.ratio_error < 0.05
+    with pytest.raises(MeasurementError, match="--reference"):
+        applied(diagnose(small_ring, made[1], effects=["quadrupole_gradient"]), {"QF": (1.0, 2.0)})
+    path.write_text("device,new\nQF,1\n")
+    with pytest.raises(MeasurementError, match="no device, present or new"):
+        read_settings(path)

@@ -58,6 +58,14 @@ log = logging.getLogger(__name__)
     help="A measurement of the same machine and kind before the fault: static errors cancel, and "
     "what changed is told. Repeat it where several are diagnosed together.",
 )
+@click.option(
+    "--settings",
+    "settings_file",
+    type=FILE,
+    metavar="FILE",
+    help="settings.csv of `tmlattice correct`, applied between the reference and the measurement: "
+    "the calibration of each device, measured over asked change, is printed.",
+)
 @background_option("Small errors everywhere (not given: the data say)")
 @assume_option
 @click.option(
@@ -123,6 +131,7 @@ def diagnose(
     sequence: str | None,
     energy: float | None,
     references: tuple[Path, ...],
+    settings_file: Path | None,
     background: tuple[tuple[str, float | None], ...],
     effects: tuple[str, ...] | None,
     network: Path | None,
@@ -154,11 +163,16 @@ def diagnose(
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
+        from tmlattice.correction.applied import applied, read_settings
+        from tmlattice.correction.applied import sentence as of_device
         from tmlattice.effects import background_rms, names
 
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
+        if settings_file and not references:
+            raise click.UsageError("--settings needs the measurement from before: --reference")
+        asked = read_settings(settings_file) if settings_file else {}
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice, sequence, energy)
@@ -216,12 +230,17 @@ def diagnose(
 
             known = known_of(result)
         correction = _correction(result, known)
+        calibrations = applied(result, asked) if asked else []
+        if calibrations:
+            source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]
         _write(result, source, folder, extra, correction)
         written = _write_rings(result, known, lattice_out, repaired_out)
         if folder and reading:
             _write_weights(reading, folder)
     if not quiet:
         _print(result, correction, out, json_file, written)
+        for own in calibrations:
+            console().print(of_device(own), soft_wrap=True)
         if reading:
             _print_weights(ring, reading)
 
