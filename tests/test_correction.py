@@ -402,3 +402,16 @@ def test_applied_settings_have_a_calibration(small_ring, tmp_path):
     path.write_text("device,new\nQF,1\n")
     with pytest.raises(MeasurementError, match="no device, present or new"):
         read_settings(path)
+
+
+def test_a_table_is_not_written_over(small_ring, tmp_path):
+    save_ring(small_ring, tmp_path / "design.json")
+    knobs = tmp_path / "knobs.yaml"
+    knobs.write_text("- {knob: QF}\n")
+    done = CliRunner().invoke(tmlattice, [
+        "correct", str(tmp_path / "design.json"), "--design", str(tmp_path / "design.json"),
+        "--knobs", str(knobs), "--json", str(knobs),
+    ])  # fmt: skip
+    assert done.exit_code != 0
+    assert "is read, and would be written over" in str(done.exception)
+    assert knobs.read_text() == "- {knob: QF}\n"

@@ -60,7 +60,13 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
     "closed_orbit, with the rms error that is tolerated; or first_turn alone, which threads a beam "
     "that is not stored. Else the optics.",
 )
-@click.option("--example", type=FILE, metavar="FILE", help="Write the table of the knobs, and end.")
+@click.option(
+    "--example",
+    "example_file",
+    type=FILE,
+    metavar="FILE",
+    help="Write the table of the knobs, and end.",
+)
 @click.option(
     "--seed",
     type=click.IntRange(0),
@@ -82,7 +88,7 @@ def correct(
     goal: str | None,
     knobs: str | None,
     targets: tuple[tuple[str, float | None], ...],
-    example: Path | None,
+    example_file: Path | None,
     seed: int,
     json_file: Path | None,
     out: Path | None,
@@ -112,10 +118,10 @@ def correct(
             raise click.UsageError("name the lattice that the diagnosis started from: --design")
         settings = open_ring(start, None, None)
         devices = _devices(knobs, settings, dict(targets))
-        if example:
-            with output_file(example) as temporary:
+        if example_file:
+            with output_file(example_file) as temporary:
                 write_knobs(temporary, devices)
-            console().print(f"written: {example}")
+            console().print(f"written: {example_file}")
             return
         tell("estimated ring")
         estimate, said = read_estimate(path, settings, open_ring(str(path), None, None))

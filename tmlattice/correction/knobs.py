@@ -276,7 +276,11 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
     name = str(given.pop("knob", "")).strip()
     where = f"{path}: knob '{plain(name, 40)}'"
     if not name or (strange := set(given) - set(COLUMNS)):
-        what = "a row without a knob" if not name else f"{where}: unknown column {sorted(strange)}"
+        what = (
+            "a row without a knob"
+            if not name
+            else f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
+        )
         raise MeasurementError(f"{what}; the columns are {', '.join(COLUMNS)}")
     members = given.pop("members", ())
     names = members.split() if isinstance(members, str) else [str(m) for m in members]
