@@ -123,28 +123,30 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
     """What the priors of one variable, which add up, ask for its values."""
     if not groups:  # of numbers that a ring has none of
         return 0.0
-    bases = [group.basis[rows] for group in groups]
-    own = next((i for i, basis in enumerate(bases) if _of_each(basis)), None)
-    spreads = [basis * group.scale for basis, group in zip(bases, groups, strict=True)]
-    if own is None:
-        spread = np.concatenate(spreads, axis=1)
+    each, shared = np.zeros(len(values)), []
+    for group in groups:
+        spread = group.basis[rows] * group.scale
+        own = spread.any(axis=1)
+        if _of_each(spread) and not each[own].any():
+            each += np.abs(spread).sum(axis=1)
+        else:
+            shared.append(spread)
+    free = each > 0  # one that is held is not asked for
+    if not free.any():
+        spread = np.concatenate(shared, axis=1)
         return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
     # a few that are shared, each number's own takes the rest
-    each = np.diagonal(spreads.pop(own))
-    free = each > 0  # one that is held is not asked for
-    shared = np.concatenate([np.zeros((free.sum(), 0)), *(s[free] for s in spreads)], axis=1)
-    rest = values[free] / each[free]
-    shared /= each[free, None]
-    asked = np.concatenate([rest, np.zeros(shared.shape[1])])
-    both = np.concatenate([shared, np.eye(shared.shape[1])])
-    amounts = np.linalg.lstsq(both, asked, rcond=None)[0]
-    return float(np.sum((rest - shared @ amounts) ** 2) + amounts @ amounts)
+    rest, scale = values[free] / each[free], each[free, None]
+    few = np.concatenate([np.zeros((len(rest), 0)), *(own[free] / scale for own in shared)], axis=1)
+    asked = np.concatenate([rest, np.zeros(few.shape[1])])
+    amounts = np.linalg.lstsq(np.concatenate([few, np.eye(few.shape[1])]), asked, rcond=None)[0]
+    return float(np.sum((rest - few @ amounts) ** 2) + amounts @ amounts)
 
 
-def _of_each(basis: Array) -> bool:
-    """Whether a group has one parameter for each number."""
-    rows, columns = basis.shape
-    return rows == columns and bool(np.count_nonzero(basis) == np.count_nonzero(basis.diagonal()))
+def _of_each(spread: Array) -> bool:
+    """Whether a group has one parameter for each of its numbers."""
+    there = spread != 0
+    return bool((there.sum(axis=0) <= 1).all() and (there.sum(axis=1) <= 1).all())
 
 
 def settle(
