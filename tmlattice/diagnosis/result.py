@@ -25,7 +25,7 @@ from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
 if TYPE_CHECKING:
-    from tmlattice.diagnosis.response.dense import Step
+    from tmlattice.diagnosis.response.hierarchical import Step
     from tmlattice.diagnosis.response.missing import Weighed
     from tmlattice.diagnosis.response.pulled_apart import PulledApart
     from tmlattice.diagnosis.response.reasons import Reasons

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from tmlattice.diagnosis.response.dense import Step
+from tmlattice.diagnosis.response.hierarchical import Step
 from tmlattice.diagnosis.response.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import Support

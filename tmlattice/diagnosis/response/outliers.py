@@ -1,0 +1,330 @@
+"""Outliers of an orbit response: single readings, steps and BPMs that contradict everything else.
+
+Readings that went wrong have a small weight in the fit, for its noise model learns who they belong
+to. But nobody may be validated by them: what is held out has such readings, too. Here they are
+found beside a fit, by one statistic: what it leaves, over the median of the same plane.
+
+>>> found = outliers(state)
+>>> state = without(state, found.unread)
+"""
+
+import warnings
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import FREEDOM, used
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import ResponseData
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+GROSS = 20.0
+"""So many times what is usual both of its corrector and of its BPM, no error of a ring makes of one
+reading alone: it went wrong."""
+MANY = 0.1
+"""Share of a step's readings from which they are not single ones: the step went wrong."""
+STEP = 10.0
+"""A step is an outlier that leaves so many times what the typical one does, and so many times as
+large a share of its orbit. Two correctors with swapped labels leave some hundred times."""
+NOISE = 2.0
+"""Times the noise that it leaves at least."""
+BAD = 5.0
+"""A BPM with so many times the rms misfit of the typical reading is bad."""
+BLIND = 0.2
+"""A gain below which a BPM tells nothing of the beam."""
+MOST = 0.25
+"""Share of the steps of a plane that may be outliers: more of them are a model discrepancy."""
+COLUMNS, READINGS = 5, 6
+"""Steps of a plane, and readings of a step, that it takes to say so."""
+OUT = 5.0
+"""Standard deviations from which a reading is reported as an outlier of the fit."""
+NAMED, OFTEN = 3, 2
+"""BPMs and correctors that are named, and outliers of one from which it is."""
+STEPS = 10
+"""Reweighted least squares of a step's own amounts."""
+_MAD = 1.4826  # of a Gaussian
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """What went wrong.
+
+    Attributes:
+        unread: readings that are not used, [column, monitor, plane that is read].
+        messages: which they are.
+    """
+
+    unread: Flags
+    messages: tuple[str, ...] = ()
+
+
+def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
+    """Single readings and steps that went wrong.
+
+    Args:
+        state: a fit, with gains.
+        explained: correctors that are something else, such as swapped ones: their steps stay.
+    """
+    data = state.data
+    left = beside_own(state)
+    single = gross(data, left)
+    read = np.isfinite(data.orbits).sum(axis=(1, 2))
+    single[single.sum(axis=(1, 2)) > np.maximum(MANY * read, 1)] = False
+    left[single] = np.nan
+    ratio = misfits(state, left)
+    names = data.measured.correctors
+    steps = [
+        c for c in np.flatnonzero(ratio > STEP).tolist() if names[c] not in explained
+    ]  # fmt: skip
+    unread = single.copy()
+    unread[steps] = True
+    gone = unread.all(axis=(1, 2)) if steps else np.zeros(len(data.plane), dtype=bool)
+    split = state.split
+    if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
+        return Outliers(single, tuple(gross_message(data, single, "the fit")))
+    single[steps] = False
+    messages = gross_message(data, single, "the fit")
+    if steps:
+        told = ", ".join(f"{names[c]} ({ratio[c]:.2g} times)" for c in steps)
+        messages.append(
+            "steps whose readings contradict the fit to all others, by so many times what a "
+            f"typical step leaves, left out: {told}; measure them again: look for a supply that "
+            "jumps, for another kick, for BPMs that were read before the beam had settled"
+        )
+    return Outliers(unread, tuple(messages))
+
+
+def beside_own(state: State) -> Array:
+    """What is left of each step beside its own amounts, which held-out ones have not been fitted
+    for: its kick, its place, its roll; least absolute deviations, m, [column, monitor, 2]."""
+    data, at = state.data, state.at
+    beam, jumps, across = at.seen(at.kicked), at.seen(at.jumps), at.seen(at.across)
+    left = at.left.copy()
+    left[:, ~state.good] = np.nan
+    for c, plane in enumerate(data.plane[:-1].tolist()):
+        own = np.stack([beam[c, :, plane], jumps[c, :, plane]], axis=1)
+        left[c, :, plane] -= own @ (amounts := _robust(own, left[c, :, plane]))
+        other = 1 - plane
+        left[c, :, other] -= amounts[0] * beam[c, :, other]
+        rolled = across[c, :, [other]].T
+        left[c, :, other] -= rolled @ _robust(rolled, left[c, :, other])
+    return left
+
+
+def _robust(patterns: Array, read: Array) -> Array:
+    """Amounts by least absolute deviations, [pattern]."""
+    seen = np.isfinite(read)
+    size = np.abs(patterns[seen]).max(axis=0, initial=0.0)
+    amounts = np.zeros(patterns.shape[1])
+    some = size > 0
+    if seen.sum() <= some.sum() or not some.any():
+        return amounts
+    rows, right = patterns[seen][:, some] / size[some], read[seen]
+    least = 1e-3 * float(np.median(np.abs(right))) + 1e-300
+    weight = np.ones(len(right))
+    for _ in range(STEPS):
+        found = np.linalg.lstsq(rows * weight[:, None], right * weight, rcond=None)[0]
+        weight = np.maximum(np.abs(right - rows @ found), least) ** -0.5
+        weight /= weight.max()
+    amounts[some] = found / size[some]
+    return amounts
+
+
+def misfits(state: State, left: Array) -> Array:
+    """By how many times what a step leaves is more than what the typical one of its plane does,
+    both in metres and as a share of its orbit, in the plane read where that is more, [column].
+
+    Args:
+        state: of the fit.
+        left: m, NaN where nothing counts, [column, monitor, 2].
+    """
+    data = state.data
+    out = np.zeros(len(data.plane))
+    for kicked in (0, 1):
+        rows = np.flatnonzero(data.plane[:-1] == kicked)
+        orbit = _typical(data.orbits[rows][:, state.good, kicked])
+        for read in (0, 1):
+            size = _typical(left[rows, :, read])
+            told = np.isfinite(size) & np.isfinite(orbit)
+            if told.sum() < COLUMNS:
+                continue
+            noise = float(np.median(data.noise[:, read]))
+            share = size / np.maximum(orbit, noise)
+            least = max(float(np.median(size[told])), NOISE * noise / STEP)
+            ratio = np.minimum(size / least, share / max(float(np.median(share[told])), 1e-300))
+            ratio = np.where(told, ratio, 0.0)
+            if (ratio > STEP).sum() <= MOST * told.sum():
+                out[rows] = np.maximum(out[rows], ratio)
+    return out
+
+
+def _typical(read: Array) -> Array:
+    """Of each row, by the median, NaN of too few, m."""
+    out = np.full(len(read), np.nan)
+    for i, own in enumerate(read):
+        seen = own[np.isfinite(own)]
+        if len(seen) >= READINGS:
+            out[i] = _MAD * np.median(np.abs(seen))
+    return out
+
+
+def good_monitors(state: State) -> Flags:
+    """BPMs whose misfit the noise model finds usual, and that have a gain, [monitor].
+
+    Args:
+        state: a fit with a misfit of each monitor.
+    """
+    noise, gain = state.noise, np.diagonal(state.at.errors.monitors, axis1=1, axis2=2)
+    good = ~(np.abs(gain) < BLIND).any(axis=1)
+    for block in (0, 1):
+        if not state.of_block(block):
+            continue
+        for read in (0, 1):
+            rows = state.data.plane_of(block)[:-1] == read
+            if rows.any():
+                usual = np.median(noise.column[block, :-1][rows])
+                usual = usual + np.median(state.data.noise[:, read]) ** 2
+                good &= noise.monitor[block, read] < (BAD**2 - 1) * usual
+    return np.asarray(good)
+
+
+def without(state: State, flags: Flags) -> State:
+    """A state as if nobody had taken these readings, [column, monitor, 2]: columns that have none
+    are fitted nowhere, validate nothing, and have no numbers of their own."""
+    if not flags.any():
+        return state
+    data = state.data
+    orbits = np.where(flags, np.nan, data.orbits)
+    measured = replace(data.measured, response=orbits[:-1].copy())
+    data = replace(data, orbits=orbits, measured=measured)
+    gone = flags.all(axis=(1, 2))
+    split = replace(state.split, held=state.split.held & ~gone, inner=state.split.inner & ~gone)
+    values = dict(state.values)
+    for family in state.families:
+        if family.per == "column":
+            values[family.variable] = np.where(gone, 0.0, values[family.variable])
+    return replace(state, data=data, split=split).moved(values)
+
+
+# --- single readings ------------------------------------------------------------------------------
+def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitResponse, list[str]]:
+    """The measurement without single readings that went wrong, and a message of them.
+
+    Held-out correctors have such readings, too, and a few of them make up most of a validation
+    score.
+
+    Args:
+        measured: the response.
+        data: the same, as the ring has it.
+    """
+    wrong = gross(data, data.orbits - Predicted(data, Errors.none(data)).read)
+    if not wrong.any():
+        return measured, []
+    response = data.measured.response.copy()
+    response[wrong[:-1]] = np.nan
+    return replace(data.measured, response=response), gross_message(data, wrong, "the design")
+
+
+def gross(data: ResponseData, left: Array) -> Flags:
+    """Readings of the correctors that went wrong, by what something leaves of them, [column,
+    monitor, 2].
+
+    Args:
+        data: the response.
+        left: m, NaN where nothing was read, [column, monitor, 2].
+    """
+    gap, plane = np.abs(left[:-1]), data.plane[:-1]
+    wrong = np.zeros(left.shape, dtype=bool)
+    for kicked, read in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        rows = np.flatnonzero(plane == kicked)
+        own = gap[rows, :, read]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # what was not read at all
+            column, monitor = (np.nanmedian(own, axis=k, keepdims=True) for k in (1, 0))
+        usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
+        wrong[rows, :, read] = np.nan_to_num(own) > GROSS * _MAD * usual
+    return wrong
+
+
+def gross_message(data: ResponseData, wrong: Flags, what: str) -> list[str]:
+    """A message of readings that went wrong, where there are any.
+
+    Args:
+        data: the response.
+        wrong: which, [column, monitor, 2].
+        what: they differ from.
+    """
+    if not wrong.any():
+        return []
+    columns, monitors, _ = np.nonzero(wrong)
+    names = data.measured
+    most = _most(Counter(names.monitors[i] for i in monitors.tolist()),
+                 Counter(names.correctors[i] for i in columns.tolist()))  # fmt: skip
+    return [
+        f"single readings that differ from {what} by {GROSS:g} times what is usual of their "
+        f"corrector and of their monitor, left out: {len(columns)}{most}"
+    ]
+
+
+def _most(*tables: Counter[str]) -> str:
+    """Who has most of them."""
+    most = [
+        f"{name} ({own})"
+        for table in tables
+        for name, own in table.most_common(NAMED)
+        if own >= OFTEN
+    ]
+    return f"; most at {', '.join(most)}" if most else ""
+
+
+def messages(state: State) -> list[str]:
+    """Outliers that a fit leaves in its readings, and what all steps have in common."""
+    measured = state.data.measured
+    limit = (FREEDOM + 1) / (FREEDOM + OUT**2)
+    monitors, correctors = Counter[str](), Counter[str]()
+    count = total = 0
+    out = []
+    for block in (0, 1):
+        use = used(state, block)
+        odd = use & (state.noise.share[block] < limit)
+        rf = np.flatnonzero(odd[-1])
+        if len(rf):
+            names = ", ".join(measured.monitors[i] for i in rf)
+            out.append(
+                f"readings of the RF's orbit in {'xy'[block]} that are more than {OUT:g} standard "
+                f"deviations off, and count little: {names}"
+            )
+        count, total = count + int(odd[:-1].sum()), total + int(use[:-1].sum())
+        monitors.update(measured.monitors[i] for i in np.nonzero(odd[:-1])[1])
+        correctors.update(measured.correctors[i] for i in np.nonzero(odd[:-1])[0])
+    if count:
+        out.append(
+            f"{count} of {total} readings are more than {OUT:g} standard deviations off, and count "
+            f"little{_most(monitors, correctors)}"
+        )
+    return out + common_modes(state)
+
+
+def common_modes(state: State) -> list[str]:
+    """What all readings of a step have in common, where that is more than their noise."""
+    noise, data = state.noise, state.data
+    moved = []
+    for plane in (0, 1) if "waves" in noise.kinds else ():
+        blocks = [block for block in (0, 1) if used(state, block).any()]
+        waves = noise.waves.shape[1]
+        rms = max((float(noise.scale[b, plane, 0]) * np.sqrt(waves) for b in blocks), default=0.0)
+        if rms > float(np.median(data.noise[:, plane])):
+            moved.append(f"{1e6 * rms:.2g} µm rms in {'xy'[plane]}")
+    if not moved:
+        return []
+    return [
+        "the beam moved between the readings of a step, all BPMs together, by another amount in "
+        f"each: {' and '.join(moved)}; the amounts are taken for unknown"
+    ]
