@@ -45,6 +45,8 @@ Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
+WAVES = "waves"
+"""The kind of common modes that is admitted by validation."""
 LEADS, ROUGH = 5e-3, 0.03
 """Share of the cost that a round has to gain for another one, of a fit that leads to the next one;
 and of one that is compared."""
@@ -148,15 +150,18 @@ def fit_families(
     late = [f for f in there if f.name in SECOND]
     progress("all families")
     state = allow(begun(design, there), [f for f in there if f not in late])
+    kinds = tuple(kind for kind in state.noise.kinds if kind != WAVES)
+    state = replace(state, noise=replace(state.noise, kinds=kinds))
     state = settle(bend(jump(state)), gain=LEADS, alike=True)
-    progress("misfits of columns and BPMs")
-    state = settle(bend(jump(allow(state, late))), gain=LEADS)
     swapped = {name for pair in exchanged(state, _far_off(state)) for name in pair}
     odd = outliers(state, swapped)
     state, design = without(state, odd.unread), without(design, odd.unread)
-    state = replace(state, good=good_monitors(state))
     messages = list(odd.messages)
-    state = settle(_undoubted(state, messages), gain=LEADS)
+    progress("misfits of columns and BPMs")
+    state = settle(bend(jump(allow(state, late))), gain=LEADS)
+    state = replace(state, good=good_monitors(state))
+    fewer = _undoubted(state, messages)
+    state = state if fewer is state else settle(fewer, gain=LEADS)
     split = state.split
     before = score(design, split.held)
     steps = [Step.scored("design", 0, before)]
@@ -195,16 +200,17 @@ def fit_families(
 
 
 def _validated(state: State, progress: Callable[[str], Any]) -> tuple[State, list[Step]]:
-    """The state without waves, and without late families, that inner correctors reject; and the
-    figures with the latter."""
+    """The state with waves of the orbit in each step, if inner correctors want them, for these
+    absorb what gradients should explain; and without late families that they reject, with the
+    figures of these."""
     progress("validation")
     refused: list[Step] = []
-    kinds = tuple(kind for kind in state.noise.kinds if kind != "waves")
-    fewer = settle(replace(state, noise=replace(state.noise, kinds=kinds)), gain=ROUGH)
-    rise = lost(inner(fewer), inner(state))
-    log.info("without waves: validation %+.3f +- %.3f", *rise)
+    kinds = (*state.noise.kinds, WAVES)
+    more = settle(replace(state, noise=replace(state.noise, kinds=kinds)), gain=ROUGH)
+    rise = lost(inner(more), inner(state))
+    log.info("without waves: validation %+.3f +- %.3f", -rise[0], rise[1])
     if against(rise):
-        state = fewer
+        state = more
     for family in [own for own in state.families if own.name in SECOND]:
         if not state.values[family.variable].any():
             continue

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.diagnosis.response.weights import FREEDOM, used
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -78,11 +79,11 @@ def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
     read = np.isfinite(data.orbits).sum(axis=(1, 2))
     single[single.sum(axis=(1, 2)) > np.maximum(MANY * read, 1)] = False
     left[single] = np.nan
+    broken = torn(without(state, single))
     ratio = misfits(state, left)
     names = data.measured.correctors
-    steps = [
-        c for c in np.flatnonzero(ratio > STEP).tolist() if names[c] not in explained
-    ]  # fmt: skip
+    odd = broken | (ratio > STEP)
+    steps = [c for c in np.flatnonzero(odd).tolist() if names[c] not in explained]
     unread = single.copy()
     unread[steps] = True
     gone = unread.all(axis=(1, 2)) if steps else np.zeros(len(data.plane), dtype=bool)
@@ -94,9 +95,9 @@ def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
     if steps:
         told = ", ".join(f"{names[c]} ({ratio[c]:.2g} times)" for c in steps)
         messages.append(
-            "steps whose readings contradict the fit to all others, by so many times what a "
-            f"typical step leaves, left out: {told}; measure them again: look for a supply that "
-            "jumps, for another kick, for BPMs that were read before the beam had settled"
+            "steps whose readings contradict one another or the fit to all others, with so many "
+            f"times what a typical step leaves, left out: {told}; measure them again: wait until "
+            "the beam has settled, and look for another kick or a supply that jumps"
         )
     return Outliers(unread, tuple(messages))
 
@@ -189,9 +190,9 @@ def good_monitors(state: State) -> Flags:
         for read in (0, 1):
             rows = state.data.plane_of(block)[:-1] == read
             if rows.any():
-                usual = np.median(noise.column[block, :-1][rows])
-                usual = usual + np.median(state.data.noise[:, read]) ** 2
-                good &= noise.monitor[block, read] < (BAD**2 - 1) * usual
+                square = state.data.noise[:, read] ** 2 + noise.monitor[block, read]
+                square = square + np.median(noise.column[block, :-1][rows])
+                good &= square < BAD**2 * np.median(square)
     return np.asarray(good)
 
 
