@@ -160,12 +160,13 @@ def fit_families(
     progress("misfits of columns and BPMs")
     state = settle(bend(jump(allow(state, late))), gain=LEADS)
     state = replace(state, good=good_monitors(state))
-    fewer = _undoubted(state, messages)
+    refused: list[Step] = []
+    fewer = _undoubted(state, messages, refused)
     state = state if fewer is state else settle(fewer, gain=LEADS)
     split = state.split
     before = score(design, split.held)
     steps = [Step.scored("design", 0, before)]
-    state, refused = _validated(state, progress)
+    state = _validated(state, refused, progress)
     spoilt = -lost(inner(design), inner(state))[0]
     enough = int(split.inner.sum()) >= ENOUGH
     title = "all families"
@@ -180,7 +181,7 @@ def fit_families(
     progress("all correctors")
     # the inner ones begin at what they say: a column far off would weigh nothing, and stay there
     state = settle(bend(jump(replace(state, exploring=False), beyond=1.0)))
-    fewer = _undoubted(state, messages)
+    fewer = _undoubted(state, messages, refused)
     state = state if fewer is state else settle(fewer)
     state = replace(state, good=state.good & good_monitors(state))
     then = replace(design, good=state.good, exploring=False)
@@ -199,12 +200,16 @@ def fit_families(
     )
 
 
-def _validated(state: State, progress: Callable[[str], Any]) -> tuple[State, list[Step]]:
+def _refused(state: State, family: Family) -> Step:
+    """The figures of the fit with a family that is closed."""
+    figures = score(state, state.split.held)
+    return replace(Step.scored(family.title, family.count(state.data), figures), kept=False)
+
+
+def _validated(state: State, refused: list[Step], progress: Callable[[str], Any]) -> State:
     """The state with waves of the orbit in each step, if inner correctors want them, for these
-    absorb what gradients should explain; and without late families that they reject, with the
-    figures of these."""
+    absorb what gradients should explain; and without late families that they reject."""
     progress("validation")
-    refused: list[Step] = []
     kinds = (*state.noise.kinds, WAVES)
     more = settle(replace(state, noise=replace(state.noise, kinds=kinds)), gain=ROUGH)
     rise = lost(inner(more), inner(state))
@@ -217,12 +222,9 @@ def _validated(state: State, progress: Callable[[str], Any]) -> tuple[State, lis
         rise = lost(inner(_closed(state, family)), inner(state))
         log.info("without %s: validation %+.3f +- %.3f", family.name, *rise)
         if against(rise):
-            figures = Step.scored(
-                family.title, family.count(state.data), score(state, state.split.held)
-            )
-            refused.append(replace(figures, kept=False))
+            refused.append(_refused(state, family))
             state = settle(forbid(state, [family]), gain=LEADS)
-    return state, refused
+    return state
 
 
 def _closed(state: State, family: Family) -> State:
@@ -238,7 +240,7 @@ def _closed(state: State, family: Family) -> State:
         return state
 
 
-def _undoubted(state: State, messages: list[str]) -> State:
+def _undoubted(state: State, messages: list[str], refused: list[Step]) -> State:
     """The state without families whose numbers cannot be what they stand for; why goes to the
     messages."""
     doubts = {
@@ -247,6 +249,7 @@ def _undoubted(state: State, messages: list[str]) -> State:
         if (doubt := family.doubt(state.values[family.variable], state.data)) is not None
     }
     messages += doubts.values()
+    refused += [_refused(state, family) for family in doubts]
     return forbid(state, list(doubts)) if doubts else state
 
 

@@ -31,7 +31,7 @@ GROSS = 20.0
 reading alone: it went wrong."""
 MANY = 0.1
 """Share of a step's readings from which they are not single ones: the step went wrong."""
-STEP = 10.0
+STEP = 6.0
 """A step is an outlier that leaves so many times what the typical one does, and so many times as
 large a share of its orbit. Two correctors with swapped labels leave some hundred times."""
 NOISE = 2.0

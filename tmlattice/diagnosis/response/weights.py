@@ -193,8 +193,12 @@ def _learn_misfits(
     free[-1] = max(count[-1] - spent.rf, 0.01 * count[-1])
     grown = (count / np.maximum(free, 1e-9))[:, None]
     v = variance(state, block)
-    # a reading is an outlier beside the others of its column, and not because its column is one
+    # a reading is an outlier beside the others of its column and of its monitor, and not because
+    # these are
     usual = v if alike else np.maximum(v, _typical(left, use)[:, None])
+    for read in (0, 1) if not alike else ():
+        rows = plane == read
+        usual[rows] = np.maximum(usual[rows], _typical(left[rows].T, use[rows].T))
     noise.share[block] = np.where(
         use, np.minimum((FREEDOM + 1) / (FREEDOM + left**2 * grown / usual), 1.0), 1.0
     )
@@ -223,8 +227,8 @@ def _learn_misfits(
 
 
 def _typical(left: Array, use: Flags) -> Array:
-    """Of each column, by the median of its squares, m^2, [column]."""
+    """Of each row, by the median of its squares, m^2, [row]."""
     out = np.zeros(len(left))
-    for column in np.flatnonzero(use.any(axis=1)):
-        out[column] = np.median(left[column, use[column]] ** 2) / MEDIAN_SQUARE
+    for row in np.flatnonzero(use.any(axis=1)):
+        out[row] = np.median(left[row, use[row]] ** 2) / MEDIAN_SQUARE
     return out
