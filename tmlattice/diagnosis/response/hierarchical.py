@@ -54,8 +54,8 @@ ASTRAY, NEAR = 1.2, 1e-3
 """So many times what the design leaves of the typical column's square no result may leave; or this
 share of it, if that is more."""
 SPOILT, ENOUGH = 0.05, 3
-"""By how much the logarithms of the validation scores may rise with all families, and inner
-correctors that it takes to say so."""
+"""By how much the logarithms of the validation scores may rise with all families, if that is more
+than their standard error, and inner correctors that it takes to say so."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def fit_families(
     before = score(design, split.held)
     steps = [Step.scored("design", 0, before)]
     state = _validated(state, refused, progress)
-    spoilt = -lost(inner(design), inner(state))[0]
+    rise, unsure = lost(inner(replace(design, good=state.good)), inner(state))
     enough = int(split.inner.sum()) >= ENOUGH
     title = "all families"
     count = sum(family.count(data) for family in state.families)
@@ -176,7 +176,7 @@ def fit_families(
         (*refused, replace(Step.scored(title, count, score(state, split.held)), kept=False)),
         (before, before), tuple(messages),
     )  # fmt: skip
-    if enough and spoilt > SPOILT:
+    if enough and -rise > max(SPOILT, unsure):
         return nothing
     progress("all correctors")
     # the inner ones begin at what they say: a column far off would weigh nothing, and stay there
@@ -211,7 +211,7 @@ def _validated(state: State, refused: list[Step], progress: Callable[[str], Any]
     absorb what gradients should explain; and without late families that they reject."""
     progress("validation")
     kinds = (*state.noise.kinds, WAVES)
-    more = settle(replace(state, noise=replace(state.noise, kinds=kinds)), gain=ROUGH)
+    more = settle(replace(state, noise=replace(state.noise, kinds=kinds)), gain=LEADS)
     rise = lost(inner(more), inner(state))
     log.info("without waves: validation %+.3f +- %.3f", -rise[0], rise[1])
     if against(rise):
