@@ -204,7 +204,7 @@ class Diagnosis(ShownDiagnosis):
         errors: standard error of each one's amount, the same length.
         view: what figures need; it says what was measured.
         steps: of a dense fit, those kept; the first is the design's, the last the result's.
-        refused: those that did not help.
+        refused: families that are closed, with the figures with them.
         bad_monitors: names of those left out.
         priors: rms of small errors, as the data have them or as they were told, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
@@ -307,7 +307,7 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def by_steps(self) -> bool:
-        """Whether families of errors were fitted step by step, as to an orbit response."""
+        """Whether families of errors were fitted, as to an orbit response."""
         return isinstance(self.view, ResponseView)
 
     @property

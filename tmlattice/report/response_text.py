@@ -1,4 +1,4 @@
-"""What only a dense fit has to say: its steps, its errors, what may be missing."""
+"""What only a hierarchical fit reports: held-out figures, errors, what may be missing."""
 
 from collections.abc import Iterable
 
@@ -258,7 +258,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
     lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
     if result.refused:
-        lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
+        lines += ["", "Closed, for held-out readings are worse with them, or no beam has so much:"]
         lines += columns([HEAD, *step_rows(result.refused)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.reasons is not None:

@@ -1,4 +1,4 @@
-"""A dense fit of a design that is far from the ring that was measured, or stores no beam at all."""
+"""A fit of a design that is far from the ring that was measured, or stores no beam at all."""
 
 import dataclasses
 

@@ -60,10 +60,10 @@ than their standard error, and inner correctors that it takes to say so."""
 
 @dataclass(frozen=True)
 class Step:
-    """The gap with what has been allowed so far.
+    """The gap of the design, of the fit, or with a single fault or without a closed family.
 
     Attributes:
-        effect: what was tried; the first is "design".
+        effect: what was fitted: "design", "all families", or a fault or a family by its effect.
         parameters: how many it has.
         heldout_rms_in_plane, heldout_rms_coupling: m, over held-out correctors.
         heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
@@ -71,7 +71,7 @@ class Step:
             gave its kick, m; NaN before rolls are fitted.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
         dispersion_rms: of the RF's orbit in x on the half of the monitors not fitted, m.
-        kept: whether it helped those who choose; the figures of one that was not are its own.
+        kept: False of a family that is closed; its figures are those with it.
     """
 
     effect: str
