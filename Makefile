@@ -30,10 +30,11 @@ check: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# damaged inputs of every format, then kills and full disks: half an hour
+# damaged inputs of every format, kills and full disks, pairs of outputs: half an hour
 fuzz: $(VENV)/installed
 	$(BIN)/python tests/fuzz/run.py 10000
 	$(BIN)/python tests/fuzz/kills.py 200
+	$(BIN)/python tests/fuzz/pairs.py 500
 
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/speed.py

@@ -1,9 +1,12 @@
 """Batches: failures stay alone, finished cases are kept, local processes and a scheduler agree."""
 
 import json
+import os
+import signal
 import sys
 import time
 
+import psutil
 import pytest
 
 from tmlattice import batch
@@ -59,7 +62,8 @@ def test_two_processes_and_a_scheduler_by_its_address(tmp_path):
     assert json.loads((tmp_path / "remote" / "c0.json").read_text()) == {"n": 0}
 
 
-def test_no_scheduler_is_one_sentence(tmp_path):
+def test_no_scheduler_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(batch, "PATIENCE", 1.0)
     with pytest.raises(TmlatticeError, match="no Dask scheduler answers"):
         run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)
 
@@ -118,8 +122,44 @@ def test_warnings_of_worker_processes_reach_the_user(tmp_path):
     assert texts == ["all of them are", "case 1 is odd", "case 2 is odd", "case 3 is odd"]
 
 
-def test_several_processes_without_their_package_say_how_to_install_it(tmp_path, monkeypatch):
+def test_a_scheduler_without_its_package_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(TmlatticeError, match=r"pip install 'tmlattice\[study\]'.*--workers 1"):
-        run_batch(dict, cases(a={}, b={}), tmp_path, jobs=2, progress=False)
-    assert run_batch(dict, cases(a={"n": 1}), tmp_path, jobs=1, progress=False)["a"] == {"n": 1}
+    with pytest.raises(TmlatticeError, match=r"pip install 'tmlattice\[dask\]'.*local processes"):
+        run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)
+    found = run_batch(dict, cases(a={"n": 1}, b={"n": 2}), tmp_path, jobs=2, progress=False)
+    assert found == {"a": {"n": 1}, "b": {"n": 2}}
+
+
+def suicidal(case):
+    if case == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"n": case}
+
+
+def test_a_killed_worker_fails_its_own_case_and_no_other(tmp_path):
+    some = cases(a=1, b="dies", c=3, d=4)
+    found = run_batch(suicidal, some, tmp_path, jobs=2, progress=False)
+    assert [found[name].get("n") for name in "acd"] == [1, 3, 4]
+    assert "a worker process was lost (SIGKILL)" in found["b"]["error"]
+
+
+def test_local_workers_open_no_port(tmp_path):
+    """Neither they nor this process listens, on any address, Unix sockets included."""
+    me = psutil.Process()
+    seen = []
+    results = run_batch(
+        late, {name: lambda: {"n": 1} for name in "ab"}, tmp_path, jobs=2, progress=False
+    )
+    assert results["a"] == {"n": 1}
+
+    def look():
+        for process in [me, *me.children(recursive=True)]:
+            seen.append([c for c in process.net_connections("all") if c.status == "LISTEN"])
+            seen.append([c for c in process.net_connections("unix") if process != me])
+        return {"n": 2}
+
+    more = {**cases(c={"n": 1}, d={"n": 1}, e={"n": 1}, f={"n": 1}), "g": look}
+    run_batch(late, more, tmp_path, jobs=2, progress=False)
+    assert len(seen) >= 6  # this process and both workers
+    assert not any(seen)
+    assert not me.children()

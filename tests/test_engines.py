@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from conftest import SMALL
 from places import PLACES
 
+from tmlattice import load_ring
 from tmlattice.effects import CATALOGUE, Cause, ReadingEffect
 from tmlattice.machine import Machine, draw_shots
 
@@ -67,3 +69,19 @@ def test_a_set_gradient_of_a_bend_is_the_same_in_both_engines(small_ring):
     size = np.sqrt((changes["at"] ** 2).mean())
     assert size > 1e-5
     assert np.sqrt(((changes["at"] - changes["ocelot"]) ** 2).mean()) < 0.02 * size
+
+
+def test_a_matrix_that_kicks_does_so_in_both_engines(tmp_path):
+    """A misaligned magnet of an AT file is such a matrix; beside a fault in its middle as well."""
+    text = SMALL.read_text().replace(
+        "root = sqrt", "wiggler.b[:4, 0] = [1e-5, 2e-5, -3e-5, 1e-5]\nroot = sqrt"
+    )
+    (tmp_path / "ring.py").write_text(text)
+    ring = load_ring(tmp_path / "ring.py")
+    launches = np.zeros((1, 6))
+    for causes in ([], [Cause("insertion_device_focusing", "wig_1", 0.5)]):
+        at, ocelot = (
+            Machine(ring, causes, engine=engine).beam(launches, 2) for engine in ("at", "ocelot")
+        )
+        assert np.abs(ocelot).max() > 1e-4
+        np.testing.assert_allclose(at, ocelot, rtol=0, atol=1e-8)  # sextupoles, to third order

@@ -74,7 +74,7 @@ def test_python_names_the_extra_too(tmp_path):
         "def one(): tmlattice.TaylorNetwork\n"
         "def two(): from tmlattice.fitting import fine_tune\n"
         "from pathlib import Path\n"
-        "def three(): run_batch(str, {'a': str, 'b': str}, Path('x'), jobs=2)\n"
+        "def three(): run_batch(str, {'a': str}, Path('x'), scheduler='tcp://x:1')\n"
         "for wanted in (one, two, three):\n"
         "    try:\n"
         "        wanted()\n"
@@ -87,8 +87,8 @@ def test_python_names_the_extra_too(tmp_path):
     assert "'torch'" in first
     assert "'tmlattice[network]'" in first
     assert second == first
-    assert "'tmlattice[study]'" in third
-    assert "--workers 1" in third
+    assert "'tmlattice[dask]'" in third
+    assert "local processes" in third
 
 
 def test_every_extra_brings_what_its_message_says():
@@ -99,6 +99,6 @@ def test_every_extra_brings_what_its_message_says():
         name: {wanted.partition(">=")[0] for wanted in wants} for name, wants in extras.items()
     }
     assert "torch" in brings["network"]
-    assert {"torch", "distributed"} <= brings["study"]
+    assert "distributed" in brings["dask"]
     assert {"torch", "scikit-learn"} <= brings["challenge"] & brings["reproduce"]
-    assert set().union(*(brings[n] for n in ("network", "study", "challenge"))) <= brings["test"]
+    assert set().union(*(brings[n] for n in ("network", "dask", "challenge"))) <= brings["test"]

@@ -5,6 +5,7 @@ import errno
 import fcntl
 import json
 import os
+import struct
 import subprocess
 import sys
 import threading
@@ -16,11 +17,14 @@ import pytest
 from command import tmlattice
 from conftest import SMALL
 
-from tmlattice import files, read_measurement
+sys.path.insert(0, str(Path(__file__).parent / "fuzz"))
+from pairs import pairs
+
+from tmlattice import read_measurement, temporaries
 from tmlattice.errors import MeasurementError
 from tmlattice.files import OutputError, check_writable, output_file, output_folder
 from tmlattice.measurement import Measurement, write_measurement
-from tmlattice.temporaries import PREFIX, exchange
+from tmlattice.temporaries import PREFIX, locked
 
 
 def litter(folder):
@@ -33,7 +37,8 @@ def write_pair(folder, text, names=("a", "b")):
             (temporary / name).write_text(text)
 
 
-def test_a_folder_never_holds_files_of_two_runs(tmp_path):
+def test_a_folder_s_files_are_of_one_run(tmp_path):
+    """Of whoever holds its lock; its other files stay."""
     folder = tmp_path / "out"
     write_pair(folder, "0")
     (folder / "mine").write_text("mine")
@@ -41,15 +46,9 @@ def test_a_folder_never_holds_files_of_two_runs(tmp_path):
 
     def watch():
         while not end.is_set():
-            handle = os.open(folder, os.O_RDONLY)  # one and the same folder for both readings
-            texts = []
-            with contextlib.suppress(FileNotFoundError):  # it was exchanged, and is on its way out
-                for name in ("a", "b"):
-                    file = os.open(name, os.O_RDONLY, dir_fd=handle)
-                    texts.append(os.read(file, 10))
-                    os.close(file)
-                seen.append(texts[0])
-            os.close(handle)
+            with locked(folder, shared=True):
+                texts = [(folder / name).read_text() for name in "ab"]
+            seen.append(texts[0])
             if len(set(texts)) > 1:
                 mixed.append(texts)
 
@@ -60,30 +59,15 @@ def test_a_folder_never_holds_files_of_two_runs(tmp_path):
     end.set()
     watcher.join()
     assert not mixed
-    assert len(seen) > 10
+    assert len(set(seen)) > 10
     assert (folder / "mine").read_text() == "mine"
     assert not litter(tmp_path)
 
 
-def test_two_writers_leave_the_folder_of_one_of_them(tmp_path):
-    folder = tmp_path / "out"
-    wrong = []
-
-    def write(text):
-        for number in range(40):
-            try:
-                write_pair(folder, f"{text} {number}")
-            except OutputError as error:  # the other one exchanged it at this moment
-                wrong.append(str(error))
-
-    both = [threading.Thread(target=write, args=(text,)) for text in ("one", "other")]
-    for writer in both:
-        writer.start()
-    for writer in both:
-        writer.join()
-    assert not wrong
-    assert len({(folder / name).read_text() for name in "ab"}) == 1
-    assert not litter(tmp_path)
+@pytest.mark.parametrize("there", [True, False])
+def test_outputs_into_one_folder_lose_nothing(tmp_path, there):
+    """Of two processes, and of another program that writes there all the time."""
+    assert not pairs(tmp_path, 6, there)
 
 
 def test_what_fails_leaves_the_folder_as_it_was(tmp_path):
@@ -100,30 +84,71 @@ def test_what_fails_leaves_the_folder_as_it_was(tmp_path):
     assert [(folder / name).read_text() for name in "ab"] == ["old", "old"]
 
 
-@pytest.mark.parametrize("why", ["folders in it", "somebody stands in it", "no exchange"])
-def test_a_folder_that_cannot_be_exchanged_keeps_what_it_has(tmp_path, monkeypatch, why):
+def test_a_folder_stays_the_same_folder(tmp_path, monkeypatch):
+    """Its inode, owner, mode, set-group-ID bit, attributes, files; whoever is in it."""
     folder = tmp_path / "out"
     write_pair(folder, "old")
     (folder / "mine").write_text("mine")
-    if why == "folders in it":
-        (folder / "figures").mkdir()
-    elif why == "somebody stands in it":
-        monkeypatch.chdir(folder)
-    else:
-        monkeypatch.setattr(files, "exchange", lambda *_: False)
-    before = folder.stat().st_ino
+    (folder / "figures").mkdir()
+    monkeypatch.chdir(folder)
+    if os.geteuid() == 0:
+        os.chown(folder, 1234, 2345)
+    folder.chmod(0o2775)
+    with contextlib.suppress(OSError):  # a file system without
+        os.setxattr(folder, "user.shift", b"night")
+        os.setxattr(folder, "system.posix_acl_default", ACL)
+    kept = os.stat(folder), attributes(folder)
+    handle = os.open(folder, os.O_RDONLY)
     write_pair(folder, "new")
-    assert folder.stat().st_ino == before
+    after = os.stat(folder), attributes(folder)
+    os.close(handle)
+    for field in ("st_ino", "st_uid", "st_gid", "st_mode"):
+        assert getattr(after[0], field) == getattr(kept[0], field)
+    assert after[1] == kept[1]
     assert [(folder / name).read_text() for name in ("a", "b", "mine")] == ["new", "new", "mine"]
+    assert (folder / "a").stat().st_gid == kept[0].st_gid  # of the folder, as any new file there
+    if "system.posix_acl_default" in kept[1]:
+        assert "system.posix_acl_access" in attributes(folder / "a")  # readable by user 2345
     assert not litter(tmp_path)
 
 
-def test_folders_are_exchanged_at_once_on_this_system(tmp_path):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "who").write_text(name)
-    assert exchange(tmp_path / "a", tmp_path / "b")  # Linux has it: the tests above mean it
-    assert (tmp_path / "a" / "who").read_text() == "b"
+ACL = struct.pack("<I" + "HHI" * 5, 2, 1, 7, 2**32 - 1, 2, 5, 2345, 4, 7, 2**32 - 1, 16, 7,
+                  2**32 - 1, 32, 5, 2**32 - 1)  # fmt: skip
+"""user::rwx, user:2345:r-x, group::rwx, mask::rwx, other::r-x"""
+
+
+def attributes(path):
+    return {name: os.getxattr(path, name) for name in os.listxattr(path)}
+
+
+def test_a_new_folder_is_as_any_other(tmp_path):
+    """Its mode is the process's, its group that of the folder it is in."""
+    tmp_path.chmod(0o2775)
+    before = os.umask(0o027)
+    try:
+        write_pair(tmp_path / "out", "x")
+        (tmp_path / "made").mkdir()
+    finally:
+        os.umask(before)
+    assert (tmp_path / "out").stat().st_mode == (tmp_path / "made").stat().st_mode
+    assert (tmp_path / "out" / "a").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_file_does_not_replace_a_folder(tmp_path):
+    write_pair(tmp_path / "out", "old")
+    (tmp_path / "out" / "c").mkdir()
+    with pytest.raises(OutputError, match="'c' is a folder there"):
+        write_pair(tmp_path / "out", "new", names=("a", "b", "c"))
+    assert (tmp_path / "out" / "a").read_text() == "old"
+    assert not litter(tmp_path)
+
+
+def test_a_lock_that_somebody_keeps_stops_no_output(tmp_path, monkeypatch):
+    monkeypatch.setattr(temporaries, "PATIENCE", 0.1)
+    write_pair(tmp_path / "out", "old")
+    with locked(tmp_path / "out"):
+        write_pair(tmp_path / "out", "new")
+    assert (tmp_path / "out" / "a").read_text() == "new"
 
 
 def test_devices_and_pipes_stay_what_they_are(tmp_path):
@@ -198,19 +223,30 @@ def test_an_output_is_no_input(measured, words):
 
 
 def test_what_a_killed_run_left_is_removed_and_no_more(tmp_path):
+    """Not what lives, is young, another user's, or only begins with the same letters."""
     old = time.time() - 100
-    (tmp_path / f"{PREFIX}folder").mkdir()
-    (tmp_path / f"{PREFIX}folder" / "x").write_text("x")
-    (tmp_path / f"{PREFIX}file").write_text("x")
-    (tmp_path / f"{PREFIX}living").write_text("x")
+    stale = [tmp_path / f"{PREFIX}{k:016x}" for k in range(2)]
+    stale[0].mkdir()
+    (stale[0] / "x").write_text("x")
+    stale[1].write_text("x")
+    living, linked, young = (tmp_path / f"{PREFIX}{k:016x}" for k in (10, 11, 12))
+    notes, others = tmp_path / f"{PREFIX}notes", tmp_path / f"{PREFIX}{13:016x}"
+    linked.symlink_to(tmp_path / "elsewhere")
+    for path in (living, notes, others):
+        path.write_text("x")
+    if os.geteuid() == 0:
+        os.chown(others, 1234, 1234)
+    else:
+        others.unlink()
     for path in tmp_path.iterdir():
-        os.utime(path, (old, old))
-    (tmp_path / f"{PREFIX}young").write_text("x")
-    with (tmp_path / f"{PREFIX}living").open() as living:
-        fcntl.flock(living, fcntl.LOCK_EX)
+        os.utime(path, (old, old), follow_symlinks=False)
+    young.write_text("x")
+    before = set(litter(tmp_path))
+    with living.open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
         with output_file(tmp_path / "out") as path:
             path.write_text("x")
-        assert sorted(litter(tmp_path)) == [f"{PREFIX}living", f"{PREFIX}young"]
+    assert before - set(litter(tmp_path)) == {path.name for path in stale}
 
 
 KILLED = """
@@ -232,9 +268,41 @@ def test_a_killed_run_leaves_only_what_the_next_removes(tmp_path):
     left = litter(tmp_path)
     assert len(left) == 2
     old = time.time() - 100
-    for name in left:
-        os.utime(tmp_path / name, (old, old))
+    for path in tmp_path.rglob(f"{PREFIX}*"):
+        os.utime(path, (old, old))
     write_pair(tmp_path / "out", "new")
+    with output_file(tmp_path / "file") as path:
+        path.write_text("new")
+    assert not litter(tmp_path)
+
+
+AMID = """
+import os, sys
+from pathlib import Path
+from tmlattice.files import output_folder
+real, left = os.replace, [int(sys.argv[1])]
+def replace(*paths):
+    if not left[0]:
+        os.kill(os.getpid(), 9)
+    left[0] -= 1
+    real(*paths)
+os.replace = replace
+with output_folder(Path("out")) as folder:
+    for name in "abc":
+        (folder / name).write_text("new")
+"""
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_a_run_that_is_killed_while_it_moves_its_files_is_finished(tmp_path, moved):
+    """By whoever has the folder's lock next: it never sees files of two runs."""
+    folder = tmp_path / "out"
+    write_pair(folder, "old", "abc")
+    done = subprocess.run([sys.executable, "-c", AMID, str(moved)], cwd=tmp_path, check=False)
+    assert done.returncode == -9
+    assert [(folder / name).read_text() for name in "abc"].count("new") == moved
+    with locked(folder, shared=True):
+        assert [(folder / name).read_text() for name in "abc"] == ["new"] * 3
     assert not litter(tmp_path)
 
 

@@ -97,4 +97,4 @@ def test_a_plain_install_takes_nothing_that_only_studies_need():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     plain = {wanted.partition(">=")[0] for wanted in project["dependencies"]}
     assert not plain & {"distributed", "dask", "scikit-learn", "torch"}
-    assert any("distributed" in wanted for wanted in project["optional-dependencies"]["study"])
+    assert any("distributed" in wanted for wanted in project["optional-dependencies"]["dask"])

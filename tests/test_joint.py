@@ -261,6 +261,14 @@ def test_what_has_no_meaning_is_a_sentence(small_ring):
         diagnose(small_ring, unknown)
 
 
+def test_readings_that_are_given_twice_are_refused(small_ring):
+    data = {"monday": _orbit(small_ring, [KICK]), "again": _orbit(small_ring, [KICK])}
+    with pytest.raises(MeasurementError, match="'monday' and 'again' hold the same readings"):
+        diagnose(small_ring, data)
+    data["again"] = _orbit(small_ring, [KICK], seed=5)
+    assert diagnose(small_ring, data).verdict in {"named", "equivalent"}
+
+
 def test_small_errors_that_leave_no_stored_beam_are_told(small_ring):
     """Half of them stood in the model that is shown, and nobody said so."""
     places = {"quadrupole_gradient": 1.0}

@@ -7,6 +7,7 @@ from tmlattice import TaylorNetwork, load_ring, one_turn_optics
 from tmlattice.effects import find
 from tmlattice.errors import LatticeError, UnknownNameError
 from tmlattice.lattice import middle_of_first_arc
+from tmlattice.lattice.ocelot import elements
 
 
 def write(folder, text, name="machine.py"):
@@ -138,6 +139,24 @@ def test_sequence_may_be_nested_or_a_magnetic_lattice(tmp_path, variable):
     )
     ring = load_ring(path, sequence="mine" if variable == "mine" else None)
     assert [e.name for e in ring.magnets] == ["q::0", "q::1", "q::2"]
+
+
+def test_a_cell_of_the_ring_is_not_the_ring(tmp_path):
+    text = "from ocelot import *\nenergy = 3.0\ncell = [Quadrupole(l=0.4, k1=1.1), Drift(l=1)]\n"
+    for ring in ("lattice = [[cell, cell], cell]", "lat = MagneticLattice(tuple(3 * cell))"):
+        path = write(tmp_path, f"{text}{ring}\n")
+        assert load_ring(path).length == pytest.approx(4.2)
+        assert load_ring(path, sequence="cell").length == pytest.approx(1.4)
+
+
+def test_a_multipole_that_bends_the_design_orbit_is_a_thin_bend(tmp_path):
+    text = "from ocelot import *\nenergy = 3.0\nring = [Multipole(kn=[0.1, 0.02, 3.0], eid='m')]\n"
+    ring = load_ring(write(tmp_path, text))
+    assert ring["m"].bending == 0.1
+    (own,) = elements.Multipole(kn=[0.1, 0.02, 3.0]).R(3.0)
+    (found,) = ring["m"].source.R(ring.map_energy)
+    np.testing.assert_allclose(found[:4], own[:4], rtol=0, atol=1e-6)
+    assert found[4, 0] == pytest.approx(0.1, abs=1e-6)  # as of a bend; OCELOT has 0
 
 
 def test_file_is_run_as_a_module_with_its_neighbours(tmp_path):

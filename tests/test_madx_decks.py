@@ -53,6 +53,8 @@ REFUSED = {
     "match": (PLAIN + "match, sequence=ring; vary, name=kq; endmatch;", "MATCH changes strengths"),
     "ealign": (PLAIN + "use, sequence=ring; ealign, dx=1e-4;", "EALIGN moves elements"),
     "efcomp": (PLAIN + "efcomp, order=0, dkn={1e-4};", "EFCOMP gives elements field errors"),
+    "taper": (PLAIN + "taper, reset;", "TAPER changes strengths along the ring"),
+    "setvars_lin": (PLAIN + "setvars_lin, table=t;", "SETVARS_LIN sets variables from a table"),
     "correct": (PLAIN + "correct, flag=ring;", "CORRECT sets correctors"),
     "random": (PLAIN + "qf, k1=1.1 + 1e-3*gauss();", r"GAUSS\(\) is random"),
     "result": (PLAIN + "qf, k1=table(twiss, qf, k1l);", r"TABLE\(\) reads a result"),
@@ -61,6 +63,25 @@ REFUSED = {
     "beam-beam by default": (with_element("b: beambeam, at=4.95;"), "BEAMBEAM 'b' .* by its"),
     "install": (
         PLAIN + "seqedit, sequence=cell; install, element=qf; endedit;", "AT is missing"
+    ),
+    "flattened names": (
+        PLAIN + "seqedit, sequence=ring; flatten; replace, element=mq, by=sf; endedit;",
+        "FLATTEN has made 8 elements 'mq' of one name",
+    ),
+    "edit after flatten": (
+        PLAIN + "half: sequence, l=41.6; ring, at=20.8; endsequence;"
+        "seqedit, sequence=cell; install, element=q9, class=sf, at=5; endedit;"
+        "one: sequence, l=10, refer=entry; cell, at=0; endsequence;"
+        "seqedit, sequence=one; flatten; remove, element=q9; endedit;",
+        "put ENDEDIT and another SEQEDIT before",
+    ),
+    "cycle": (
+        PLAIN + "seqedit, sequence=cell; cycle, start=qd; endedit;",
+        "CYCLE starts at 'qd', which has a length; take a marker",
+    ),
+    "extract": (
+        PLAIN + "extract, sequence=cell, from=qf, to=qd, newname=part;",
+        "EXTRACT is not from a marker to a marker",
     ),
     "call": (PLAIN + "call;", "it calls"),
     "nested branches": (
@@ -72,7 +93,7 @@ REFUSED = {
     ),
     "class": (with_element("w: wigglerx, at=4.95;"), "no element or command 'wigglerx' is known"),
     "attribute": (PLAIN + "qf, k1x=1;", "attribute K1X of QUADRUPOLE 'qf'"),
-    "taper": (PLAIN + "qf, ktap=0.01;", "attribute KTAP of QUADRUPOLE 'qf'"),
+    "tapered magnet": (PLAIN + "qf, ktap=0.01;", "attribute KTAP of QUADRUPOLE 'qf'"),
     "pitch": (PLAIN + "qf, dtheta=1e-3;", "attribute DTHETA of QUADRUPOLE 'qf'"),
     "overlap": (
         with_element("q: quadrupole, l=0.4, at=2.9;"),
@@ -99,6 +120,11 @@ WARNED = {
         with_element("d: multipole, knl={0,0,0,0,9}, at=4.95;"),
         "above the sextupole of d",
     ),
+    "shift in a line": (
+        PLAIN + "d1: drift, l=2; own: line=(8*(qf,d1,qd,d1)); qf, dx=1e-3; use, period=own;",
+        r"left out.*DX of the QUADRUPOLE \(as in a LINE\) of qf \(1\)",
+    ),
+    "no value": (PLAIN + "qf, tilt;", "TILT of 'qf' has no value: 0, as in MAD-X"),
     "later length": (PLAIN + "qf, l=0.5;", r"left out.*the later L or ANGLE .* of qf \(1\)"),
 }
 

@@ -57,6 +57,7 @@ def table(ring, folder, centre=0.0, drop=(), **header):
             "S": e.s + (0.5 - centre) * e.length,
             "L": e.length,
             "ANGLE": e.angle if e.kind == "bend" else 0.0,
+            "K0L": e.angle if e.kind == "multipole" else 0.0,
             "K1L": e.k1 * e.length,
             "K2L": e.k2 * e.length,
             "TILT": 0.0 if e.kind == "vcorrector" else e.tilt,  # OCELOT's are turned
@@ -146,6 +147,45 @@ def test_header_that_states_other_figures_is_a_contradiction(madx, tmp_path):
         wrong = table(madx, tmp_path, **{**header, key: header[key] + by})
         with pytest.raises(LatticeError, match="contradicts its header"):
             load_ring(wrong)
+
+
+DECKS = json.loads((Path(__file__).parent / "lattices" / "madx_decks.json").read_text())["decks"]
+
+
+@pytest.mark.parametrize(
+    ("name", "radius"), [("thin bends", "2.54648"), ("thin bends no lrad", "")]
+)
+def test_thin_bends_without_a_length_have_that_of_the_headers_tunes(
+    tmp_path, name, radius, recwarn
+):
+    deck = DECKS[name]
+    (tmp_path / "ring.madx").write_text(deck["text"])
+    header = {"Q1": deck["q1"], "Q2": deck["q2"], "ALFA": deck["alfa"]}
+    path = table(load_ring(tmp_path / "ring.madx"), tmp_path, **header)
+    ring = load_ring(path)
+    own = [str(w.message) for w in recwarn if "no column LRAD" in str(w.message)]
+    assert [radius in text for text in own] == ([True] if radius else [])
+    tunes = twiss(Chain.from_ring(ring)).total_tunes
+    np.testing.assert_allclose(tunes, [deck["q1"], deck["q2"]], rtol=0, atol=2e-6)
+
+
+def test_table_off_momentum_is_of_the_same_ring(madx, tmp_path):
+    load_ring(table(madx, tmp_path, DELTAP=1e-3, XCOMAX=2e-3, Q1=0.1, Q2=0.2))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "drop", "message"),
+    [
+        ('"QUADRUPOLE"', '"SOLENOID"', (), "SOLENOID 'QF' and no column KS or KSI"),
+        ('"QF"', '"QF"', ("K1L",), "QUADRUPOLE 'QF' and no column K1L"),
+        ('"MONITOR"', '"DIPEDGE"', (), "DIPEDGE 'm1', whose numbers a table does not hold"),
+    ],
+)
+def test_fields_that_a_table_lacks_are_named(madx, tmp_path, old, new, drop, message):
+    path = table(madx, tmp_path, drop=drop)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(LatticeError, match=message):
+        load_ring(path)
 
 
 def test_tables_that_say_too_little(madx, tmp_path):

@@ -1,5 +1,6 @@
 """What a command loads, and what is kept between two calls."""
 
+import io
 import json
 import os
 import shutil
@@ -181,7 +182,7 @@ def test_a_changed_file_is_read_again(kept):
 def test_a_damaged_entry_is_made_anew(kept):
     ring = load_ring(kept)
     expected = ring_maps(ring).W1
-    entries = sorted((kept.parent / "cache").iterdir())
+    entries = sorted((kept.parent / "cache" / "tmlattice").iterdir())
     assert len(entries) == 2  # elements, maps
     whole = [entry.read_bytes() for entry in entries]
     for spoil in (lambda b: b[:-1], lambda b: b"", lambda b: b[:90] + b"?" + b[91:]):
@@ -260,13 +261,14 @@ def test_what_data_cannot_say_is_not_kept(kept):
 def test_many_writers_never_leave_a_torn_entry(tmp_path, monkeypatch):
     monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path))
     contents = [bytes([k]) * (40_000 + 977 * k) for k in range(4)]
-    cache.save("entry", contents[0])
+    name = cache.key("entry")
+    cache.save(name, contents[0])
     wrong = []
 
     def work(k):
         for _ in range(40):
-            cache.save("entry", contents[k])
-            if cache.load("entry") not in contents:
+            cache.save(name, contents[k])
+            if cache.load(name, bytes) not in contents:
                 wrong.append(k)
 
     threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
@@ -275,18 +277,59 @@ def test_many_writers_never_leave_a_torn_entry(tmp_path, monkeypatch):
     for thread in threads:
         thread.join()
     assert not wrong
-    assert [path.name for path in tmp_path.iterdir()] == ["entry"]
+    assert [path.name for path in (tmp_path / "tmlattice").iterdir()] == [name]
 
 
-def test_the_cache_stays_within_its_bound_and_the_oldest_go(tmp_path, monkeypatch):
+def test_only_what_the_cache_has_written_is_counted_and_removed(tmp_path, monkeypatch):
+    """The oldest entries go, until the cache is within its bound."""
     monkeypatch.setenv("TMLATTICE_CACHE", str(tmp_path))
     monkeypatch.setattr(cache, "LIMIT", 5000)
-    for k in range(6):
-        cache.save(f"entry{k}", b"x" * 1500)
-        os.utime(tmp_path / f"entry{k}", (k, k))
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 5000
-    assert cache.load("entry5") == b"x" * 1500
-    assert cache.load("entry0") is None
+    own = tmp_path / "tmlattice"
+    own.mkdir(0o700)
+    others = [tmp_path / "measured.h5", tmp_path / ("0" * 64), own / "notes", own / "0a.json"]
+    for path in others:
+        path.write_bytes(b"y" * 9000)
+        os.utime(path, (0, 0))
+    names = [cache.key(k) for k in range(6)]
+    for k, name in enumerate(names):
+        cache.save(name, b"x" * 1500)
+        os.utime(own / name, (k, k))
+    left = {path.name for path in own.iterdir()} & set(names)
+    assert left == set(names[-3:])  # 1532 bytes each
+    assert cache.load(names[5], bytes) == b"x" * 1500
+    assert cache.load(names[0], bytes) is None
+    assert all(path.stat().st_size == 9000 for path in others)
+
+
+def test_an_entry_of_another_content_is_made_anew(kept):
+    """Its checksum is right: what a reader makes of it decides."""
+    ring = load_ring(kept)
+    expected = ring_maps(ring).W1
+    folder = kept.parent / "cache" / "tmlattice"
+    names = [path.name for path in folder.iterdir()]
+    archive = io.BytesIO()
+    np.savez(archive, W0=np.zeros(3), at=np.full(35, 10**9))
+    for content in (b"[]", b'{"definitions": [[1]]}', b"PK", archive.getvalue(), b"null"):
+        for name in names:
+            cache.save(name, content)
+        again = load_ring(kept)
+        assert again == ring
+        assert np.array_equal(ring_maps(again).W1, expected)
+    maps, elements = sorted(names, key=lambda name: (folder / name).read_bytes()[32:34] != b"PK")
+    with np.load(io.BytesIO((folder / maps).read_bytes()[32:])) as arrays:
+        whole = dict(arrays)
+    for name, wrong in (
+        ("at", whole["at"] + 10**9), ("W2", whole["W2"][:, :2]), ("s", whole["s"].astype("U9")),
+    ):  # fmt: skip
+        archive = io.BytesIO()
+        np.savez(archive, **{**whole, name: wrong})
+        cache.save(maps, archive.getvalue())
+        assert np.array_equal(ring_maps(load_ring(kept)).W1, expected)
+    document = json.loads((folder / elements).read_bytes()[32:])
+    for key, wrong in (("energy", "3"), ("families", [1] * len(document["families"])),
+                       ("sequence", [10**6]), ("changes", {"qf::0": 1})):  # fmt: skip
+        cache.save(elements, json.dumps({**document, key: wrong}).encode())
+        assert load_ring(kept) == ring
 
 
 @pytest.mark.parametrize("tilt", [0.3, np.pi / 2])

@@ -22,6 +22,7 @@ BESIDE = {
     "files",
     "temporaries",
     "cache",
+    "compiled",
     "by_name",
     "late",
     "speaks",

@@ -43,6 +43,14 @@ def excursions(ring):
     return np.abs(np.asarray(path))[:, [0, 2]].max(0)
 
 
+@pytest.mark.parametrize("model", ["adaptive", "full", "rot-kick-rot", "bend-kick-bend"])
+def test_few_kicks_of_a_bend_are_named(tmp_path, model):
+    deck = {"elements": {"bb": {**REFEREE["elements"]["bb"], "model": model, "k1": 0.1,
+                                "integrator": "uniform", "num_multipole_kicks": 1}}}  # fmt: skip
+    with pytest.warns(UserWarning, match=r"the finite number of kicks of bb \(1\)"):
+        load(line_of(deck), tmp_path)
+
+
 @pytest.mark.parametrize("name", DECKS)
 def test_class_has_xtracks_figures(tmp_path, name):
     deck = DECKS[name]

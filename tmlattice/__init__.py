@@ -45,6 +45,11 @@ Names and rooms are imported when they are first used: `import tmlattice` itself
 nor OCELOT, which take seconds.
 """
 
+import sys
+
+if sys.argv[:1] == ["-m"] and not sys.flags.safe_path:
+    del sys.path[0]  # of `python -m tmlattice`: modules are never taken from the working directory
+
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

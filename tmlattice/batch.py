@@ -10,7 +10,9 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.errors import TmlatticeError, missing_package
 from tmlattice.files import OutputError, output_file, write_json
-from tmlattice.workers import caught, heard
+from tmlattice.workers import Caught, Processes, caught, heard
 
 log = logging.getLogger(__name__)
 
@@ -79,8 +81,7 @@ def run_batch(
 
     Raises:
         OutputError: the folder cannot be written.
-        TmlatticeError: no scheduler answers, or several processes without the package that runs
-            them.
+        TmlatticeError: no scheduler answers, or Dask is not installed.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -118,12 +119,11 @@ def _results(
         for name in todo:
             yield name, _loaded(work, cases[name])
         return
-    with _client(count, scheduler) as (client, workers):
-        from distributed import as_completed
-
+    work = partial(guarded, work)
+    with _cluster(work, scheduler) if scheduler else Processes(work, count) as workers:
         waiting = iter(todo)
-        names: dict[Any, str] = {}
-        running = as_completed()
+        running: dict[Future[Caught], str] = {}
+        failed: dict[str, dict[str, Any]] = {}
 
         def feed() -> None:
             for name in waiting:
@@ -132,46 +132,24 @@ def _results(
                 except Exception as error:
                     failed[name] = _error(error, 0.0)
                     continue
-                future = client.submit(caught, guarded, work, argument, pure=False)
-                names[future.key] = name
-                running.add(future)
+                running[workers.submit(argument)] = name
                 return
 
-        failed: dict[str, dict[str, Any]] = {}
-        for _ in range(2 * workers):  # no more in flight than the workers need
+        for _ in range(2 * workers.count):  # no more in flight than the workers need
             feed()
-        for future in _arriving(running, client):
-            name = names.pop(future.key)
-            try:
-                result = heard(future.result())
-            except Exception as error:  # the worker itself was lost
-                result = _error(error, 0.0)
-            feed()
-            yield name, result
+        while running:
+            done, _ = wait(running, 1.0, FIRST_COMPLETED)
+            if isinstance(workers, _Cluster):
+                workers.check()
+            for future in done:
+                name = running.pop(future)
+                try:
+                    result = heard(future.result())
+                except Exception as error:  # the worker itself was lost
+                    result = _error(error, 0.0)
+                feed()
+                yield name, result
         yield from failed.items()
-
-
-def _arriving(running: Any, client: Any) -> Iterator[Any]:
-    """Futures as they are done.
-
-    Raises:
-        TmlatticeError: there has been no worker for long.
-    """
-    alone = looked = time.monotonic()
-    while not running.is_empty():
-        if running.has_ready():
-            yield next(running)
-            continue
-        time.sleep(0.02)
-        now = time.monotonic()
-        if now - looked > 1.0:
-            looked = now
-            alone = alone if not client.scheduler_info()["workers"] else now
-        if now - alone > PATIENCE:
-            raise TmlatticeError(
-                f"all workers are gone, and none came back in {PATIENCE:.0f} s; start some and go "
-                "on: what is done is kept"
-            )
 
 
 def fingerprint(*parts: object) -> str:
@@ -208,47 +186,64 @@ def _error(error: Exception, seconds: float) -> dict[str, Any]:
     return {"error": f"{type(error).__name__}: {error}", "seconds": seconds}
 
 
-@contextmanager
-def _client(count: int, scheduler: str | None) -> Iterator[tuple[Any, int]]:
-    """A Dask client and its number of workers."""
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-    except ModuleNotFoundError as error:
-        what = "more than one process needs"
-        raise missing_package(
-            error, what, "study", "--workers 1 or --jobs 1 does without"
-        ) from error
+class _Cluster:
+    """The workers of a Dask scheduler, used as `Processes`."""
 
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout="20s")
-        except (OSError, ValueError, TimeoutError) as error:
+    def __init__(self, client: Any, work: Work, address: str) -> None:
+        self.count = sum(client.nthreads().values())
+        self._client, self._work, self._address = client, work, address
+        self._executor = client.get_executor(pure=False)
+        self._seen = time.monotonic()
+
+    def submit(self, argument: Any) -> "Future[Caught]":
+        """As `Processes.submit`."""
+        future: Future[Caught] = self._executor.submit(caught, self._work, argument)
+        return future
+
+    def check(self) -> None:
+        """See to it that somebody is at work.
+
+        Raises:
+            TmlatticeError: the scheduler is gone, or there has been no worker for long.
+        """
+        if self._client.status != "running":
             raise TmlatticeError(
-                f"no Dask scheduler answers at '{scheduler}'; start one with `dask scheduler`, or "
-                "leave the address out"
+                f"the Dask scheduler at '{self._address}' is gone; start it and run this again: "
+                "finished cases are kept"
+            )
+        now = time.monotonic()
+        if self._client.scheduler_info()["workers"]:
+            self._seen = now
+        if now - self._seen > PATIENCE:
+            raise TmlatticeError(
+                f"all workers are gone, and none came back in {PATIENCE:.0f} s; start some and run "
+                "this again: finished cases are kept"
+            )
+
+
+@contextmanager
+def _cluster(work: Work, address: str) -> Iterator[_Cluster]:
+    """The workers of the scheduler at an address."""
+    try:
+        from distributed import Client
+    except ModuleNotFoundError as error:
+        instead = "without --scheduler, local processes do the work"
+        raise missing_package(error, "--scheduler needs", "dask", instead) from error
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is one sentence of ours
+    try:
+        client = Client(address, timeout=PATIENCE / 3)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise TmlatticeError(
+            f"no Dask scheduler answers at '{address}'; start one with `dask scheduler`, or "
+            "leave the address out"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError as error:
+            raise TmlatticeError(
+                f"the Dask scheduler at '{address}' has no worker; start one with `dask "
+                f"worker {address}`"
             ) from error
-        with client:
-            try:
-                client.wait_for_workers(1, timeout=PATIENCE)
-            except TimeoutError as error:
-                raise TmlatticeError(
-                    f"the Dask scheduler at '{scheduler}' has no worker; start one with `dask "
-                    f"worker {scheduler}`"
-                ) from error
-            yield client, sum(client.nthreads().values())
-        return
-    # one thread a process: compiled kernels must not be entered twice, and cores are shared out
-    environment = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    settings = {
-        "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.nanny.pre-spawn-environ": environment,
-    }
-    with (
-        dask.config.set(settings),
-        LocalCluster(
-            count, threads_per_worker=1, processes=True, dashboard_address=":0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client, count
+        yield _Cluster(client, work, address)

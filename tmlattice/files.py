@@ -1,6 +1,6 @@
 """Files that are whole or not there: written under a temporary name, then moved.
 
-A folder's files are exchanged together. What a killed run left is removed by the next one that
+A folder's files are moved together. What a killed run left is removed by the next one that
 writes there: a temporary is locked as long as its process lives (`tmlattice.temporaries`).
 """
 
@@ -10,15 +10,20 @@ import os
 import shutil
 import stat
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import TmlatticeError
-from tmlattice.temporaries import exchange, temporary_file, temporary_folder
-
-MOST_OTHERS = 1000
-"""Files of an output folder that are not of this output, up to which all are exchanged at once."""
+from tmlattice.temporaries import (
+    WHOLE,
+    is_temporary,
+    locked,
+    move_files,
+    temporary_file,
+    temporary_folder,
+)
 
 
 class OutputError(TmlatticeError):
@@ -33,9 +38,9 @@ def _refusal(path: Path, error: OSError) -> OutputError:
 def output_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder whose files stand in `folder` when all went well: all of them, or none.
 
-    It is made at once, so that an unwritable place is known before the work and not after it.
-    Other files of the folder stay. Where it cannot be exchanged (it is mounted, or somebody's
-    working directory, or holds folders), its files are replaced one by one.
+    It is made at once, so that an unwritable place is known before the work and not after it. A
+    folder that is there stays: its owner, its access, its other files, whoever writes them
+    meanwhile. The new files are moved into it under its lock, so that no two outputs mix.
 
     Raises:
         OutputError: the folder cannot be made or written.
@@ -44,69 +49,44 @@ def output_folder(folder: Path) -> Iterator[Path]:
         folder = folder.resolve()
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"'{folder}' is a file; name a folder")
-        if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        place = next(p for p in folder.parents if p.exists())
-        if folder.exists() and not _movable(folder):
-            place = folder
+        place = next(p for p in (folder, *folder.parents) if p.exists())
         made = temporary_folder(place)
         temporary = made.__enter__()
     except (OSError, RuntimeError, ValueError) as error:
         raise _refusal(folder, _as_os_error(error)) from error
     try:
         yield temporary
-        if not folder.is_dir():
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            temporary.chmod(0o777 & ~_umask())  # mkdtemp's folders are for the owner alone
-            os.rename(temporary, folder)
-        elif place == folder or not _exchanged(temporary, folder):
-            for path in sorted(temporary.iterdir()):
-                os.replace(path, folder / path.name)
+        with ThreadPoolExecutor(1) as other:  # Ctrl-C comes before the move or after it
+            other.submit(_put, temporary, folder).result()
     except OSError as error:
         raise _refusal(folder, error) from error
     finally:
         made.__exit__(None, None, None)
 
 
-def _movable(folder: Path) -> bool:
-    """Whether a folder may be exchanged for another: nobody stands in it, or is mounted there."""
-    here = Path.cwd()
-    parent = folder.parent
-    return (
-        folder != here
-        and folder not in here.parents
-        and not folder.is_mount()
-        and parent.stat().st_dev == folder.stat().st_dev
-        and folder.stat().st_uid == getattr(os, "geteuid", lambda: 0)()
-        and os.access(parent, os.W_OK | os.X_OK)
-    )
-
-
-def _exchanged(temporary: Path, folder: Path) -> bool:
-    """Put a folder in the place of another, with the other's remaining files in it."""
-    if not _carry_over(folder, temporary):
-        return False
-    shutil.copymode(folder, temporary)
-    return exchange(temporary, folder)
-
-
-def _carry_over(folder: Path, temporary: Path) -> bool:
-    """Link the folder's other files into its successor; False where that cannot be done."""
-    made = {path.name for path in temporary.iterdir()}
-    others = [entry for entry in os.scandir(folder) if entry.name not in made]
-    plain = all(e.is_file(follow_symlinks=False) or e.is_symlink() for e in others)
-    if not plain or len(others) > MOST_OTHERS:
-        return False
-    linked: list[Path] = []
-    try:
-        for entry in others:
-            os.link(entry.path, temporary / entry.name, follow_symlinks=False)
-            linked.append(temporary / entry.name)
-    except OSError:  # a file system without links
-        for path in linked:
-            path.unlink()
-        return False
-    return True
+def _put(temporary: Path, folder: Path) -> None:
+    """Move a folder's files into another one; as a whole, where that is not there."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if not folder.exists():
+        try:
+            os.rename(temporary, folder)
+            return
+        except OSError:
+            if not folder.is_dir():  # else somebody has made it meanwhile, and has written to it
+                raise
+    for path in temporary.iterdir():
+        if (folder / path.name).is_dir():
+            raise IsADirectoryError(errno.EISDIR, f"'{path.name}' is a folder there")
+    if is_temporary(folder):
+        move_files(temporary, folder)
+        return
+    with locked(folder):
+        whole = folder / (temporary.name + WHOLE)  # from now on a killed run is finished by others
+        os.rename(temporary, whole)
+        try:
+            move_files(whole, folder)
+        finally:
+            shutil.rmtree(whole, ignore_errors=True)
 
 
 @contextmanager
@@ -133,7 +113,6 @@ def output_file(path: Path) -> Iterator[Path]:
         if special:
             _pour(temporary, path)
         else:
-            temporary.chmod(0o666 & ~_umask())  # mkstemp's files are for the owner alone
             os.replace(temporary, path)
     except OSError as error:
         raise _refusal(path, error) from error
@@ -177,12 +156,6 @@ def check_writable(path: Path) -> None:
 def _as_os_error(error: Exception) -> OSError:
     """A path may hold a NUL byte (ValueError) or links in a circle (RuntimeError) as well."""
     return error if isinstance(error, OSError) else OSError(errno.EINVAL, str(error))
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask
 
 
 def write_json(path: Path, value: Any) -> None:

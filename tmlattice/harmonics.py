@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
+from importlib import import_module
 from typing import Any, cast
 
 import numpy as np
@@ -143,10 +144,11 @@ def frequency(signal: ComplexArray, method: Method = Method.NAFF) -> tuple[float
 @cache
 def _naff() -> Callable[..., Any]:
     """nafflib's NAFF, whose compiled loop is kept from one process to the next, as our own are."""
-    import nafflib
+    from tmlattice.compiled import keep  # first: it settles where numba keeps its code
 
-    with suppress(AttributeError, RuntimeError):  # another version, or no place to keep it
-        nafflib.optimize.expArray.enable_caching()
+    nafflib = import_module("nafflib")
+    with suppress(AttributeError):  # another version
+        keep(nafflib.optimize.expArray)
     return cast(Callable[..., Any], nafflib.naff)
 
 

@@ -122,8 +122,14 @@ DECKS = {
     "thin bends vertical": deck(extra="b2: multipole, at=4.95, ksl={1e-3}, lrad=0.1;"),
     "dipedge": deck(extra="de: dipedge, at=4.95, h=0.4, e1=0.1, hgap=0.02, fint=0.5;"),
     "dipedge tilt": deck(extra="de: dipedge, at=4.95, h=0.4, e1=0.1, tilt=0.3;"),
+    "thin bends angle": deck(elements=bends(
+        "bb: multipole, knl={twopi/16*1.0001}, lrad=1, angle=twopi/16;")),
+    "sbend shift": deck(extra="b2: sbend, l=0.1, angle=0.03, dx=1e-3, dy=2e-4, at=4.95;"),
+    "sbend shift along": deck(extra="b2: sbend, l=0.1, angle=0.03, tilt=0.7, ds=1e-3, at=4.95;"),
+    "rbend shift": deck(extra="b2: rbend, l=0.1, angle=0.03, dx=1e-3, ds=1e-3, at=4.95;"),
     # straight magnets
     "quadrupole tilt": deck(elements=quadrupoles("k1=1.1, tilt=0.05")),
+    "quadrupole tilt without a value": deck(extra="q3: quadrupole, l=0.1, k1=0.1, tilt, at=4.95;"),
     "quadrupole k1s": deck(elements=quadrupoles("k1=1.1, k1s=0.05")),
     "quadrupole knl": deck(elements=quadrupoles("k1=1.1, knl={0,0.02,0.4}")),
     "quadrupole thin": deck(extra="q3: quadrupole, at=4.95, l=0, k1=3;"),
@@ -146,6 +152,7 @@ DECKS = {
     # correctors
     "hkicker": deck(extra="tk: hkicker, l=0.2, kick=1e-4, at=4.95;"),
     "hkicker hkick": deck(extra="tk: hkicker, l=0.2, hkick=1e-4, at=4.95;"),
+    "hkicker kick and hkick": deck(extra="tk: hkicker, l=0.2, kick=1e-4, hkick=2e-4, at=4.95;"),
     "vkicker": deck(extra="tk: vkicker, l=0.2, kick=1e-4, at=4.95;"),
     "vkicker thin": deck(extra="tk: vkicker, kick=1e-4, at=4.95;"),
     "kicker": deck(extra="tk: kicker, l=0.2, hkick=1e-4, vkick=-2e-4, at=4.95;"),
@@ -198,6 +205,8 @@ DECKS = {
     "macro": deck(before="setq(qq,kk): macro = { qq->k1 = kk; }\nexec, setq(qf, 1.14);\n"),
     "macro number": deck(before="setk(nn): macro = { k.nn = 1.14; }\nn=3; exec, setk($n);\n"
                                 "qf->k1 := k.3;\n"),
+    "macro within words": deck(
+        before="setk(qq): macro = { kqqx = 1.0qq; }\nexec, setk(14); qf->k1 := k14x;\n"),
     # spellings
     "signs and exponents": deck(elements=quadrupoles("k1=+.11e1 + 11.e-1 - 1.1E+00")),
     "minus minus": deck(elements=quadrupoles("k1=-(-1.1)")),
@@ -213,6 +222,15 @@ DECKS = {
         "set, format=\"22.14e\"; use, sequence=ring; select, flag=twiss, clear;\n"
         "select, flag=twiss, column=name,s,betx,bety; savebeta, label=b0, place=#s;\n")),
     "save": deck(after="save, sequence=ring, file=\"ring.seq\";\n"),
+    "initial values": deck(after="start: beta0, betx=1, bety=1;\nuse, sequence=ring;\n"),
+    "other monitors": deck(extra="b1: blmonitor, l=0.1, at=4.8; i1: imonitor, at=4.9;"
+                                 " s1: slmonitor, l=0.1, at=5.0;"),
+    "thin bends of makethin": BEAM + bends("bb: multipole, knl={twopi/16}, lrad=1;"
+        "d1: dipedge, h=twopi/16, e1=0.05, entrance=true; d2: dipedge, h=twopi/16, e1=0.05,"
+        " entrance=false; mm: marker, kill_ent_fringe=true;") + "ring: sequence, l=41.6;\n"
+        + "".join(f"{q}, at={s - 1.2}; d1, at={s}; bb, at={s}; mm, at={s}; d2, at={s};\n"
+                  for k in range(8) for q, s in (("qf", 5.2 * k + 1.5), ("qd", 5.2 * k + 4.1)))
+        + "endsequence;\n",
     "stop": deck(after="use, sequence=ring;\n"),
     "two comments": deck(before="/* one ! two // three\n more */ qf, k1=1.12; // ! and */\n"),
     "semicolon in a text": deck(elements=quadrupoles("type=\"a;b\", k1=1.1")),
@@ -290,6 +308,24 @@ DECKS = {
               "seqedit, sequence=cell;\nremove, element=selected;\nendedit;\n"),
     "seqedit replace": deck(before="q3: quadrupole, l=0.4, k1=-1.2;\n",
         after="seqedit, sequence=cell;\nreplace, element=qd, by=q3;\nendedit;\n"),
+    "seqedit first of several": deck(before="q3: quadrupole, k1=0.3, l=0.04;\n",
+        after="seqedit, sequence=cell;\nreplace, element=mq, by=q3;\nendedit;\n"),
+    "seqedit one of several": deck(before="q3: quadrupole, k1=0.3, l=0.04;\n",
+        after="seqedit, sequence=cell;\nreplace, element=mq[2], by=q3;\nendedit;\n"),
+    "seqedit one after another": deck(elements=bends("bb: sbend, l=1, angle=0.01;"),
+        after="seqedit, sequence=cell; remove, element=bb[1]; remove, element=bb[2]; endedit;\n"),
+    "seqedit class of elements": deck(
+        before="q3: quadrupole, l=0.1, k1=0.5; q4: q3, k1=0.4;\n", extra="q4, at=4.95;",
+        after="select, flag=seqedit, class=q3;\n"
+              "seqedit, sequence=cell;\nremove, element=selected;\nendedit;\n"),
+    "seqedit after flatten": deck(ring="half: sequence, l=20.8, refer=entry;\n" + "".join(
+            f" cell, at={k}*5.2;\n" for k in range(4)) + "q3: quadrupole, l=0.1, k1=0.5, at=20.6;\n"
+            "endsequence;\nring: sequence, l=20.8, refer=entry; half, at=0; endsequence;\n",
+        after="seqedit, sequence=ring;\nflatten;\nendedit;\n"
+              "seqedit, sequence=ring;\nremove, element=q3;\nendedit;\n"),
+    "extract": deck(ring=RING.replace("refer=entry;", "refer=entry;\n m.a: marker, at=0;").replace(
+            " cell, at=4*", " m.b: marker, at=20.8;\n cell, at=4*"),
+        after="extract, sequence=ring, from=m.a, to=m.b, newname=part;\nuse, sequence=part;\n"),
     "seqedit move by": deck(after="seqedit, sequence=cell;\nmove, element=qd, by=0.1;\nendedit;\n"),
     "seqedit move to": deck(after="seqedit, sequence=cell;\nmove, element=qd, to=2.8;\nendedit;\n"),
     "seqedit flatten cycle": deck(
@@ -312,8 +348,7 @@ def figures(text):
         mad.input("twiss;")
         summ, table = mad.table.summ, mad.table.twiss
         orbit = [float(table[k][0]) for k in ("x", "px", "y", "py")]
-        ring = next(k for k in ("ring", "RING") if k.lower() in mad.sequence)
-        beam = mad.sequence[ring.lower()].beam
+        beam = mad.sequence[str(table.summary.sequence).lower()].beam
         own = {k: float(summ[k][0]) for k in ("q1", "q2", "dq1", "dq2", "length", "alfa")}
         own |= {"orbit": orbit, "energy": float(beam.energy), "mass": float(beam.mass)}
         version = str(mad.version)

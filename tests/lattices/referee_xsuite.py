@@ -60,6 +60,8 @@ DECKS = {
     "bend_k0": bend(k0=PHI * 1.001),
     "bend_k0_edges": bend(k0=PHI * 1.001, **EDGE),
     "bend_shift": bend(shift_x=1e-5, shift_y=2e-5, k1=-0.05),
+    "bend_shift_anchor": {"ch": xt.Bend(length=0.2, angle=0.05, shift_x=1e-4, shift_s=1e-3,
+                                        rot_s_rad=0.4, rot_shift_anchor=0.2)},
     "bend_roll": bend(rot_s_rad_no_frame=1e-3),
     "bend_corrector": {"ch": xt.Bend(length=0.2, k0=1e-3)},
     "bend_knl": bend(knl=[1e-4, 0.02, 0.1], ksl=[2e-4, 0.01]),

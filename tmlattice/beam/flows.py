@@ -14,18 +14,16 @@ Source: K. Feng, M. Qin, Symplectic Geometric Algorithms for Hamiltonian Systems
 rule.
 """
 
-import numba
 import numpy as np
 
 from tmlattice.beam.sweeps import _polynomial, _pull
-
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+from tmlattice.compiled import jit
 
 _ITERATIONS = 60
 _ROUNDING = 1e-16
 
 
-@_jit
+@jit
 def _scratch(size):  # type: ignore[no-untyped-def]
     """Room for a layer: the state x, its image y, the middle m, the step d [n, lane each], and the
     largest change of the middle [lane].
@@ -36,14 +34,14 @@ def _scratch(size):  # type: ignore[no-untyped-def]
     return np.zeros((4 * len(size[0]) + 1) * len(size[1]))
 
 
-@_jit
+@jit
 def _part(size, work, which):  # type: ignore[no-untyped-def]
     """x, y, m or d (0 to 3) of the room as [n, lane], a view."""
     n, lanes = len(size[0]), len(size[1])
     return work[which * n * lanes : (which + 1) * n * lanes].reshape((n, lanes))
 
 
-@_jit
+@jit
 def _flat_field(size, k, Q, work):  # type: ignore[no-untyped-def]
     """d = f(m) for a cubic generator that is even in (y, py)."""
     n, lanes = 4, len(size[1])
@@ -64,7 +62,7 @@ def _flat_field(size, k, Q, work):  # type: ignore[no-untyped-def]
             work[d + a * lanes + v] = (xy * y + xq * q) * x + (py * y + pq * q) * p
 
 
-@_jit
+@jit
 def _middle(size, work):  # type: ignore[no-untyped-def]
     """m = y + d / 2; the largest change of any m."""
     n, lanes = len(size[0]), len(size[1])
@@ -80,7 +78,7 @@ def _middle(size, work):  # type: ignore[no-untyped-def]
     return _largest(size, work)
 
 
-@_jit
+@jit
 def _largest(size, work):  # type: ignore[no-untyped-def]
     """Over the lanes, a power of two of them; NaN is passed over. Halves are compared with halves:
     the vector unit does it, as it does not a plain maximum."""
@@ -93,7 +91,7 @@ def _largest(size, work):  # type: ignore[no-untyped-def]
     return work[first]
 
 
-@_jit
+@jit
 def _layer(size, k, W0, W1, c, A, Q, moves, flat, work):  # type: ignore[no-untyped-def]
     """x of the room becomes its image by layer k; m is left as the middle."""
     n, lanes = len(size[0]), len(size[1])
@@ -136,7 +134,7 @@ def _layer(size, k, W0, W1, c, A, Q, moves, flat, work):  # type: ignore[no-unty
             work[i] = work[y + i] + work[d + i] + kick
 
 
-@_jit
+@jit
 def forward(first, last, size, W0, W1, c, A, Q, moves, flat, states, middles):  # type: ignore[no-untyped-def]
     """Fill states [block, 1:, n, lane] and middles from states[block, 0]."""
     work = _scratch(size)
@@ -149,7 +147,7 @@ def forward(first, last, size, W0, W1, c, A, Q, moves, flat, states, middles):  
             middles[block, k] = m
 
 
-@_jit
+@jit
 def track(first, last, size, W0, W1, c, A, Q, moves, flat, turns):  # type: ignore[no-untyped-def]
     """Fill turns [block, 1:, n, lane] from turns[block, 0]."""
     work = _scratch(size)
@@ -162,7 +160,7 @@ def track(first, last, size, W0, W1, c, A, Q, moves, flat, turns):  # type: igno
             turns[block, turn] = x
 
 
-@_jit
+@jit
 def reverse(  # type: ignore[no-untyped-def]
     first,
     last,

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from tmlattice.beam.readouts import APERTURE
 from tmlattice.beam.rf import Cavities
 from tmlattice.beam.sweeps import curved
 from tmlattice.beam.threads import share
+from tmlattice.compiled import jit
 from tmlattice.lattice import Element
 from tmlattice.lattice.ring import NO_ERRORS
 from tmlattice.maps import LayerMaps, RingMaps
@@ -119,7 +119,7 @@ def track(
     return readings
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@jit
 def _track(  # type: ignore[no-untyped-def]
     first,
     last,

@@ -1,11 +1,12 @@
 """Compiled: squares of changes of an orbit response that are given in factors."""
 
-import numba
 import numpy as np
+
+from tmlattice.compiled import jit_sums
 
 
 # The sum over readings (`reassoc`) may follow the vector unit's order.
-@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@jit_sums
 def squares(seen, readings, start, change, first, weight):  # type: ignore[no-untyped-def]
     """Weighted sum over all readings of (seen . start + readings . change)^2, [error].
 

@@ -1,10 +1,11 @@
 """Compiled: closed orbits of many settings of one corrector each, without linearisation."""
 
-import numba
 import numpy as np
 
+from tmlattice.compiled import jit
 
-@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+
+@jit
 def settle(  # type: ignore[no-untyped-def]
     first, last, W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths, good
 ):

@@ -16,11 +16,11 @@ Axes: `states` [block, layer + 1, n, lane], `W0` [layer, n], `W1` [layer, n, n],
 import math
 from collections.abc import Callable
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.threads import share
+from tmlattice.compiled import jit, jit_sums
 
 Array = NDArray[np.float64]
 Size = tuple[tuple[None, ...], tuple[None, ...]]
@@ -46,13 +46,9 @@ _PLANES = (None, None)
 
 # Products are fused into sums (`contract`): exact to rounding, and repeatable. Nothing else of fast
 # mathematics touches a state. Sums over lanes (`reassoc`) may follow the vector unit's order.
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
-_jit_sums = numba.njit(
-    nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc"}
-)
 
 
-@_jit
+@jit
 def _polynomial(size, k, W0, W1, W2, curved, x, y):  # type: ignore[no-untyped-def]
     """y [., lane] = polynomial k of x [n, lane], in Horner's form: few and short chains."""
     n, lanes = len(size[0]), len(size[1])
@@ -76,7 +72,7 @@ def _polynomial(size, k, W0, W1, W2, curved, x, y):  # type: ignore[no-untyped-d
                 y[a, v] = total
 
 
-@_jit
+@jit
 def _pull(size, rows, k, W1, W2, curved, x, above, below):  # type: ignore[no-untyped-def]
     """below [n, lane] += J(x)^T above [row, lane]: a sensitivity carried back through
     polynomial k."""
@@ -100,7 +96,7 @@ def _pull(size, rows, k, W1, W2, curved, x, above, below):  # type: ignore[no-un
                 m += 1
 
 
-@_jit
+@jit
 def forward(first, last, size, W0, W1, W2, curved, states):  # type: ignore[no-untyped-def]
     """Fill states [block, 1:, n, lane] from states[block, 0]."""
     for block in range(first, last):
@@ -108,7 +104,7 @@ def forward(first, last, size, W0, W1, W2, curved, states):  # type: ignore[no-u
             _polynomial(size, k, W0, W1, W2, curved, states[block, k], states[block, k + 1])
 
 
-@_jit
+@jit
 def accelerate(first, last, size, W0, W1, W2, curved, exits, rf, states):  # type: ignore[no-untyped-def]
     """`forward` with the cavities of `Cavities`, and the slip of the turn at its end."""
     lanes = len(size[1])
@@ -126,7 +122,7 @@ def accelerate(first, last, size, W0, W1, W2, curved, exits, rf, states):  # typ
             states[block, -1, 4, v] += rf[3]
 
 
-@_jit
+@jit
 def track(first, last, size, W0, W1, W2, curved, turns):  # type: ignore[no-untyped-def]
     """Fill turns [block, 1:, n, lane] from turns[block, 0]; states inside a turn are not kept."""
     n, lanes = len(size[0]), len(size[1])
@@ -143,7 +139,7 @@ def track(first, last, size, W0, W1, W2, curved, turns):  # type: ignore[no-unty
             turns[block, turn] = x
 
 
-@_jit
+@jit
 def read(first, last, size, R0, R1, R2, bent, at, states, readings):  # type: ignore[no-untyped-def]
     """Fill readings [block, monitor, 2, lane]; monitor m reads the state at exit `at[m]`."""
     for block in range(first, last):
@@ -151,7 +147,7 @@ def read(first, last, size, R0, R1, R2, bent, at, states, readings):  # type: ig
             _polynomial(size, m, R0, R1, R2, bent, states[block, at[m]], readings[block, m])
 
 
-@_jit
+@jit
 def reverse(  # type: ignore[no-untyped-def]
     first, last, size, W1, W2, curved, R1, R2, bent, start, states, pulls, adjoint
 ):
@@ -175,7 +171,7 @@ def reverse(  # type: ignore[no-untyped-def]
                 _pull(size, _PLANES, m, R1, R2, bent, states[block, k], pulls[block, m], below)
 
 
-@_jit_sums
+@jit_sums
 def weights(first, last, size, states, adjoint, G0, G1, G2):  # type: ignore[no-untyped-def]
     """Gradients of the weights of the layers first to last - 1, summed over trajectories."""
     n, lanes = len(size[0]), len(size[1])

@@ -6,13 +6,12 @@ Axes: states [shot, step + 1, n], tangents C [shot, step + 1, n, n] = d state / 
 
 import math
 
-import numba
 import numpy as np
 
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+from tmlattice.compiled import jit
 
 
-@_jit
+@jit
 def trajectories(first, last, W0, W1, W2, curved, exits, rf, states, tangents):  # type: ignore[no-untyped-def]
     """Fill states [shot, 1:] and tangents [shot, 1:] from states[:, 0] and tangents[:, 0].
 
@@ -57,7 +56,7 @@ def trajectories(first, last, W0, W1, W2, curved, exits, rf, states, tangents): 
                         _cavities(0, exits, rf, y, after)
 
 
-@_jit
+@jit
 def _cavities(exit_, exits, rf, x, tangent):  # type: ignore[no-untyped-def]
     """What the cavities at one exit give to a state, and to its tangent."""
     for c in range(len(exits)):
@@ -69,7 +68,7 @@ def _cavities(exit_, exits, rf, x, tangent):  # type: ignore[no-untyped-def]
                 tangent[5, j] += slope * tangent[4, j]
 
 
-@_jit
+@jit
 def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
     """whole [end, n, n]: the product of the steps behind the last end, up to and with this one."""
     n, k = steps.shape[1], 0
@@ -87,7 +86,7 @@ def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
         k = ends[e] + 1
 
 
-@_jit
+@jit
 def products(steps, total):  # type: ignore[no-untyped-def]
     """total [step + 1, n, n] of matrices [step, n, n]: from the start to behind each."""
     n = steps.shape[1]
@@ -105,7 +104,7 @@ def products(steps, total):  # type: ignore[no-untyped-def]
                         total[k + 1, a, j] += slope * total[k, i, j]
 
 
-@_jit
+@jit
 def kicks(layer, D0, D1, D2, states, steps, out):  # type: ignore[no-untyped-def]
     """out [shot, turn, row, n] = D0 + D1 x + D2 x^2 at the entrance of each row's layer.
 
@@ -128,7 +127,7 @@ def kicks(layer, D0, D1, D2, states, steps, out):  # type: ignore[no-untyped-def
                     out[shot, turn, row, a] = total
 
 
-@_jit
+@jit
 def carry(first, last, owner, start, pulled, G, out):  # type: ignore[no-untyped-def]
     """out [hypothesis, shot, reading, 2] += G v: kicks carried to all readings downstream.
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
-import numba
+from tmlattice.compiled import numba
 
 _pool: ThreadPoolExecutor | None = None
 

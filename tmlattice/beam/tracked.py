@@ -7,6 +7,7 @@ turns of a shot one after another, `reading = turn * monitors + monitor`.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +99,7 @@ class TrackedShots:
         active: NDArray[np.bool_] | None = None,
     ) -> None:
         self.design = ring
+        self._settings = tuple(settings)
         self.active = np.ones(len(settings), dtype=bool) if active is None else active
         self.turns = turns
         self.shots = len(settings)
@@ -125,6 +127,13 @@ class TrackedShots:
                 own = shots[self.active[shots] == active]
                 if len(own):
                     yield own, setting, active
+
+    def knowing(self, causes: Sequence[Cause]) -> Self:
+        """The same with further causes known, in all shots."""
+        return type(self)(
+            self.design, self._settings, self.turns, (*self.assembly.known, *causes),
+            self.dimension, self.active,
+        )  # fmt: skip
 
     def monitor(self, name: str) -> int:
         """Its place among the monitors."""

@@ -1,9 +1,13 @@
 """The group of commands, and how any of them ends: a result, or one sentence and a code."""
 
+import codecs
 import difflib
+import io
 import os
+import signal
 import sys
 import warnings
+from contextlib import suppress
 from typing import NoReturn, TextIO
 
 import click
@@ -24,7 +28,6 @@ from tmlattice.cli.tune_fit import tune_fit
 from tmlattice.errors import TmlatticeError, harmless
 
 BAD_INPUT = 2
-STOPPED = 130  # as the shell has it for Ctrl-C
 
 
 class Sections(click.Group):
@@ -77,13 +80,19 @@ for _commands in SECTIONS.values():
         tmlattice.add_command(_command)
 
 
+class Terminated(BaseException):
+    """SIGTERM, or a terminal that was closed: it unwinds as Ctrl-C, so that nothing is left."""
+
+
 def main() -> NoReturn:
     """Run the command line. Exit code 0: done; 1: done, and told what is wrong (`check`); 2: input
-    that cannot be used; 130: Ctrl-C."""
-    warnings.showwarning = _show_warning
+    that cannot be used; 128 and the signal's number: stopped, 130 by Ctrl-C, 143 by SIGTERM, 141
+    where nobody reads the output."""
+    _prepare()
     code = 0
     try:
         code = tmlattice(standalone_mode=False) or 0
+        sys.stdout.flush()
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         sys.exit(BAD_INPUT)
@@ -91,15 +100,56 @@ def main() -> NoReturn:
         _fail(error.format_message(), BAD_INPUT)
     except TmlatticeError as error:
         _fail(str(error), BAD_INPUT)
+    except (
+        BrokenPipeError,
+        SystemExit,
+    ):  # click makes the second of the first, and of nothing else
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is still to be flushed
+        sys.exit(128 + signal.SIGPIPE)
     except OSError as error:
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
-    except (KeyboardInterrupt, click.exceptions.Abort):
+    except (KeyboardInterrupt, click.exceptions.Abort, Terminated) as stop:
         where = f" in '{stopped_in[0]}'" if stopped_in else ""
-        click.echo(f"tmlattice: stopped{where}; nothing was written", err=True)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(STOPPED)  # temporary files are gone; torch and its threads need a second to end
+        with suppress(OSError):  # the terminal may be gone
+            click.echo(f"tmlattice: stopped{where}; nothing was written", err=True)
+            sys.stdout.flush()
+            sys.stderr.flush()
+        by = stop.args[0] if isinstance(stop, Terminated) else signal.SIGINT
+        os._exit(128 + by)  # temporary files are gone; torch and its threads need a second to end
     sys.exit(code)
+
+
+def _prepare() -> None:
+    """What a command does not take from its surroundings."""
+    warnings.showwarning = _show_warning
+    os.environ["MPLBACKEND"] = "Agg"  # figures are files
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=SPELT)
+    for name in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(name) is signal.SIG_DFL:
+            signal.signal(name, _terminated)
+
+
+def _terminated(number: int, _: object) -> None:
+    raise Terminated(number)
+
+
+SPELT = "tmlattice.spelt"
+"""How a stream writes what its encoding does not have."""
+_LETTERS = {
+    "µ": "u", "±": "+-", "²": "^2", "³": "^3", "·": "*", "×": "x", "β": "beta", "σ": "sigma",
+    "χ": "chi", "–": "-", "−": "-", "…": "...",
+}  # fmt: skip
+
+
+def _spelt(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    part = error.object[error.start : error.end]
+    return "".join(_LETTERS.get(c, "?") for c in part), error.end
+
+
+codecs.register_error(SPELT, _spelt)
 
 
 def _fail(message: str, code: int) -> NoReturn:

@@ -351,9 +351,6 @@ def _weights(
 
 
 def _write_weights(reading: "WeightReading", folder: Path) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     from tmlattice.files import write_json
@@ -390,9 +387,6 @@ def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
 
 
 def _write_folder(result: "Diagnosis", folder: Path, document: dict[str, Any]) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     from tmlattice.report.speaking import write_files
 
     write_files(result, folder, document)

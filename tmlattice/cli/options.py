@@ -362,6 +362,9 @@ def console() -> "Console":
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(harmless(text), **options)
 
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
         def print(self, *objects: Any, **options: Any) -> None:
             clear()  # the progress line
             super().print(*objects, **options)

@@ -45,9 +45,6 @@ def reproduce(
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out))
         extra = files.enter_context(output_file(json_file)) if json_file else None
-        import matplotlib as mpl
-
-        mpl.use("Agg")
         import matplotlib.pyplot as plt
 
         entries = []

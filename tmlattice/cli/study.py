@@ -264,9 +264,6 @@ def _print_localisation(rows: list[dict[str, Any]]) -> None:
 
 
 def _draw(lattice: str, options: dict[str, Any], cases: list[Any], out: Path) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     from tmlattice.files import output_file

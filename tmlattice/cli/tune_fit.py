@@ -164,9 +164,6 @@ def _fit(
 
 def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
     """The figures, and their names; a loss there is where the recipe was asked for."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum

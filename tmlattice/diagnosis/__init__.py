@@ -62,7 +62,8 @@ def diagnose(
     more it is the same to rounding.
 
     Raises:
-        MeasurementError: data that cannot be used, or an option without meaning for them.
+        MeasurementError: data that cannot be used, or are given twice, or an option without meaning
+            for them.
         UnknownNameError: an effect that does not exist, or names that mostly are not the lattice's.
     """
     from threadpoolctl import threadpool_limits
@@ -75,6 +76,7 @@ def diagnose(
         if options[name] is None:
             del options[name]
     every = [*(measurement.values() if isinstance(measurement, Mapping) else [measurement])]
+    _each_once(measurement)
     with threadpool_limits(one, "blas"):
         found = _diagnosed(ring, measurement, options)
     found = with_devices(found, devices_of(ring, every))
@@ -94,10 +96,30 @@ def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
     return {name: own for name, (own, _) in parts.items()}, said
 
 
+def _each_once(measurement: Any) -> None:
+    """Raises a MeasurementError where readings are given twice, which would count twice."""
+    named = list(measurement.items()) if isinstance(measurement, Mapping) else []
+    for i, (name, one) in enumerate(named):
+        for other, before in named[:i]:
+            if type(one) is type(before) and np.array_equal(
+                _largest(one), _largest(before), equal_nan=True
+            ):
+                raise MeasurementError(
+                    f"'{other}' and '{name}' hold the same readings, which would count twice: give "
+                    "each measurement once"
+                )
+
+
+def _largest(measured: Any) -> np.ndarray:
+    """The largest array of a measurement: its readings."""
+    records = [measured, *getattr(measured, "steps", ())]
+    arrays = [v for record in records for v in vars(record).values() if isinstance(v, np.ndarray)]
+    return max(arrays, key=np.size, default=np.zeros(0))
+
+
 def _readings(measurement: Any) -> int:
     some = measurement.values() if isinstance(measurement, Mapping) else [measurement]
-    sizes = [v.size for one in some for v in vars(one).values() if isinstance(v, np.ndarray)]
-    return max(sizes, default=0)
+    return max((_largest(one).size for one in some), default=0)
 
 
 def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnosis:

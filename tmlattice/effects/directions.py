@@ -12,6 +12,7 @@ for is kept by `LayerMaps`, so that equal magnets cost one.
 import io
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,15 +92,33 @@ def kept_directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | Non
     if file is None or len(hypotheses) < MANY:
         return directions(layers, hypotheses)
     key = cache.key("directions", file, layers.dimension, tuple(hypotheses))
-    content = cache.load(key)
-    if content is not None:
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return Directions(tuple(hypotheses), **arrays)
+    kept = cache.load(key, partial(_read, layers, hypotheses))
+    if kept is not None:
+        return kept
     found = directions(layers, hypotheses)
     written = io.BytesIO()
     np.savez(written, **{name: getattr(found, name) for name in ARRAYS})
     cache.save(key, written.getvalue())
     return found
+
+
+def _read(
+    layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], content: bytes
+) -> Directions:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        kept = Directions(tuple(hypotheses), **arrays)
+    n, magnets, monitors = layers.dimension, len(layers.ring.magnets), len(layers.ring.monitors)
+    orders = (), (n,), (n * (n + 1) // 2,)
+    for owner, place, below, weights, first in (
+        (kept.owner, kept.layer, magnets + 1, (kept.D0, kept.D1, kept.D2), n),
+        (kept.read_owner, kept.monitor, monitors, (kept.E0, kept.E1, kept.E2), 2),
+    ):
+        rows = len(owner)
+        cache.check_form(owner, (rows,), len(hypotheses))
+        cache.check_form(place, (rows,), below)
+        for own, order in zip(weights, orders, strict=True):
+            cache.check_form(own, (rows, first, *order))
+    return kept
 
 
 def directions_nearby(

@@ -1,6 +1,6 @@
 """The experiment of `tune_fit` over the whole ring: one chosen magnet says little about a method.
 
-Cases run on Dask, on local processes or on a cluster (`tmlattice.batch`); each is written to a
+Cases run on local processes or on a Dask cluster (`tmlattice.batch`); each is written to a
 folder as it ends, so a study that was stopped goes on where it was.
 """
 

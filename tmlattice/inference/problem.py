@@ -7,8 +7,8 @@ little more of a cause would do. Fit, scan and search know no more of it.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,10 @@ class Problem(ABC):
     def everywhere(self) -> "Problem":
         """The same with causes that act in all of its measurements, those of a reference too."""
         return self
+
+    def standing(self, causes: Sequence[Cause]) -> Self:
+        """The same with further fixed causes: the kind may put them into its model once for all."""
+        return replace(self, fixed=(*self.fixed, *causes))
 
     @abstractmethod
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:

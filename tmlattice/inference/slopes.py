@@ -7,10 +7,11 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
+
+from tmlattice.compiled import jit_sums
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -116,7 +117,7 @@ def weighed_sums(
 
 
 # The sum over readings (`reassoc`) may follow the vector unit's order.
-@numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@jit_sums
 def _weigh(rows, root, by_monitor, by_column, plane, weighed, monitors, columns):  # type: ignore[no-untyped-def]
     """One pass over the slopes of one family; `monitors` is added to.
 

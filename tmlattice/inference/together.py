@@ -9,6 +9,7 @@ of zeros there. Nothing here knows which kinds they are.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -132,13 +133,21 @@ class Together(Problem):
         """Active in all parts."""
         return replace(self, active=(True,) * len(self.parts))
 
+    @cached_property
+    def standing_parts(self) -> tuple[Problem, ...]:
+        """The parts, each with the fixed causes that it sees."""
+        return tuple(
+            part.standing([c for c in self.fixed if part.sees((c.effect, c.element))])
+            for part in self.parts
+        )
+
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """`view` are the points of the parts, each with the causes that it sees."""
         points = []
         for part, active, own in zip(
-            self.parts, self.active, self.of_parts(nuisances), strict=True
+            self.standing_parts, self.active, self.of_parts(nuisances), strict=True
         ):
-            there = (*self.fixed, *causes) if active else self.fixed
+            there = causes if active else ()
             seen = [c for c in there if part.sees((c.effect, c.element))]
             points.append(part.at(seen, own))
             if points[-1].lost:  # the others would not be asked any more
@@ -158,11 +167,9 @@ class Together(Problem):
         """Of each part that sees it."""
         own = point.causes[cause]
         rows = []
-        for part, active, here in zip(self.parts, self.active, point.view, strict=True):
+        for part, active, here in zip(self.standing_parts, self.active, point.view, strict=True):
             if active and part.sees((own.effect, own.element)):
-                # the last one: what is fixed comes first, and may hold the same effect there
-                at = max(i for i, c in enumerate(here.causes) if c == own)
-                rows.append(part.slope(here, at))
+                rows.append(part.slope(here, here.causes.index(own)))
             else:
                 rows.append(np.zeros(len(here.residual)))
         return np.concatenate(rows)
@@ -231,7 +238,7 @@ class _TogetherMetric(Metric):
         assert isinstance(point.projection, Blocks)
         super().__init__(point.projection)
         self.problem, self.blocks = problem, point.projection
-        pairs = zip(problem.parts, point.view, strict=True)
+        pairs = zip(problem.standing_parts, point.view, strict=True)
         self.metrics = [part.metric(here) for part, here in pairs]
 
     def products(self, hypotheses: Sequence[Hypothesis], data: Array) -> Products:

@@ -35,7 +35,7 @@ from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
 from tmlattice.lattice.mat_file import check_mat
 from tmlattice.lattice.parts import assembled
-from tmlattice.lattice.places import Place, corrector, corrector_pair
+from tmlattice.lattice.places import Place, corrector, corrector_pair, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
 log = logging.getLogger(__name__)
@@ -108,8 +108,7 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         LatticeError: no elements.
 
     Warns:
-        Of misalignments that are no offset, rotations that are no roll, and orders above the
-        second, which are left out.
+        Of orders above the second, which are left out.
     """
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
     rest = float(lattice.particle.rest_energy) / 1e9
@@ -125,10 +124,12 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         for element in lattice:
             if id(element) not in known:
                 family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
-                own = _places(element, family, design.map_energy, left_out, tracker)
-                known[id(element)] = own
-                if shift := _shift(element, left_out):
+                entrance, exit_ = _frame(element, family, design.map_energy)
+                bare = _without_frame(element) if entrance else element
+                own = _places(bare, family, design.map_energy, left_out, tracker)
+                if shift := _shift(bare):
                     errors |= {id(source): shift for _, _, source in own}
+                known[id(element)] = [*entrance, *own, *exit_]
             converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
@@ -138,34 +139,42 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     return assembled(design, converted, errors, max(1, int(lattice.periodicity)))
 
 
-def _shift(element: Any, left_out: Counter[str]) -> dict[str, float]:
-    """Offset of the element's centre, m, from T1 and T2; what else they do is counted as left
-    out."""
-    entrance, exit_ = (
-        np.asarray(getattr(element, key, np.zeros(6)), dtype=float).ravel() for key in ("T1", "T2")
-    )
-    if not entrance.any() and not exit_.any():
-        return {}
-    bare = np.zeros(6)
-    bare[[0, 2]] = entrance[[0, 2]]
-    if entrance.shape != (6,) or np.any(entrance != bare) or np.any(exit_ != -bare):
-        left_out["misalignments T1, T2 that are no offset"] += 1
-        return {}
-    return {k: v for k, v in (("dx", -bare[0]), ("dy", -bare[2])) if v}
+def _translations(element: Any) -> tuple[Array, Array]:
+    T1, T2 = (np.asarray(getattr(element, key, np.zeros(6)), float).ravel() for key in ("T1", "T2"))
+    return T1, T2
 
 
-def _roll(element: Any, left_out: Counter[str]) -> float:
-    """Tilt from R1, rad; any other rotation is counted as left out."""
-    R1 = np.asarray(getattr(element, "R1", np.eye(6)), dtype=float)
-    R2 = np.asarray(getattr(element, "R2", np.eye(6)), dtype=float)
-    roll = math.atan2(R1[0, 2], R1[0, 0])
-    turn = np.eye(6)
-    turn[:4, :4] = np.kron(
-        [[math.cos(roll), math.sin(roll)], [-math.sin(roll), math.cos(roll)]], np.eye(2)
+def _rotations(element: Any) -> tuple[Array, Array]:
+    R1, R2 = (np.asarray(getattr(element, key, np.eye(6)), dtype=float) for key in ("R1", "R2"))
+    return R1, R2
+
+
+def _frame(element: Any, family: str, energy: float) -> tuple[list[Place], list[Place]]:
+    """What T1, R1 and R2, T2 do before and behind an element, where they are neither an offset nor
+    a roll: matrices of their own. x -> R1 (x + T1) and x -> R2 x + T2."""
+    (T1, T2), (R1, R2) = _translations(element), _rotations(element)
+    turn = rotation(math.atan2(R1[0, 2], R1[0, 0]))
+    offset = np.array_equal(T1, -T2) and not T1[[1, 3, 4, 5]].any()
+    if offset and np.abs(R1 - turn).max() < 1e-9 and np.abs(R2 - turn.T).max() < 1e-9:
+        return [], []
+    entrance, exit_ = f"{family}_entrance", f"{family}_exit"
+    return (
+        [(entrance, "matrix", _matrix(R1, entrance, 0.0, energy, R1 @ T1)[1])],
+        [(exit_, "matrix", _matrix(R2, exit_, 0.0, energy, T2)[1])],
     )
-    if np.abs(R1 - turn).max() > 1e-9 or np.abs(R2 - turn.T).max() > 1e-9:
-        left_out["rotations R1, R2 that are no roll"] += 1
-    return roll
+
+
+def _without_frame(element: Any) -> Any:
+    bare = element.deepcopy()
+    for name in ("T1", "T2", "R1", "R2"):
+        vars(bare).pop(name, None)
+    return bare
+
+
+def _shift(element: Any) -> dict[str, float]:
+    """Offset of the element's centre, m."""
+    T1, _ = _translations(element)
+    return {k: v for k, v in (("dx", -T1[0]), ("dy", -T1[2])) if v}
 
 
 def _places(
@@ -194,7 +203,8 @@ def _convert(
     from tmlattice.lattice.ocelot import elements as ocelot
 
     length = float(getattr(element, "Length", 0.0))
-    roll = _roll(element, left_out)
+    R1, R2 = _rotations(element)
+    roll = math.atan2(R1[0, 2], R1[0, 0])
     if isinstance(element, at.RFCavity):
         voltage, frequency = (float(getattr(element, k, 0.0)) for k in ("Voltage", "Frequency"))
         return "cavity", ocelot.Cavity(l=length, v=1e-9 * voltage, freq=frequency, eid=family)
@@ -213,7 +223,7 @@ def _convert(
     if isinstance(element, at.M66):
         matrix = np.asarray(element.M66, dtype=float)
         if roll:
-            matrix = np.asarray(element.R2) @ matrix @ np.asarray(element.R1)
+            matrix = R2 @ matrix @ R1
         return _matrix(matrix, family, length, energy)
     if isinstance(element, at.ThinMultipole) and not isinstance(element, at.Multipole):
         return thin(element, family, mad, roll, left_out)
@@ -261,7 +271,9 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     return corrector_pair(family, length, x, y)
 
 
-def _matrix(r: Array, family: str, length: float, energy: float) -> tuple[Kind, Any]:
+def _matrix(
+    r: Array, family: str, length: float, energy: float, b: Array | None = None
+) -> tuple[Kind, Any]:
     from tmlattice.lattice.ocelot import elements as ocelot
 
     gamma = energy / ELECTRON_GEV
@@ -272,4 +284,6 @@ def _matrix(r: Array, family: str, length: float, energy: float) -> tuple[Kind, 
     source.r = to_ocelot @ r @ np.linalg.inv(to_ocelot)
     if source.r[4, 4] == 0.0 and source.r[5, 5] == 0.0:
         source.r[4, 4] = source.r[5, 5] = 1.0
+    if b is not None:
+        source.b = (to_ocelot @ b).reshape(6, 1)
     return ("wiggler" if "wig" in family else "matrix"), source

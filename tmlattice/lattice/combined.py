@@ -30,7 +30,7 @@ FIELDS = ("k0", "k0s", "k1", "k1s", "k2", "k2s")
 """Dipole (1/m), quadrupole (1/m2), sextupole (1/m3); normal and skew."""
 DESIGN = ("angle", "lrad")
 """Of a thin one: the angle by which the design orbit bends, rad, and the length of the bend that it
-stands for, m; over that length a bend focuses as angle^2 / lrad; 0: it does not."""
+stands for, m; over that length a bend focuses as angle (angle + k0) / lrad; 0: it does not."""
 
 _quadrupole = elements.Quadrupole().element
 _Magnet: Any = next(c for c in type(_quadrupole).__mro__ if c.__name__ == "Magnet")
@@ -52,7 +52,7 @@ def _motion(k: dict[str, float], energy: float) -> list[dict[tuple[int, ...], fl
     slip = 1 / (beta * gamma) ** 2 if gamma else 0.0
     # H = -angle x (1 + delta) + weak x^2 / 2, with delta = p / beta - slip p^2 / 2
     angle = k.get("angle", 0.0)
-    weak = angle**2 / k["lrad"] if angle and k["lrad"] else 0.0
+    weak = angle * (angle + k["k0"]) / k["lrad"] if angle and k["lrad"] else 0.0
     return [
         {(1,): 1.0, (1, 5): -1 / beta},
         {(): -k["k0"], (0,): -k["k1"] - weak, (2,): k["k1s"],

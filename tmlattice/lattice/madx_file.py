@@ -9,6 +9,7 @@ import contextlib
 import math
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,7 +33,16 @@ from tmlattice.lattice.madx_language import (
     unquoted,
     values,
 )
-from tmlattice.lattice.parts import ACTING, MODELLED, NO_EFFECT, STATIC, Part, Report, ring_of_parts
+from tmlattice.lattice.parts import (
+    ACTING,
+    MODELLED,
+    NO_EFFECT,
+    SHIFTS,
+    STATIC,
+    Part,
+    Report,
+    ring_of_parts,
+)
 from tmlattice.lattice.ring import Ring
 
 MOST_WORK = 4_000_000
@@ -49,7 +59,8 @@ NO_STATEMENT = frozenset({
     "dynap", "sodd", "sixtrack", "dumpsequ", "create", "fill", "readtable", "readmytable",
     "setplot", "resplot", "usemonitor", "usekick", "chdir", "rename", "copyfile", "removefile",
     "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
-    "set", "error",
+    "set", "error", "beta0", "coption", "deselect", "distribution", "etable", "getdisp", "getkick",
+    "getorbit", "renamefile", "rviewer", "save_state", "sddsin", "sddsout", "select_ptc_normal",
 })  # fmt: skip
 """Statements that leave the ring as it is, as do all that begin with PTC_."""
 NOT_RUN = {
@@ -64,9 +75,13 @@ REFUSED: dict[str, str] = {
     "efcomp": "EFCOMP gives elements field errors; take it out to read the ring as designed",
     "seterr": "SETERR gives elements errors from a table; take it out to read the ring as designed",
     "correct": "CORRECT sets correctors; take it out to read the ring before it",
-    "setvars": "SETVARS sets variables from a table; write their values",
+    "taper": "TAPER changes strengths along the ring; take it out to read the ring as designed",
+    "add2expr": "ADD2EXPR changes the expression of a variable; write the expression",
+    **{word: f"{word.upper()} sets variables from a table; write their values"
+       for word in ("setvars", "setvars_lin", "setvars_const", "setvars_knob")},
+    **{word: f"{word.upper()} sets correctors from a table; write their kicks"
+       for word in ("readcorr", "setcorr", "putkick", "putorbit", "putdisp")},
     "sxfread": "SXFREAD reads a ring from a file of SXF; give a sequence",
-    "extract": "EXTRACT makes a sequence of a part of another; SAVE that sequence and read it",
     "setplugin": "SETPLUGIN runs a program; take it out",
 }  # fmt: skip
 """Statements that may change the ring and are not carried out."""
@@ -78,6 +93,7 @@ WORDS = frozenset({
     "ysize", "reference",
 })  # fmt: skip
 """Attributes that are texts, or whose numbers nothing here asks for."""
+_FLAGS = frozenset({"kill_ent_fringe", "kill_exi_fringe"})
 
 
 @dataclass
@@ -93,16 +109,21 @@ class _Definition:
     values: dict[str, Any]
     where: str
     length: float = 0.0
+    parents: tuple[str, ...] = ()
 
 
 @dataclass
 class _Node:
-    """An element's place in a sequence; `at` is that of its reference point, or of its centre."""
+    """An element's place in a sequence; `at` is that of its reference point, or of its centre.
+
+    `count` is k of NAME[k], which stays when others of the name are removed.
+    """
 
     name: str
     at: Evaluate
     origin: str = ""
     centred: bool = False
+    count: int = 1
 
 
 @dataclass
@@ -112,6 +133,12 @@ class _Sequence:
     refer: str = "centre"
     refpos: str = ""
     nodes: list[_Node] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def counted(self, name: str) -> int:
+        """The number of an element's next place."""
+        self.counts[name] += 1
+        return self.counts[name]
 
 
 @dataclass(frozen=True)
@@ -121,6 +148,7 @@ class _Slot:
     name: str
     centre: float
     length: float
+    count: int = 1
 
 
 def read_madx(
@@ -192,6 +220,7 @@ class _Reader:
         self._open: _Sequence | None = None
         self._edited: _Sequence | None = None
         self._selected: list[dict[str, str]] = []
+        self._unfound = set[str]()
         self._made: dict[tuple[str, float], Part] = {}
         self._files: list[Path] = []
         self._count = 0
@@ -340,7 +369,7 @@ class _Reader:
             self._read_text(body)
         self._branched = holding  # also where blocks inside have changed it
 
-    _branched = False
+    _branched = _in_line = False
 
     def _define(self, name: str, rest: str, statement: Statement) -> None:
         line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
@@ -362,7 +391,8 @@ class _Reader:
         parent = self.elements.get(word)
         own = dict(parent.values) if parent else {}
         keyword = parent.keyword if parent else word
-        definition = _Definition(name, keyword, own, self._where(statement))
+        parents = () if parent is None else (word, *parent.parents)
+        definition = _Definition(name, keyword, own, self._where(statement), parents=parents)
         self.elements[name] = definition
         self._update(definition, given)
         definition.length = self._element_length(definition)
@@ -380,6 +410,11 @@ class _Reader:
                 continue
             if attribute in WORDS:
                 definition.values[attribute] = unquoted(value.text)
+            elif value.bare and attribute not in _FLAGS | NO_EFFECT:
+                definition.values[attribute] = 0.0
+                self.warnings.append(
+                    f"{attribute.upper()} of '{definition.name}' has no value: 0, as in MAD-X"
+                )
             elif value.deferred:
                 definition.values[attribute] = self._deferred(value)
             else:
@@ -464,6 +499,8 @@ class _Reader:
             case "endedit":
                 self._edited = None
                 return None
+            case "extract":
+                return self._extract(given)
         if self._edited is not None and word in _EDITS:
             return getattr(self, f"_{word}")(given)  # type: ignore[no-any-return]
         if word in self.elements or word in self.sequences or word in KEYWORDS:
@@ -494,8 +531,8 @@ class _Reader:
             if value.startswith("$"):
                 number = self.variable(value[1:].lower())
                 value = str(int(number)) if number == int(number) else repr(number)  # noqa: PLW2901
-            inside = rf"(?<![A-Za-z0-9_]){re.escape(name)}(?![A-Za-z0-9_])"
-            body = re.sub(inside, value.replace("\\", r"\\"), body)
+            # wherever it stands, within words too, as MAD-X does
+            body = re.sub(re.escape(name), value.replace("\\", r"\\"), body, flags=re.IGNORECASE)
         self._depth += 1
         if self._depth > 100:
             raise LatticeError(f"the macro '{match[1]}' calls itself without end")
@@ -549,7 +586,8 @@ class _Reader:
         if self._open is None or "at" not in given:
             return
         origin = unquoted(given["from"].text).lower() if "from" in given else ""
-        self._open.nodes.append(_Node(name, self._evaluate(given["at"]), origin))
+        at = self._evaluate(given["at"])
+        self._open.nodes.append(_Node(name, at, origin, count=self._open.counted(name)))
 
     def _length(self, name: str, nested: bool = False) -> float:
         """Of an element (along the arc) or a sequence, m."""
@@ -574,9 +612,9 @@ class _Reader:
     def slots(self, sequence: _Sequence, nested: bool = False) -> list[_Slot]:
         """Its elements and sequences with the positions of their centres, in their order."""
         reference = {"entry": 0.5, "exit": -0.5}.get(sequence.refer, 0.0)
-        nodes: dict[str, list[_Node]] = {}
+        nodes: dict[tuple[str, int], _Node] = {}
         for node in sequence.nodes:
-            nodes.setdefault(node.name, []).append(node)
+            nodes.setdefault((node.name, node.count), node)
         known: dict[int, float] = {}
 
         def centre(node: _Node, depth: int = 0) -> float:
@@ -588,18 +626,20 @@ class _Reader:
             if not node.centred:
                 at += self._offset(node.name, reference, nested)
             if node.origin:
-                name, _, k = node.origin.partition("[")
-                if name not in nodes:
+                origin = nodes.get(_occurrence(node.origin))
+                if origin is None:
                     raise LatticeError(
-                        f"FROM of '{plain(node.name, 60)}' names '{plain(name, 60)}', which is not "
+                        f"FROM of '{plain(node.name, 60)}' names '{plain(node.origin, 60)}', not "
                         f"in the sequence '{sequence.name}'"
                     )
-                at += centre(nodes[name][int(k.rstrip("]") or 1) - 1], depth + 1)
+                at += centre(origin, depth + 1)
             known[id(node)] = at
             return at
 
         self.work(len(sequence.nodes))
-        own = [_Slot(n.name, centre(n), self._length(n.name, nested)) for n in sequence.nodes]
+        own = [
+            _Slot(n.name, centre(n), self._length(n.name, nested), n.count) for n in sequence.nodes
+        ]
         return sorted(own, key=lambda slot: slot.centre)
 
     def _offset(self, name: str, reference: float, nested: bool = False) -> float:
@@ -630,12 +670,35 @@ class _Reader:
         if name not in self.sequences:
             raise LatticeError(f"SEQEDIT names '{plain(name, 60)}', which no sequence is")
         self._edited = self.sequences[name]
+        self._unfound = set()
         self._put(self.slots(self._edited))
 
     def _put(self, slots: Sequence[_Slot]) -> None:
         assert self._edited is not None
         ordered = sorted(slots, key=lambda slot: slot.centre)
-        self._edited.nodes = [_Node(s.name, _constant(s.centre), centred=True) for s in ordered]
+        self._edited.nodes = [
+            _Node(s.name, _constant(s.centre), centred=True, count=s.count) for s in ordered
+        ]
+
+    def _extract(self, given: dict[str, Given]) -> None:
+        """A sequence of what stands between two markers of another."""
+        named, first, last, new = (
+            unquoted(given[k].text).lower() for k in ("sequence", "from", "to", "newname")
+        )
+        if named not in self.sequences:
+            raise LatticeError(f"EXTRACT names '{plain(named, 60)}', which no sequence is")
+        slots = self.slots(self.sequences[named])
+        ends = [self._targets({"element": Given(end)}, slots)[0] for end in (first, last)]
+        begin, end = ends[0].centre, ends[1].centre
+        if ends[0].length or ends[1].length or end < begin:
+            raise LatticeError("EXTRACT is not from a marker to a marker behind it")
+        made = _Sequence(new, _constant(end - begin), counts=self.sequences[named].counts.copy())
+        made.nodes = [
+            _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count)
+            for s in slots[slots.index(ends[0]) : slots.index(ends[1]) + 1]
+        ]
+        self.sequences[new] = made
+        self._known_as(new)
 
     def _select(self, given: dict[str, Given]) -> None:
         flag = unquoted(given["flag"].text).lower() if "flag" in given else ""
@@ -654,8 +717,9 @@ class _Reader:
         if "range" in choice:
             raise LatticeError("SELECT with a RANGE is not read in SEQEDIT; use a PATTERN")
         definition = self.elements.get(slot.name)
-        keyword = "" if definition is None else definition.keyword
-        if "class" in choice and keyword != choice["class"].lower():
+        classes = (slot.name, *(definition.parents if definition else ()))
+        keyword = definition.keyword if definition else ""
+        if "class" in choice and choice["class"].lower() not in (keyword, *classes):
             return False
         if "pattern" not in choice:
             return "class" in choice
@@ -674,11 +738,26 @@ class _Reader:
         named = unquoted(given["element"].text).lower()
         if named == "selected":
             return self._chosen_slots(slots)
-        name, _, k = named.partition("[")
-        found = [slot for slot in slots if slot.name == name]
+        found = [slot for slot in slots if (slot.name, slot.count) == _occurrence(named)]
         if not found:
             raise LatticeError(f"the sequence has no element '{plain(named, 60)}'")
-        return [found[int(k.rstrip("]")) - 1]] if k else found
+        if len(found) > 1:  # MAD-X edits one of them or none
+            raise LatticeError(
+                f"FLATTEN has made {len(found)} elements '{plain(named, 60)}' of one name; edit "
+                "them by SELECT"
+            )
+        return found
+
+    def _found(self, given: dict[str, Given], slots: Sequence[_Slot]) -> list[_Slot]:
+        """As `_targets`, for edits that do not find what FLATTEN has just brought in."""
+        found = self._targets(given, slots)
+        unfound = sorted({slot.name for slot in found} & self._unfound)
+        if unfound:
+            raise LatticeError(
+                f"MAD-X does not find '{plain(unfound[0], 60)}' in the SEQEDIT that flattens its "
+                "sequence; put ENDEDIT and another SEQEDIT before this edit"
+            )
+        return found
 
     def _install(self, given: dict[str, Given]) -> None:
         assert self._edited is not None
@@ -689,10 +768,11 @@ class _Reader:
             if parent not in self.elements and parent not in KEYWORDS:
                 raise LatticeError(f"no element class '{plain(parent, 60)}' is known")
             old = self.elements.get(parent)
-            keyword, own, known = parent, dict[str, Any](), 0.0
+            new = _Definition(name, parent, {}, "INSTALL")
             if old is not None:
-                keyword, own, known = old.keyword, dict(old.values), old.length
-            self.elements.setdefault(name, _Definition(name, keyword, own, "INSTALL", known))
+                own, parents = dict(old.values), (parent, *old.parents)
+                new = replace(old, name=name, values=own, where="INSTALL", parents=parents)
+            self.elements.setdefault(name, new)
         reference = {"entry": 0.5, "exit": -0.5}.get(self._edited.refer, 0.0)
         length = self._length(name)
         at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
@@ -700,14 +780,13 @@ class _Reader:
         if "from" in given:
             origin = {"element": Given(given["from"].text)}
             origins = [slot.centre for slot in self._targets(origin, slots)]
-            if unquoted(given["from"].text).lower() != "selected":
-                origins = origins[:1]
-        self._put([*slots, *(_Slot(name, at + origin, length) for origin in origins)])
+        count = self._edited.counted
+        self._put([*slots, *(_Slot(name, at + s, length, count(name)) for s in origins)])
 
     def _remove(self, given: dict[str, Given]) -> None:
         assert self._edited is not None
         slots = self.slots(self._edited)
-        gone = {id(slot) for slot in self._targets(given, slots)}
+        gone = {id(slot) for slot in self._found(given, slots)}
         self._put([slot for slot in slots if id(slot) not in gone])
 
     def _replace(self, given: dict[str, Given]) -> None:
@@ -716,12 +795,15 @@ class _Reader:
         new = unquoted(given["by"].text).lower()
         old = {id(slot) for slot in self._targets(given, slots)}
         length = self._length(new)
-        self._put([replace(s, name=new, length=length) if id(s) in old else s for s in slots])
+        self._put([
+            replace(s, name=new, length=length, count=self._edited.counted(new))
+            if id(s) in old else s for s in slots
+        ])  # fmt: skip
 
     def _move(self, given: dict[str, Given]) -> None:
         assert self._edited is not None
         slots = self.slots(self._edited)
-        moved = {id(slot) for slot in self._targets(given, slots)}
+        moved = {id(slot) for slot in self._found(given, slots)}
         if "to" in given:
             to = float(compiled(given["to"].text)(self))
             if "from" in given:
@@ -739,14 +821,19 @@ class _Reader:
 
     def _flatten(self, given: dict[str, Given]) -> None:
         assert self._edited is not None
-        self._put(self._flat(self._edited))
+        own = {node.name for node in self._edited.nodes}
+        flat = self._flat(self._edited)
+        self._unfound = {slot.name for slot in flat} - own
+        self._put(flat)
 
     def _cycle(self, given: dict[str, Given]) -> None:
         assert self._edited is not None
         slots = self.slots(self._edited)
         named = {"element": given.get("start", Given(""))}
         first = self._targets(named, slots)[0]
-        length, zero = self._length(self._edited.name), first.centre - first.length / 2
+        if first.length:
+            raise LatticeError(f"CYCLE starts at '{first.name}', which has a length; take a marker")
+        length, zero = self._length(self._edited.name), first.centre
         before = slots.index(first)
         self._put([replace(s, centre=s.centre - zero + (length if k < before else 0.0))
                    for k, s in enumerate(slots)])  # fmt: skip
@@ -770,6 +857,7 @@ class _Reader:
         if use in self.sequences:
             sequence = self.sequences[use]
             return self._laid_out(sequence, beam, self._length(use))
+        self._in_line = True
         names = [name for name, _ in laid_out(self.lines[use], self.lines)]
         self.work(len(names))
         parts: list[Part] = []
@@ -835,9 +923,10 @@ class _Reader:
                 own = _with_matrix(own)
             case "multipole" if not self.thin_focusing:
                 own["lrad"] = 0.0
-        for attribute in _NOT_IN_TWISS.get(keyword, ()):
+        for attribute in (*_NOT_IN_TWISS.get(keyword, ()), *(SHIFTS if self._in_line else ())):
             if np.any(own.pop(attribute, 0.0)):
-                what = f"{attribute.upper()} of the {keyword.upper()} (as in MAD-X's TWISS)"
+                where = "a LINE" if attribute in SHIFTS else "MAD-X's TWISS"
+                what = f"{attribute.upper()} of the {keyword.upper()} (as in {where})"
                 self.report.left_out(what, definition.name)
         if float(beam.given.get("bv", 1.0)) == -1:
             own = _reversed_fields(own)
@@ -859,6 +948,12 @@ def _reversed_fields(own: dict[str, Any]) -> dict[str, Any]:
     """BV=-1: the beam goes through the same fields with the other sign of charge or direction."""
     return {k: tuple(-x for x in v) if isinstance(v, tuple) else -v
             if k in _ODD else v for k, v in own.items()}  # fmt: skip
+
+
+def _occurrence(text: str) -> tuple[str, int]:
+    """The name and k of NAME[k]; NAME alone is the first."""
+    name, _, k = text.partition("[")
+    return name, int(k.rstrip("]") or 1)
 
 
 def _constant(value: float) -> Evaluate:

@@ -342,10 +342,14 @@ def split(text: str, separator: str = ",") -> list[str]:
 
 @dataclass(frozen=True)
 class Given:
-    """The text of an attribute, and whether it is worked out anew each time (`:=`)."""
+    """The text of an attribute, and whether it is worked out anew each time (`:=`).
+
+    `bare`: the attribute stands without a value.
+    """
 
     text: str
     deferred: bool = False
+    bare: bool = False
 
 
 _ITEM = re.compile(r"([\w.]+)\s*(:?=)\s*(.*)", re.DOTALL)
@@ -360,7 +364,7 @@ def attributes(items: Sequence[str]) -> dict[str, Given]:
             found[match[1].lower()] = Given(match[3], match[2] == ":=")
         elif item:
             off = item.startswith("-")
-            found[item.lstrip("-+ ").lower()] = Given("0" if off else "1")
+            found[item.lstrip("-+ ").lower()] = Given("0" if off else "1", bare=True)
     return found
 
 

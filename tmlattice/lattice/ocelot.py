@@ -79,8 +79,9 @@ def _depth(context: int = 1) -> list[Any]:
 @contextlib.contextmanager
 def _light() -> Iterator[None]:
     """Imports of OCELOT's parts inside load neither the whole package nor `LATER`."""
-    import numba
     import scipy.special  # noqa: F401  (it, and what it needs, must be the real ones)
+
+    from tmlattice.compiled import numba
 
     def uncompiled(jit: Callable[..., Any]) -> Callable[..., Any]:
         def made(*args: Any, **options: Any) -> Any:

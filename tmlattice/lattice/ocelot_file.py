@@ -41,7 +41,8 @@ def read_ocelot(
     Args:
         path: of the `.py` file.
         name: of the ring.
-        sequence: the variable that holds the elements; else `ring`, `cell` or `lattice`.
+        sequence: the variable that holds the elements; else `ring`; else of `cell`, `lattice` and
+            every MagneticLattice the one with the most elements.
         energy: GeV; else what the file states (`energy`, or the E of a Twiss or Beam object).
 
     Raises:
@@ -64,13 +65,13 @@ def read_ocelot(
 
 @contextmanager
 def _import_path(folder: Path) -> Iterator[None]:
-    """A lattice file may import its neighbours, as when it is run from its own folder."""
-    sys.path.insert(0, str(folder))
+    """A lattice file may import its neighbours; what is installed comes before them."""
+    before = sys.path[:]
+    sys.path.append(str(folder))
     try:
         yield
     finally:
-        if str(folder) in sys.path:
-            sys.path.remove(str(folder))
+        sys.path[:] = before
 
 
 def _run_as_module(path: Path) -> ModuleType:
@@ -95,16 +96,21 @@ def _run_as_module(path: Path) -> ModuleType:
 
 
 def _sequence(path: Path, variables: dict[str, Any], wanted: str | None) -> Any:
-    names = (wanted,) if wanted else SEQUENCES
-    for name in names:
+    """The variable that holds the ring: `ring`; else of `SEQUENCES` and all MagneticLattices the
+    one with the most elements, for `cell` may be the ring or a cell of it."""
+    if wanted or "ring" in variables:
+        name = wanted or "ring"
         if name in variables:
             return variables[name]
-    if wanted:
         lists = [k for k, v in variables.items() if isinstance(v, list | tuple)]
-        raise unknown_name(f"sequence in '{path}' named", wanted, lists)
-    raise LatticeError(
-        f"'{path}' has no sequence called ring, cell or lattice; name it with sequence="
-    )
+        raise unknown_name(f"sequence in '{path}' named", name, lists)
+    found = [variables[name] for name in SEQUENCES if name in variables]
+    found += [v for v in variables.values() if type(v).__name__ == "MagneticLattice"]
+    if not found:
+        raise LatticeError(
+            f"'{path}' has no sequence called ring, cell or lattice; name it with sequence="
+        )
+    return max(found, key=lambda sequence: sum(1 for _ in _flatten(sequence)))
 
 
 def _flatten(sequence: Any) -> Iterator[Any]:
@@ -126,7 +132,8 @@ def _flatten(sequence: Any) -> Iterator[Any]:
 
 
 def _mend(source: Any) -> Any:
-    """The element, or a copy of a matrix element that was born without a longitudinal block."""
+    """The element; a copy of a matrix element that was born without a longitudinal block; a thin
+    bend in the place of a multipole that bends the design orbit."""
     from tmlattice.lattice.ocelot import elements
 
     if isinstance(source, elements.Matrix) and source.r[4, 4] == 0 and source.r[5, 5] == 0:
@@ -134,7 +141,18 @@ def _mend(source: Any) -> Any:
         matrix = source.r.copy()
         matrix[4, 4] = matrix[5, 5] = 1.0
         source.r = matrix
+    if isinstance(source, elements.Multipole) and source.kn[0]:  # it bends the design orbit
+        source = _thin_bend(source)
     return source
+
+
+def _thin_bend(source: Any) -> Any:
+    from tmlattice.lattice.combined import CombinedMultipole
+
+    angle, k1, k2, *higher = [*map(float, source.kn), 0.0, 0.0]
+    if any(higher):
+        warnings.warn(f"'{source.id}': fields above the sextupole are left out", stacklevel=2)
+    return CombinedMultipole(angle=angle, k1=k1, k2=k2, tilt=source.tilt, eid=source.id)
 
 
 def _name_places(places: list[Any], variables: dict[str, Any]) -> tuple[Element, ...]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.lattice.at_fields import straight_magnet
-from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements
+from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 from tmlattice.lattice.wigglers import merge_wigglers
 
@@ -55,7 +55,7 @@ class Part:
 
 
 _STRENGTHS = frozenset({"k0", "k0s", "k1", "k1s", "k2", "k2s", "k3", "k3s", "knl", "ksl"})
-_SHIFTS = frozenset({"dx", "dy", "ds", "dpsi"})
+SHIFTS = frozenset({"dx", "dy", "ds", "dpsi"})
 _EDGES = frozenset({
     "angle", "e1", "e2", "h1", "h2", "hgap", "fint", "fintx", "kill_ent_fringe", "kill_exi_fringe",
 })  # fmt: skip
@@ -63,13 +63,14 @@ _KICKS = frozenset({"hkick", "vkick", "kick"})
 _PASSIVE = frozenset[str]()
 
 MODELLED: dict[str, frozenset[str]] = {
-    **dict.fromkeys(("drift", "marker", "instrument", "placeholder"), _PASSIVE),
+    **dict.fromkeys(("drift", "marker", "sixmarker", "instrument", "placeholder"), _PASSIVE),
+    **dict.fromkeys(("blmonitor", "imonitor", "slmonitor"), _PASSIVE),  # of losses, current, light
     **dict.fromkeys(("collimator", "ecollimator", "rcollimator"), _PASSIVE),
     **dict.fromkeys(("monitor", "hmonitor", "vmonitor"), _PASSIVE),
     **dict.fromkeys(("hkicker", "vkicker", "kicker", "tkicker"), _KICKS | {"tilt"}),
-    "sbend": _STRENGTHS | _SHIFTS | _EDGES | {"tilt"},
-    **dict.fromkeys(("quadrupole", "sextupole", "octupole"), _STRENGTHS | _SHIFTS | {"tilt"}),
-    "multipole": _STRENGTHS | _SHIFTS | {"tilt", "lrad", "angle"},
+    "sbend": _STRENGTHS | SHIFTS | _EDGES | {"tilt"},
+    **dict.fromkeys(("quadrupole", "sextupole", "octupole"), _STRENGTHS | SHIFTS | {"tilt"}),
+    "multipole": _STRENGTHS | SHIFTS | {"tilt", "lrad", "angle"},
     "solenoid": frozenset({"ks", "ksi"}),
     "rfcavity": frozenset({"volt", "freq"}),
     "matrix": frozenset({"rm", "rmat", "b", "tilt"}),
@@ -85,6 +86,7 @@ STATIC: dict[str, str] = {
 ACTING: dict[str, tuple[str, ...]] = {
     "elseparator": ("ex", "ey", "ex_l", "ey_l"),
     "beambeam": ("charge",),
+    "wire": ("current",),
     "nllens": ("knll",),
     "rfmultipole": ("knl", "ksl", "volt"),
     "changeref": ("patch_ang", "patch_trans"),
@@ -102,7 +104,7 @@ NO_EFFECT = frozenset({
     "comments", "comment", "kmax", "kmin", "nst", "method", "model", "exact", "fringe",
     "bend_fringe", "thick", "magnet", "lrad", "lag", "harmon", "shunt", "tfill", "betrf", "pg",
     "n_bessel", "no_cavity_totalpath", "add_angle", "f_factor", "slice", "sigx", "sigy",
-    "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq",
+    "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq", "entrance",
 })  # fmt: skip
 """Attributes without effect on the optics, of any keyword."""
 NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl", "rad", "tm"})
@@ -167,6 +169,7 @@ def ring_of_parts(
             own = known[id(part)] = _places(part, design, abs(charge), report)
             if amounts := _errors(part):
                 errors |= {id(source): amounts for _, _, source in own}
+            own += _exit_of_displaced(part)
         places += known[id(part)]
     report.warn(name)
     return assembled(design, places, errors)
@@ -228,7 +231,7 @@ def _check(part: Part, report: Report) -> None:
         return
     if keyword not in MODELLED:
         raise LatticeError(f"{named}: no element class {keyword.upper()} is known")
-    for attribute, value in part.values.items():
+    for attribute, value in part.values.items() if MODELLED[keyword] is not _PASSIVE else ():
         if attribute in MODELLED[keyword] or attribute in NO_EFFECT or not _acts(value):
             continue
         if attribute not in NONLINEAR:
@@ -274,6 +277,28 @@ def _errors(part: Part) -> dict[str, Any]:
                 "modelled; set its tilt or its K1S to 0"
             )
     return {k: v for k, v in amounts.items() if np.any(v)}
+
+
+def _exit_of_displaced(part: Part) -> list[Place]:
+    """What the exit of a displaced bend does beyond that of a displaced straight magnet.
+
+    The body is moved as a whole, by dx and ds along the axes of its entrance; those of its exit are
+    turned by the angle.
+    """
+    angle, ds, tilt = part.number("angle"), part.number("ds"), part.number("tilt")
+    cos, sin = math.cos(tilt), math.sin(tilt)
+    inward = part.number("dx") * cos + part.number("dy") * sin
+    if part.keyword != "sbend" or not angle or not (ds or inward):
+        return []
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    aside = ds * math.sin(angle) - inward * (1 - math.cos(angle))
+    way = ds * (1 - math.cos(angle)) + inward * math.sin(angle)
+    source = ocelot.Matrix(l=0.0, eid=f"{part.name}_exit")
+    source.r = np.eye(6)
+    source.r[0, 1] = source.r[2, 3] = way
+    source.b = np.array([[aside * cos, 0.0, aside * sin, 0.0, 0.0, 0.0]]).T
+    return [(f"{part.name}_exit", "matrix", source)]
 
 
 def _integrated(part: Part, attribute: str) -> Array:
@@ -345,9 +370,9 @@ def _corrector(part: Part) -> list[Place]:
     name, length, tilt = part.name, part.number("l"), part.number("tilt")
     x, y = part.number("hkick"), part.number("vkick")
     if part.keyword == "hkicker":
-        x = x or part.number("kick")
+        x = part.number("kick") or x
     elif part.keyword == "vkicker":
-        y = y or part.number("kick")
+        y = part.number("kick") or y
     cos, sin = math.cos(tilt), math.sin(tilt)
     if part.keyword in ("hkicker", "vkicker"):
         plane = "h" if part.keyword == "hkicker" else "v"
@@ -464,25 +489,17 @@ def _matrix(part: Part, ring: Ring) -> Place:
         case "dipedge":
             r[1, 0], r[3, 2] = edge_focusing(*map(part.number, ("h", "e1", "hgap", "fint")))
         case "srotation":
-            r[:4, :4] = _rotation(part.number("angle"))
+            r = rotation(part.number("angle"))
         case "solenoid":
             half, turn = part.number("ks") / 2, part.number("ksi") / 2
             r[1, 0] = r[3, 2] = -half * turn
-            r[:4, :4] = _rotation(turn) @ r[:4, :4]
+            r = rotation(turn) @ r
             turn = 0.0
     if turn:
-        rotation = np.eye(6)
-        rotation[:4, :4] = _rotation(turn)
-        r = rotation.T @ r @ rotation
+        r = rotation(-turn) @ r @ rotation(turn)
     source = ocelot.Matrix(l=part.number("l"), eid=part.name)
     source.r = r
     if "b" in part.values:
         source.b = np.asarray(part.values["b"], dtype=float).reshape(6, 1)
     kind: Kind = "solenoid" if part.keyword == "solenoid" else "matrix"
     return part.name, "wiggler" if "wig" in part.name.casefold() else kind, source
-
-
-def _rotation(angle: float) -> Array:
-    """Of (x, px, y, py), as seen by axes turned by `angle` from x towards y, [4, 4]."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.asarray(np.kron([[cos, sin], [-sin, cos]], np.eye(2)))

@@ -7,6 +7,9 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tmlattice.errors import LatticeError, first_of
 from tmlattice.lattice.ring import Element, Kind, number_names
 
@@ -16,6 +19,14 @@ NAMED = 3
 """Octupoles that a warning names."""
 Place = tuple[str, Kind, Any]
 """Family, kind and OCELOT element, before its name has a number."""
+
+
+def rotation(angle: float) -> NDArray[np.float64]:
+    """Coordinates seen by a magnet turned by `angle` (rad) from x towards y, [6, 6]."""
+    matrix = np.eye(6)
+    cos, sin = math.cos(angle), math.sin(angle)
+    matrix[:4, :4] = np.kron([[cos, sin], [-sin, cos]], np.eye(2))
+    return matrix
 
 
 def corrector(family: str, plane: Literal["h", "v"], length: float, kick: float = 0.0) -> Place:

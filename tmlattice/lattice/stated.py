@@ -4,7 +4,7 @@ The linear optics here is the product of OCELOT's matrices: a check of a reader,
 and sweeps of the package.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,10 @@ from tmlattice.lattice.source import copied
 
 Array = NDArray[np.float64]
 
-TUNES = 1e-3
-"""Both codes multiply the same linear maps, from ten digits: a tune agrees to 1e-6. A magnet that
-is lost or misread changes it by more than this in all but the weakest."""
+TUNES, TUNES_WITH_RF = 1e-4, 1e-3
+"""Both codes multiply the same linear maps: from five digits a tune agrees to 1e-5. A magnet that
+is lost or misread changes it by more than this in all but the weakest. Cavities that are on, where
+the dispersion is not zero, change the header's tunes; here they are off."""
 COMPACTION = 1e-2
 CHROMATICITY = (0.5, 0.1)
 """Absolute and relative; second-order maps of bends with gradients differ between codes by 7 %."""
@@ -40,6 +41,7 @@ class Stated:
         chromaticity: dQ / d pt, [2].
         compaction: momentum compaction.
         orbit: largest closed orbit, m.
+        tolerance: of the tunes.
     """
 
     length: float | None = None
@@ -47,9 +49,10 @@ class Stated:
     chromaticity: tuple[float, float] | None = None
     compaction: float | None = None
     orbit: float = 0.0
+    tolerance: float = TUNES
 
     @classmethod
-    def of_header(cls, header: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> "Stated":
+    def of_header(cls, header: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> "Stated":
         """Of a TWISS table. Its tunes are those of the design only where the orbit is straight."""
 
         def number(key: str) -> float | None:
@@ -65,11 +68,17 @@ class Stated:
 
         orbit = max([0.0, *(abs(float(row.get(k) or 0.0)) for row in rows for k in ("X", "Y")),
                      *(abs(number(k) or 0.0) for k in ("XCOMAX", "YCOMAX"))])  # fmt: skip
-        if orbit > STRAIGHT or number("DELTAP"):
+        if number("DELTAP"):
+            return cls(number("LENGTH"))
+        if orbit > STRAIGHT:
             return cls(number("LENGTH"), orbit=orbit)
         # of second order BV=-1 is not the reversed fields in MAD-X itself
         slopes = None if number("BV_FLAG") == -1 else pair("DQ1", "DQ2")
-        return cls(number("LENGTH"), pair("Q1", "Q2"), slopes, number("ALFA") or None)
+        rf = any(row.get("VOLT") for row in rows)
+        return cls(
+            number("LENGTH"), pair("Q1", "Q2"), slopes, number("ALFA") or None,
+            tolerance=TUNES_WITH_RF if rf else TUNES,
+        )  # fmt: skip
 
 
 def contradiction(ring: Ring, stated: Stated) -> str | None:
@@ -94,7 +103,7 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
         found, tunes = found[::-1], tunes[::-1]
     # by angles, so that a tune near 0 or 1/2 has the tolerance of any other
     away = np.abs(np.arccos(np.clip(found, -1, 1)) - np.arccos(np.clip(wanted, -1, 1)))
-    if (away / (2 * np.pi)).max() > TUNES:
+    if (away / (2 * np.pi)).max() > stated.tolerance:
         own = [q if np.sin(2 * np.pi * s) >= 0 else 1 - q
                for q, s in zip(tunes, stated.tunes, strict=True)]  # fmt: skip
         return f"its tunes are {_two(own)} (fractions), the header states {_two(stated.tunes)}"
@@ -128,6 +137,43 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
     return None
 
 
+def curvatures(ring: Ring, stated: Stated) -> list[float]:
+    """Curvatures (1/m) with which thin bends, all of one radius, give the tunes that are stated.
+
+    Args:
+        ring: with thin bends without a length; one of curvature h focuses as |angle| h.
+        stated: what the header says; without tunes there is none.
+    """
+    from scipy.optimize import brentq
+
+    ways, bends, total = [np.eye(4)], list[Array](), 0.0
+    for element, maps in zip(ring.elements, _maps_of_elements(ring), strict=True):
+        for _, r, _ in maps:
+            ways[-1] = r[:4, :4] @ ways[-1]
+        if element.kind == "multipole" and element.angle:
+            across = np.array([np.cos(element.tilt), 0.0, np.sin(element.tilt), 0.0])
+            bends.append(-abs(element.angle) * np.outer(np.roll(across, 1), across))
+            ways.append(np.eye(4))
+            total += abs(element.angle)
+    wanted = sum(np.cos(2 * np.pi * q) for q in stated.tunes or ())
+
+    def miss(curvature: float) -> float:
+        turn = ways[0]
+        for bend, way in zip(bends, ways[1:], strict=True):
+            turn = way @ (turn + curvature * (bend @ turn))
+        return float(np.trace(turn) / 2 - wanted)
+
+    if stated.tunes is None or not bends:
+        return []
+    # the bends are not longer than the ring, and not shorter than a fiftieth of it
+    grid = total / ring.length * np.geomspace(1.0, 50.0, 200)
+    values = [miss(h) for h in grid]
+    return [
+        float(brentq(miss, *grid[k : k + 2]))
+        for k in range(len(grid) - 1) if values[k] * values[k + 1] < 0
+    ]  # fmt: skip
+
+
 def _kicks(element: Element) -> bool:
     """Whether an element may bend the orbit off the design's."""
     corrector = element.kind in ("hcorrector", "vcorrector") and element.angle != 0
@@ -142,8 +188,12 @@ def _two(values: Iterable[float]) -> str:
 
 def _maps(ring: Ring) -> list[tuple[Array, Array, Array]]:
     """B, R, T of every element's parts, in beam order."""
+    return [own for parts in _maps_of_elements(ring) for own in parts]
+
+
+def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
     known: dict[Any, list[tuple[Array, Array, Array]]] = {}
-    chain: list[tuple[Array, Array, Array]] = []
+    chain: list[list[tuple[Array, Array, Array]]] = []
     for element in ring.elements:
         own = vars(element.source.element).values()
         key: Any = (
@@ -155,7 +205,7 @@ def _maps(ring: Ring) -> list[tuple[Array, Array, Array]]:
             key = id(element.source)
         if key not in known:
             known[key] = _parts(element, ring.map_energy)
-        chain += known[key]
+        chain.append(known[key])
     return chain
 
 

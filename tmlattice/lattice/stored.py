@@ -7,6 +7,7 @@ that depends on nothing but itself, as far as its text shows: `depends_on_nothin
 import ast
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +65,15 @@ def key_of(path: Path, sequence: str | None, energy: float | None) -> str | None
 
 def load(key: str, name: str) -> Ring | None:
     """The ring that is kept under this key, if one is."""
-    content = cache.load(key)
-    if content is None:
-        return None
+    ring = cache.load(key, partial(_read, name))
+    if ring is not None:
+        ring.memory[KEPT] = key
+    return ring
+
+
+def _read(name: str, content: bytes) -> Ring:
     kept = json.loads(content)
+    _check(kept)
     definitions = [(*numbers, Source(text)) for *numbers, text in kept["definitions"]]
     elements = []
     start = 0.0
@@ -77,10 +83,22 @@ def load(key: str, name: str) -> Ring | None:
         s = start + length / 2
         elements.append(Element(own, family, kind, s, length, k1, k2, angle, tilt, source))
         start += length
-    ring = Ring(name, tuple(elements), kept["energy"], kept["changes"], kept["mass"],
-                kept.get("supplies"), kept.get("model", "design"))  # fmt: skip
-    ring.memory[KEPT] = key
-    return ring
+    return Ring(name, tuple(elements), kept["energy"], kept["changes"], kept["mass"],
+                kept["supplies"], kept["model"])  # fmt: skip
+
+
+def _check(kept: Any) -> None:
+    """Refuse what `save` does not write: elements are made of it without another look."""
+    number, maybe, text = int | float, int | float | None, str
+    forms: list[tuple[Any, Any]]
+    forms = [(kept["energy"], maybe), (kept["mass"], maybe), (kept["model"], text)]
+    forms += [(family, text) for family in kept["families"]]
+    for own in kept["definitions"]:
+        forms += zip(own, (text, *[number] * 5, text), strict=True)
+    for groups in (kept["changes"], kept["supplies"] or {}):
+        forms += [(group, dict | list) for group in groups.values()]
+    if not all(isinstance(value, form) for value, form in forms) or min(kept["sequence"]) < 0:
+        raise TypeError("an element is described in another way")
 
 
 def save(key: str, ring: Ring) -> None:

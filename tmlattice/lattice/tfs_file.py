@@ -4,7 +4,8 @@ Columns that are needed: NAME, KEYWORD, S (at each element's exit, or in its mid
 hold fields are read where they are there: ANGLE, E1, E2, H1, H2, HGAP, FINT, FINTX, TILT; the
 integrated strengths K0L to K3L and K0SL to K3SL; LRAD; KS, KSI; HKICK, VKICK; VOLT (MV), FREQ
 (MHz). What lies between two elements is a drift. Recent versions of MAD-X write an RBEND's E1 and
-E2 with the half angle, earlier ones without: the header's tunes decide.
+E2 with the half angle, earlier ones without: the header's tunes decide. Without the column LRAD
+thin bends have none, as in MAD-X, or the one bending radius that gives the header's tunes.
 """
 
 import math
@@ -15,7 +16,7 @@ from typing import Any
 from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.parts import MODELLED, Part, Report, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
-from tmlattice.lattice.stated import Stated, contradiction
+from tmlattice.lattice.stated import Stated, contradiction, curvatures
 
 NEEDED = ("NAME", "KEYWORD", "S", "L")
 CLOSE, DIGITS = 1e-6, 2e-9
@@ -73,14 +74,36 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     if _number(header, "BV_FLAG") == -1:  # all but the faces are of the reversed fields
         rows = [row | {e: -row[e] for e in ("E1", "E2") if row.get(e)} for row in rows]
     stated = Stated.of_header(header, rows)
-    first = ""
-    for half in _readings(rows):
+    columns = frozenset(table.columns)
+    _check_columns(path, rows, columns)
+    thin = "LRAD" not in columns and any(map(_bends_thinly, rows))
+
+    def read(half: bool, curvature: float) -> tuple[Ring, list[warnings.WarningMessage]]:
+        own = [
+            row | {"LRAD": abs(_first_strength(row)) / curvature}
+            if curvature and _bends_thinly(row) else row for row in rows
+        ]  # fmt: skip
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             report = Report()
-            parts = _with_drifts(path, rows, stated.length, half, report)
-            ring = ring_of_parts(parts, name, energy, mass, charge, report)
+            parts = _with_drifts(path, own, stated.length, half, report)
+            if curvature:
+                warnings.warn(
+                    f"'{path}' has thin bends and no column LRAD: the header's tunes give them a "
+                    f"bending radius of {1 / curvature:.6g} m",
+                    stacklevel=4,
+                )
+            return ring_of_parts(parts, name, energy, mass, charge, report), caught
+
+    first = ""
+    for half in _readings(rows):
+        ring, caught = read(half, 0.0)
         found = contradiction(ring, stated)
+        if found is not None and thin:
+            others = [read(half, curvature) for curvature in curvatures(ring, stated)]
+            agreeing = [other for other in others if contradiction(other[0], stated) is None]
+            if len(agreeing) == 1:
+                (ring, caught), found = agreeing[0], None
         if found is None:
             for w in caught:
                 warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
@@ -98,13 +121,37 @@ def _readings(rows: list[Row]) -> list[bool]:
     return [not whole, whole]
 
 
+def _first_strength(row: Row) -> float:
+    return float(row.get("K0L") or row.get("ANGLE") or 0.0)
+
+
+def _bends_thinly(row: Row) -> bool:
+    return str(row["KEYWORD"]).upper() == "MULTIPOLE" and _first_strength(row) != 0
+
+
+NEEDED_BY = {
+    "QUADRUPOLE": ("K1L",), "SEXTUPOLE": ("K2L",), "SBEND": ("ANGLE", "K0L"),
+    "RBEND": ("ANGLE", "K0L"), "SOLENOID": ("KS", "KSI"), "MULTIPOLE": ("K1L", "K2L"),
+}  # fmt: skip
+"""Without any of these columns the elements of a class would be read as drifts."""
+
+
+def _check_columns(path: Path, rows: list[Row], columns: frozenset[str]) -> None:
+    """Raises a LatticeError where an element's fields are in none of the columns."""
+    for row in rows:
+        keyword = str(row["KEYWORD"]).upper()
+        needed = NEEDED_BY.get(keyword, ())
+        if needed and not columns & set(needed):
+            raise LatticeError(
+                f"'{path}' has the {keyword} '{plain(str(row['NAME']), 60)}' and no column "
+                f"{' or '.join(needed)}; write the table with it"
+            )
+
+
 def _advice(columns: Any, rows: list[Row]) -> str:
-    thin = any(
-        str(r["KEYWORD"]).upper() == "MULTIPOLE" and (r.get("K0L") or r.get("ANGLE")) for r in rows
-    )
-    if thin and "LRAD" not in columns:
+    if any(map(_bends_thinly, rows)) and "LRAD" not in columns:
         return "its thin bends focus by their length, which it does not state: add the column LRAD"
-    known = ("K0L", "K1L", "K2L", "K0SL", "K1SL", "TILT", "E1", "E2", "FINT", "HGAP")
+    known = ("ANGLE", "K0L", "K1L", "K2L", "K0SL", "K1SL", "TILT", "E1", "E2", "FINT", "HGAP")
     lacks = [column for column in known if column not in columns]
     rest = f" and the columns {', '.join(lacks)}" if lacks else ""
     return f"write it of the whole ring, with all elements{rest}"
@@ -152,14 +199,16 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         value = row.get(attribute.upper())
         if value is not None and math.isfinite(float(value)):
             own[attribute] = float(value)
-    if keyword == "matrix":
+    if keyword in ("matrix", "dipedge"):
         raise LatticeError(
-            f"'{path}' has the MATRIX '{plain(name, 60)}', whose entries a table does not hold; "
-            "give the sequence instead"
+            f"'{path}' has the {keyword.upper()} '{plain(name, 60)}', whose numbers a table does "
+            "not hold; give the sequence instead"
         )
     if keyword == "beambeam":  # no column has its charge; the header's tunes have what it does
         own["charge"] = 0.0
         report.left_out("what the BEAMBEAM does", name)
+    if keyword in ("sbend", "rbend") and "ANGLE" not in row:  # of early versions
+        own["angle"] = float(row.get("K0L") or 0.0)
     if keyword == "rbend":
         keyword = "sbend"
         if half:
@@ -173,7 +222,7 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         values = [float(row.get(column.format(n)) or 0.0) for n in ORDERS]
         if keyword == "sbend" and attribute == "knl":
             field, values[0] = values[0], 0.0
-            if field:  # the whole field, where it is not that of the angle
+            if field and "ANGLE" in row:  # the whole field, where it is not that of the angle
                 own["k0"] = field / length
         elif keyword == "sbend" and any(values):
             report.left_out("skew fields of the SBEND (as in MAD-X's TWISS)", name)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.lattice.at_file import quiet_at
+from tmlattice.lattice.places import rotation
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -45,14 +46,6 @@ def at_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
             line, name=name, energy=ring.energy * 1e9, particle=particle, periodicity=1
         )
     return lattice, tuple(f"{what} ({count} elements)" for what, count in left_out.items())
-
-
-def rotation(angle: float) -> Array:
-    """Coordinates seen by a magnet turned by `angle` from x towards y, [6, 6]."""
-    matrix = np.eye(6)
-    cos, sin = math.cos(angle), math.sin(angle)
-    matrix[:4, :4] = np.kron([[cos, sin], [-sin, cos]], np.eye(2))
-    return matrix
 
 
 def first_order(element: Element, energy: float) -> Array:

@@ -5,6 +5,7 @@ Every class is in one of three lists: modelled; without effect on the static opt
 (`ACTING`). So is every field of a class that is modelled.
 """
 
+import cmath
 import json
 import math
 import re
@@ -79,6 +80,7 @@ NO_EFFECT = frozenset({
 })  # fmt: skip
 """Fields without effect on the optics, or on which another field's meaning depends."""
 SLICE = re.compile(r"(Thick|Thin|Drift)Slice(\w*?)(Entry|Exit)?")
+BENDS = ("Bend", "RBend", "CombinedFunctionMagnet", "Magnet")
 MAIN = {"Bend": "k0", "RBend": "k0", "CombinedFunctionMagnet": "k0", "Quadrupole": "k1",
         "Sextupole": "k2", "Octupole": "k3"}  # fmt: skip
 MOST_KICKS = 1000
@@ -457,7 +459,7 @@ class _Reader:
 
     def _classes(self) -> dict[str, Callable[[_Fields, str, str], list[Part]]]:
         return {
-            **dict.fromkeys(("Bend", "RBend", "CombinedFunctionMagnet"), self._bend),
+            **dict.fromkeys(BENDS[:3], self._bend),
             **dict.fromkeys(("Quadrupole", "Sextupole", "Octupole", "Magnet"), self._straight),
             "Multipole": self._multipole,
             "SimpleThinBend": self._multipole,
@@ -496,11 +498,21 @@ class _Reader:
                 )
         if fields.number("delta_taper"):
             self.report.left_out("delta_taper", fields.name)
-        return {
+        moved = {
             "dx": fields.number("shift_x"), "dy": fields.number("shift_y"),
             "ds": fields.number("shift_s"), "tilt": fields.number("rot_s_rad"),
             "dpsi": fields.number("rot_s_rad_no_frame"),
         }  # fmt: skip
+        anchor = fields.number("rot_shift_anchor")
+        if anchor and fields.cls in BENDS:  # along the axes there, which are turned
+            bend = _Bend(fields, self)
+            turn = cmath.exp(1j * bend.curvature * anchor)
+            frame = cmath.exp(1j * moved["tilt"])
+            aside = complex(moved["dx"], moved["dy"]) / frame
+            along = complex(aside.real, moved["ds"]) * turn
+            aside = complex(along.real, aside.imag) * frame
+            moved |= {"dx": aside.real, "dy": aside.imag, "ds": along.imag}
+        return moved
 
     def _strengths(self, fields: _Fields, length: float, dipole: float) -> tuple[Array, Array]:
         """Integrated normal and skew strengths of each order, four at least.
@@ -535,14 +547,14 @@ class _Reader:
         if sliced is None or sliced[1] == "Drift" or parent.cls in PASSIVE:
             return [_passive(name, weight * _way_of(parent))]
         if sliced[3]:
-            if parent.cls not in ("Bend", "RBend", "CombinedFunctionMagnet", "Magnet"):
+            if parent.cls not in BENDS:
                 return [_passive(name, 0.0)]
             bend = _Bend(parent, self)
             edge = bend.edges()[sliced[3] == "Exit"]
             parts = edge(name, where)
         elif sliced[1] == "Thin":
             parts = self._thin_slice(parent, name, where, weight)
-        elif parent.cls in ("Bend", "RBend", "CombinedFunctionMagnet"):
+        elif parent.cls in BENDS[:3]:
             parts = [_Bend(parent, self).body(name, where, weight)]
         elif parent.cls in ("Cavity", "CrabCavity"):
             parts = self._cavity(parent, name, where, weight)
@@ -568,7 +580,7 @@ class _Reader:
             return [Part(p.name, p.keyword, {**p.values, "l": 0.0}, where) for p in parts]
         length = _way_of(parent)
         values: dict[str, Any] = {"angle": 0.0}
-        if parent.cls in ("Bend", "RBend", "CombinedFunctionMagnet", "Magnet"):
+        if parent.cls in BENDS:
             bend = _Bend(parent, self)
             values["angle"] = weight * bend.angle
             dipole = bend.dipole
@@ -585,8 +597,11 @@ class _Reader:
         return bend.whole(name, where)
 
     def _few_kicks(self, fields: _Fields, name: str) -> None:
-        exact = ("adaptive", "mat-kick-mat", "mat-kick-mat-exact", "full", "0", "expanded")
-        if fields.number("num_multipole_kicks") and fields.word("model", "adaptive") not in exact:
+        model, rule = fields.word("model", "adaptive"), fields.word("integrator", "adaptive")
+        exact = ["mat-kick-mat", "mat-kick-mat-exact", "expanded"]
+        if rule not in ("uniform", "teapot"):
+            exact += ["adaptive", "full", "0"]
+        if fields.number("num_multipole_kicks") and model not in exact:
             self.report.left_out("the finite number of kicks", name)
 
     def _straight(self, fields: _Fields, name: str, where: str) -> list[Part]:

@@ -14,6 +14,7 @@ from tmlattice.effects.build import Build, Where
 from tmlattice.effects.radiation import expected_loss as loss_of
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.combined import bend_matrix
+from tmlattice.lattice.places import rotation
 from tmlattice.lattice.ring import Element, Ring
 
 Array = NDArray[np.float64]
@@ -71,6 +72,12 @@ def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
     return float(C_GAMMA * energy**4 / (2 * np.pi) * (bends * bent + wigglers * wiggled))
 
 
+def _kick(element: Element) -> dict[str, Array]:
+    """What a matrix element adds to the coordinates behind it, as AT has it."""
+    kick = np.ravel(getattr(element.source, "b", np.zeros(6))).astype(float)[SWAPPED]
+    return {"T2": kick} if kick.any() else {}
+
+
 def _matrix(element: Element, energy: float) -> Array:
     """The design's matrix of a matrix element or undulator in AT's coordinates, [6, 6].
 
@@ -79,10 +86,10 @@ def _matrix(element: Element, energy: float) -> Array:
     """
     source, length = element.source, element.length
     if hasattr(source, "r"):
-        if np.any(source.t) or np.any(source.b) or source.delta_e:
+        if np.any(source.t) or source.delta_e:
             raise LatticeError(
-                f"matrix '{element.name}' has a kick, a second order or an energy gain, which AT's "
-                "matrix has not; take them out of the lattice file"
+                f"matrix '{element.name}' has a second order or an energy gain, which AT's matrix "
+                "has not; take them out of the lattice file"
             )
         return np.asarray(source.r, dtype=float)[np.ix_(SWAPPED, SWAPPED)]
     matrix = np.eye(6)
@@ -105,15 +112,6 @@ def _turned(wrong: Build, angle: float) -> list[float]:
         float(cosine * wrong.kick_x - sine * wrong.kick_y),
         float(sine * wrong.kick_x + cosine * wrong.kick_y),
     ]
-
-
-def _rotation(angle: float) -> Array:
-    """Coordinates seen by a magnet turned by `angle` from x towards y, [6, 6]."""
-    matrix = np.eye(6)
-    matrix[:4, :4] = np.kron(
-        [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], np.eye(2)
-    )
-    return matrix
 
 
 def errors_of(element: Element, energy: float) -> Build:
@@ -240,7 +238,7 @@ class Builder:
             shift = np.array([wrong.dx, 0, wrong.dy, 0, 0, 0])
             more |= {"T1": -shift, "T2": shift}
         if angle:
-            more |= {"R1": _rotation(angle), "R2": _rotation(-angle)}
+            more |= {"R1": rotation(angle), "R2": rotation(-angle)}
         source = element.source
         skew = [0.0] * len(normal)
         combined = type(source).__name__ == "CombinedMultipole"
@@ -295,7 +293,7 @@ class Builder:
         factorials = np.cumprod([1, *range(1, len(strengths))])
         more = {}
         if element.tilt:
-            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
+            more = {"R1": rotation(element.tilt), "R2": rotation(-element.tilt)}
         zero = np.zeros(len(strengths))
         return [at.ThinMultipole(element.name, zero, strengths / factorials, **more)]
 
@@ -322,7 +320,7 @@ class Builder:
         steps = self.steps if k1 or element.k2 else 4
         more: dict[str, Any] = {}
         if element.tilt:
-            more = {"R1": _rotation(element.tilt), "R2": _rotation(-element.tilt)}
+            more = {"R1": rotation(element.tilt), "R2": rotation(-element.tilt)}
 
         def body(share: float, **edges: float) -> Any:
             return at.Dipole(
@@ -364,7 +362,7 @@ class Builder:
 
     def _matrix(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         matrix = np.asfortranarray(_matrix(element, self.energy))
-        return [at.M66(element.name, matrix, Length=element.length)]
+        return [at.M66(element.name, matrix, Length=element.length, **_kick(element))]
 
     def _wiggler(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         middle = self._thin(element, wrong, "middle")
@@ -373,8 +371,9 @@ class Builder:
         if not middle:
             return self._matrix(element, wrong, setting)
         root = np.asfortranarray(np.real(sqrtm(_matrix(element, self.energy))))
-        half = at.M66(element.name, root, Length=element.length / 2)
-        return [half, *middle, half]
+        half = {"m66": root, "Length": element.length / 2}
+        first, last = at.M66(element.name, **half), at.M66(element.name, **half, **_kick(element))
+        return [first, *middle, last]
 
     def _loss(self, element: Element) -> list[Any]:
         """delta -> delta - u (1 + 2 delta), and px, py in proportion to the momentum.

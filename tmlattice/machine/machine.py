@@ -4,8 +4,7 @@ import logging
 import pickle
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures import Future
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,7 +16,7 @@ from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.shots import Shots, stream
-from tmlattice.workers import Caught, caught, heard
+from tmlattice.workers import Caught, Processes, heard
 
 Array = NDArray[np.float64]
 
@@ -172,29 +171,28 @@ class Machine:
             return
         # as bytes: the process must silence OCELOT's greeting before it unpickles elements
         setup = pickle.dumps((self.ring, self.causes, self._made_of, shots, turns, seed))
-        size = min(jobs, len(chunks))
-        with ProcessPoolExecutor(size, get_context("spawn"), _start, (setup,)) as pool:
+        with Processes(_Reader(setup), min(jobs, len(chunks))) as processes:
             waiting: deque[Future[Caught]] = deque()
             for chunk in chunks:  # no more in flight than the processes need
-                waiting.append(pool.submit(caught, _work, chunk))
+                waiting.append(processes.submit(chunk))
                 if len(waiting) > 2 * jobs:
                     yield heard(waiting.popleft().result())
             while waiting:
                 yield heard(waiting.popleft().result())
 
 
-_worker: tuple[Machine, Shots, int, int] | None = None
+class _Reader:
+    """Readings of some shots in another process, which makes the machine once."""
 
+    def __init__(self, setup: bytes) -> None:
+        self._setup = setup
+        self._machine: tuple[Machine, Shots, int, int] | None = None
 
-def _start(setup: bytes) -> None:
-    global _worker
-    import tmlattice.lattice.ocelot  # noqa: F401
+    def __call__(self, chunk: range) -> Array:
+        if self._machine is None:
+            import tmlattice.lattice.ocelot  # noqa: F401
 
-    ring, causes, made_of, shots, turns, seed = pickle.loads(setup)
-    _worker = (Machine(ring, causes, **made_of), shots, turns, seed)
-
-
-def _work(chunk: range) -> Array:
-    assert _worker is not None
-    machine, shots, turns, seed = _worker
-    return machine._read(shots, chunk, turns, seed)
+            ring, causes, made_of, shots, turns, seed = pickle.loads(self._setup)
+            self._machine = (Machine(ring, causes, **made_of), shots, turns, seed)
+        machine, shots, turns, seed = self._machine
+        return machine._read(shots, chunk, turns, seed)

@@ -9,7 +9,7 @@ import io
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -299,9 +299,9 @@ def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -
         ValueError: another dimension.
     """
     key = cache.key("maps", ring.memory[KEPT], dimension) if KEPT in ring.memory else None
-    content = cache.load(key) if key else None
-    if content is not None:
-        return _read(ring, content)
+    kept = cache.load(key, partial(_read, ring, dimension)) if key else None
+    if kept is not None:
+        return kept
     maps = _made(ring, dimension, LayerMaps(ring, dimension) if layers is None else layers)
     if key:
         cache.save(key, _written(maps))
@@ -340,14 +340,23 @@ def _written(maps: RingMaps) -> bytes:
     return content.getvalue()
 
 
-def _read(ring: Ring, content: bytes) -> RingMaps:
+def _read(ring: Ring, dimension: int, content: bytes) -> RingMaps:
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        return RingMaps(
+        maps = RingMaps(
             layers=tuple(e.name for e in ring.magnets),
             monitors=tuple(e.name for e in ring.monitors),
             closing=TaylorMap([arrays[f"arr_{degree}"] for degree in range(3)]),
             **{name: arrays[name] for name in _KEPT},
         )
+    magnets, monitors = len(maps.layers), len(maps.monitors)
+    orders = (dimension,), (dimension, dimension), (dimension, dimension * (dimension + 1) // 2)
+    shapes = [(magnets,)] + [(magnets, *order) for order in orders]
+    shapes += [(monitors,)] * 2 + [(monitors, 2, *order[1:]) for order in orders]
+    for name, shape in zip(_KEPT, shapes, strict=True):
+        cache.check_form(getattr(maps, name), shape, magnets + 1 if name == "at" else None)
+    for own, shape in zip(maps.closing.coefficients, orders, strict=True):
+        cache.check_form(own, shape)
+    return maps
 
 
 def _made(ring: Ring, dimension: int, layers: LayerMaps) -> RingMaps:

@@ -32,6 +32,7 @@ from tmlattice.measurement.trajectory import (
 )
 from tmlattice.measurement.tune_reading import TuneReading
 from tmlattice.measurement.turn_by_turn import TurnByTurn
+from tmlattice.temporaries import locked
 
 Array = NDArray[np.float64]
 
@@ -94,14 +95,15 @@ def read_measurement(
     file = folder / "measurement.json"
     if not file.is_file():
         raise MeasurementError(f"no '{file}'; a measurement folder has one")
-    document = read_document(file, "measurement", FORMAT, first=partial(_check_number, file))
-    kind = document["kind"]
-    if kind in KINDS:
-        measured: AnyMeasurement = KINDS[kind].read(file, document, monitors)
-        check_table(document, file.with_name(KINDS[kind].table))
-        return measured
-    read = _trajectory if kind == "trajectory" else _orbit_response
-    return read(file, document, monitors)
+    with locked(folder, shared=True):  # of one output, whoever writes there
+        document = read_document(file, "measurement", FORMAT, first=partial(_check_number, file))
+        kind = document["kind"]
+        if kind in KINDS:
+            measured: AnyMeasurement = KINDS[kind].read(file, document, monitors)
+            check_table(document, file.with_name(KINDS[kind].table))
+            return measured
+        read = _trajectory if kind == "trajectory" else _orbit_response
+        return read(file, document, monitors)
 
 
 def _check_number(file: Path, document: dict[str, Any]) -> None:

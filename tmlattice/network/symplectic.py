@@ -13,21 +13,20 @@ learning of dynamical systems, for the penalty in one plane.
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from tmlattice.beam.threads import share
+from tmlattice.compiled import jit
 
 Array = NDArray[np.float64]
 
 _LANES = 32  # layers side by side: their matrices together stay in the first cache
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 
 
-@_jit
+@jit
 def _gather(size, first, count, W1, W2, G):  # type: ignore[no-untyped-def]
     """G [n + 1, n, n, lane] of the layers first to first + count - 1; zeros beyond."""
     n = len(size)
@@ -45,7 +44,7 @@ def _gather(size, first, count, W1, W2, G):  # type: ignore[no-untyped-def]
                     m += 1
 
 
-@_jit
+@jit
 def _coefficient(size, signs, G, u, v, first, count, design, M):  # type: ignore[no-untyped-def]
     """M [b, c, lane], b < c: the coefficient of x_u x_v (x_0 = 1) in J^T S J - S, less the design's
     where one is given (an array with layers)."""
@@ -80,7 +79,7 @@ def _coefficient(size, signs, G, u, v, first, count, design, M):  # type: ignore
             entry += 1
 
 
-@_jit
+@jit
 def _coefficients(size, signs, W1, W2, design, out):  # type: ignore[no-untyped-def]
     """Fill out [layer, pair (u, v), entry (b < c)]."""
     n = len(size)
@@ -102,7 +101,7 @@ def _coefficients(size, signs, W1, W2, design, out):  # type: ignore[no-untyped-
                 pair += 1
 
 
-@_jit
+@jit
 def _squares(first_tile, last_tile, size, signs, W1, W2, design, parts):  # type: ignore[no-untyped-def]
     """Fill parts [layer, degree]: sums of squares of the coefficients by degree 0, 1, 2."""
     n = len(size)
@@ -127,7 +126,7 @@ def _squares(first_tile, last_tile, size, signs, W1, W2, design, parts):  # type
                 parts[first + lane, degree] = sums[degree, lane]
 
 
-@_jit
+@jit
 def _pull(first_tile, last_tile, size, signs, W1, W2, design, pulls, g1, g2):  # type: ignore[no-untyped-def]
     """Carry d loss / d parts, pulls [layer, degree], back to g1, g2 (added)."""
     n = len(size)
@@ -167,7 +166,7 @@ def _pull(first_tile, last_tile, size, signs, W1, W2, design, pulls, g1, g2):  #
                         m += 1
 
 
-@_jit
+@jit
 def _back(size, signs, A, G, D):  # type: ignore[no-untyped-def]
     """D [n, n, lane] += S G A^T, for an antisymmetric A with zeros on its diagonal."""
     n = len(size)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.inference.judge import Half, Judged, other_half
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit
@@ -29,6 +29,8 @@ Flags = NDArray[np.bool_]
 
 COORDINATES = 2
 """Of a launch in one plane."""
+MANY = 10
+"""Fixed causes that are worth a model of their own."""
 STEPS = 24
 """Of a fit of launches, at most: in a plane without readings they act by their squares."""
 
@@ -81,6 +83,15 @@ class FirstTurns(Problem):
     def free(self) -> int:
         """Coordinates that are not known exactly."""
         return self.data.shots * len(self.whitening.columns)
+
+    def standing(self, causes: Sequence[Cause]) -> "FirstTurns":
+        """With errors of magnets and monitors in the model itself, where there are many: each
+        trajectory would build all these magnets again."""
+        built = [c for c in causes if isinstance(find(c.effect), RingEffect | ReadingEffect)]
+        if len(built) < MANY:
+            return super().standing(causes)
+        rest = [c for c in causes if not isinstance(find(c.effect), RingEffect | ReadingEffect)]
+        return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Trajectories and what they leave; `view` is their `Paths`."""

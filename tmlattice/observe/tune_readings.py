@@ -17,16 +17,24 @@ from tmlattice.observe.stored import Stored, rf_of, stacked
 Array = NDArray[np.float64]
 
 DELTA = 5e-4
-"""Energy deviation on both sides of the nominal one, of the difference that is the chromaticity."""
+"""Energy deviation dE / p0 c on both sides of the nominal one, of the difference that is the
+chromaticity."""
 
 TUNE, CHROMATICITY = 1e-4, 0.1
 """Errors where none is stated: a tune's by what currents drift in minutes, a chromaticity's by what
 that makes of steps of a per mil."""
 
+WIDER = 0.01
+"""Relative change of all gaps of bends, of the difference that is the tunes' slope."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TuneReadings(Stored):
-    """Tunes and chromaticities, [shot, (Qx, Qy, Q'x, Q'y)]."""
+    """Tunes and chromaticities, [shot, (Qx, Qy, Q'x, Q'y)].
+
+    Attributes:
+        energies: difference of the relative momentum deviation of the two outer states.
+    """
 
     energies: float
 
@@ -48,7 +56,8 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     settings: tuple[Settings, ...] = measured.settings or ({},) * shots
     model = ResponseModel(ring)
     step = abs(DELTA / model.rf_start[5])
-    energies = 2 * step * float(model.rf_start[5])
+    # delta is the relative deviation of the momentum, p that of the energy over p0 c: beta delta
+    energies = 2 * step * float(model.rf_start[5]) / ring.beta
     design = np.array(
         [StoredBeam(ResponseModel(apply(ring, (), one), 6, rf_of(one))).tunes for one in settings]
     )
@@ -61,6 +70,7 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
         [_filled(measured.tune_error, TUNE, shots),
          _filled(measured.chromaticity_error, CHROMATICITY, shots)], axis=1
     )  # fmt: skip
+    errors[:, 2:] = np.hypot(errors[:, 2:], fringe_uncertainty(ring))
     there = np.isfinite(data)
     return TuneReadings(
         ring=ring,
@@ -72,6 +82,27 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
         places=places,
         energies=energies,
     )
+
+
+def fringe_uncertainty(ring: Ring) -> Array:
+    """Return by how much the model's chromaticities are uncertain for fringe fields, [mode].
+
+    The extent of a bend's fringe field (gap g, field integral K, curvature h) changes the vertical
+    focusing of an edge by K g h^2. By the equations of motion that share falls with the momentum.
+    The second-order maps, as MAD-X, keep it, and in AT's exact bends it rises with the momentum.
+    The chromaticities differ by dQ / d ln g, all gaps together.
+
+    Raises:
+        UnstableRingError: the ring, or the ring with other gaps, stores no beam.
+    """
+    bends = {i: e for i, e in enumerate(ring.elements) if e.kind == "bend" and e.source.gap}
+    if not bends:
+        return np.zeros(2)
+    wider = {i: e.changed(gap=(1 + WIDER) * e.source.gap) for i, e in bends.items()}
+    before, after = (
+        StoredBeam(ResponseModel(own)).tunes for own in (ring, ring.with_elements(wider))
+    )
+    return np.asarray(((after - before + 0.5) % 1.0 - 0.5) / WIDER)
 
 
 def _filled(errors: Array | None, usual: float, shots: int) -> Array:

@@ -1,0 +1,63 @@
+"""Chromaticities as a reading: fringe fields of bends, and particles slower than light.
+
+The referee is AT, whose exact bends let the focusing of a fringe field rise with the momentum; in
+the second-order maps it does not change. ThomX, which AT ships, has bends of 0.35 m radius, for
+which the vertical chromaticities differ by 0.65.
+"""
+
+from pathlib import Path
+
+import machine_data
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause, diagnose, load_ring
+from tmlattice.beam.chain import Chain
+from tmlattice.machine.stored_beam import simulate_tunes
+from tmlattice.observe.tune_readings import fringe_uncertainty
+from tmlattice.optics import off_momentum
+
+
+@pytest.fixture(scope="module")
+def thomx():
+    return load_ring(Path(machine_data.__file__).parent / "thomx.m")
+
+
+def test_the_uncertainty_is_the_difference_to_ats_exact_bends(thomx):
+    own = off_momentum(Chain.from_ring(thomx, 6), thomx.length).chromaticity
+    ats = simulate_tunes(thomx, noise=(0.0, 0.0)).measured.chromaticity[0]
+    assert_allclose(fringe_uncertainty(thomx), ats - own, atol=0.02)
+    assert abs(ats - own)[1] > 0.5
+
+
+def test_without_gaps_there_is_none(small_ring):
+    assert_allclose(fringe_uncertainty(small_ring), 0.0, atol=1e-12)
+
+
+def test_chromaticity_of_a_healthy_ring_is_no_fault(thomx):
+    read = simulate_tunes(thomx, seed=1).measured
+    assert diagnose(thomx, read).verdict == "nothing"
+
+
+def test_a_reversed_sextupole_is_still_seen(thomx):
+    fault = Cause("sextupole_strength", "sx1::1", -2.0)
+    found = diagnose(thomx, simulate_tunes(thomx, [fault], seed=1).measured)
+    assert found.findings
+    effects = [m.effect for m in found.findings[0].credible_set]
+    assert "sextupole_strength" in effects
+
+
+def test_chromaticity_of_slow_particles_is_per_momentum(tmp_path):
+    """The maps have the energy dE / p0 c, which is beta times the momentum's deviation."""
+    sequence = tmp_path / "slow.seq"
+    sequence.write_text(
+        "beam, particle=proton, energy=0.98;\n"
+        "qf: quadrupole, l=0.5, k1=1.0; qd: quadrupole, l=0.5, k1=-1.0;\n"
+        "b: sbend, l=1.0, angle=twopi/16; m: monitor; c: hkicker;\n"
+        "cell: line=(m, qf, dr, b, dr, c, qd, dr, b, dr); dr: drift, l=0.5;\n"
+        "ring: line=(8*cell);\nuse, sequence=ring;\n"
+    )
+    ring = load_ring(sequence)
+    assert ring.beta < 0.4
+    read = simulate_tunes(ring, noise=(2e-5, 0.01), seed=1).measured
+    assert diagnose(ring, read).verdict == "nothing"
