@@ -46,7 +46,7 @@ from tmlattice.observe.split import split_columns
 
 STEP = -2000.0
 """Hz."""
-WITHOUT = [step for step in FAMILIES if not isinstance(step.families[0], HorizontalKicks)]
+WITHOUT = [own for own in FAMILIES if not isinstance(own, HorizontalKicks)]
 
 
 def simulated(ring, causes, **how):

@@ -19,7 +19,7 @@ from tmlattice.report.response_text import pulled_apart_texts
 
 WITHOUT = FAMILIES[:4]
 """Calibrations, gains, gradients."""
-WITH = [*WITHOUT, *(step for step in FAMILIES if isinstance(step.families[0], HorizontalKicks))]
+WITH = [*WITHOUT, HorizontalKicks()]
 
 
 def gradients():
