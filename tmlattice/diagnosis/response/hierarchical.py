@@ -21,18 +21,11 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.steps import FAMILIES, SECOND
-from tmlattice.diagnosis.response.exchanged import exchanged
+from tmlattice.diagnosis.response.exchanged import exchanged, mislabelled
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.judges import Chi2, Score, against, inner, lost, score
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.outliers import (
-    STEP,
-    beside_own,
-    good_monitors,
-    misfits,
-    outliers,
-    without,
-)
+from tmlattice.diagnosis.response.outliers import good_monitors, outliers, without
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import Outcome, State, allow, begin, bend, forbid, jump
 from tmlattice.errors import TmlatticeError
@@ -150,19 +143,16 @@ def fit_families(
     late = [f for f in there if f.name in SECOND]
     progress("all families")
     state = allow(begun(design, there), [f for f in there if f not in late])
-    kinds = tuple(kind for kind in state.noise.kinds if kind != WAVES)
-    state = replace(state, noise=replace(state.noise, kinds=kinds))
     state = settle(bend(jump(state)), gain=LEADS, alike=True)
-    swapped = {name for pair in exchanged(state, _far_off(state)) for name in pair}
-    odd = outliers(state, swapped)
-    state, design = without(state, odd.unread), without(design, odd.unread)
-    messages = list(odd.messages)
     progress("misfits of columns and BPMs")
     state = settle(bend(jump(allow(state, late))), gain=LEADS)
-    state = replace(state, good=good_monitors(state))
+    swapped = {name for pair in exchanged(state, mislabelled(state)) for name in pair}
+    odd = outliers(state, swapped)
+    messages = list(odd.messages)
+    state, design = without(state, odd.unread), without(design, odd.unread)
     refused: list[Step] = []
-    fewer = _undoubted(state, messages, refused)
-    state = state if fewer is state else settle(fewer, gain=LEADS)
+    state = _undoubted(replace(state, good=good_monitors(state)), messages, refused)
+    state = settle(state, gain=LEADS)
     split = state.split
     before = score(design, split.held)
     steps = [Step.scored("design", 0, before)]
@@ -251,10 +241,3 @@ def _undoubted(state: State, messages: list[str], refused: list[Step]) -> State:
     messages += doubts.values()
     refused += [_refused(state, family) for family in doubts]
     return forbid(state, list(doubts)) if doubts else state
-
-
-def _far_off(state: State) -> set[str]:
-    """Correctors whose steps are outliers: their labels may be swapped."""
-    ratio = misfits(state, beside_own(state))
-    return {name for name, own in zip(state.data.measured.correctors, ratio, strict=False)
-            if own > STEP}  # fmt: skip

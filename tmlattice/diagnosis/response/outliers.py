@@ -38,6 +38,12 @@ NOISE = 2.0
 """Times the noise that it leaves at least."""
 BAD = 5.0
 """A BPM with so many times the rms misfit of the typical reading is bad."""
+SPARED = 0.1
+"""Share of its readings that do not count: a few outliers make no BPM bad."""
+ROUNDED = 1e-6
+"""Of the readings: two equal responses differ by less."""
+COUPLING = "skew_gradient"
+"""The family that makes the readings in the other plane."""
 BLIND = 0.2
 """A gain below which a BPM tells nothing of the beam."""
 MOST = 0.25
@@ -177,23 +183,61 @@ def _typical(read: Array) -> Array:
 
 
 def good_monitors(state: State) -> Flags:
-    """BPMs whose misfit the noise model finds usual, and that have a gain, [monitor].
+    """BPMs whose misfit is usual, with a gain of their own, [monitor].
+
+    In the plane across they are judged once skew gradients are fitted, which make it.
 
     Args:
-        state: a fit with a misfit of each monitor.
+        state: a fit, with gains.
     """
-    noise, gain = state.noise, np.diagonal(state.at.errors.monitors, axis1=1, axis2=2)
-    good = ~(np.abs(gain) < BLIND).any(axis=1)
-    for block in (0, 1):
-        if not state.of_block(block):
+    good = state.good & _usual(state, 0)
+    return good & _usual(state, 1) if state.allows(COUPLING) else good
+
+
+def _usual(state: State, block: int) -> Flags:
+    """BPMs whose rms misfit in a block is not far beyond the median one's, also without the worst
+    tenth of their readings: a few outliers make no BPM bad."""
+    data = state.data
+    read, orbits = data.pick(state.at.read, block), data.pick(data.orbits, block)
+    good = np.ones(data.shape[1], dtype=bool)
+    for kicked in (0, 1):
+        rows = state.fitted & (data.plane == kicked)
+        if rows.sum() < COLUMNS:
             continue
-        for read in (0, 1):
-            rows = state.data.plane_of(block)[:-1] == read
-            if rows.any():
-                square = state.data.noise[:, read] ** 2 + noise.monitor[block, read]
-                square = square + np.median(noise.column[block, :-1][rows])
-                good &= square < BAD**2 * np.median(square)
-    return np.asarray(good)
+        bad = np.ones(data.shape[1], dtype=bool)
+        rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
+        for spared in (0.0, SPARED):
+            rms, gain, count = _beside_own_gain(read[rows], orbits[rows], spared)
+            told = (count > 0) & state.good
+            usual = max(float(np.median(rms[told])), rounded) if told.any() else np.inf
+            blind = (gain < BLIND) & (block == 0)
+            bad &= (count > 0) & ((rms > BAD * usual) | blind)
+        good &= ~bad
+    return good
+
+
+def _beside_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
+    """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
+    and of how many readings, [monitor].
+
+    Args:
+        read, orbits: by the model and measured, m, [column, monitor].
+        spared: share of a monitor's readings, its worst ones, that do not count.
+    """
+    seen = np.isfinite(orbits)
+    if spared:
+        left = np.abs(orbits - read * _gain(read, orbits, seen))
+        worst_last = np.argsort(np.argsort(np.where(seen, left, np.inf), axis=0), axis=0)
+        seen &= worst_last < np.ceil((1 - spared) * seen.sum(axis=0))
+    gain = _gain(read, orbits, seen)
+    count = seen.sum(axis=0)
+    left = np.where(seen, orbits - gain * read, 0.0)
+    return np.sqrt((left**2).sum(axis=0) / np.maximum(count, 1)), gain, count
+
+
+def _gain(read: Array, orbits: Array, seen: Flags) -> Array:
+    u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
+    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30))
 
 
 def without(state: State, flags: Flags) -> State:

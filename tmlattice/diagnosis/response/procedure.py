@@ -36,7 +36,13 @@ from tmlattice.diagnosis.findings import (
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.displaced import Displaced, displaced
-from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
+from tmlattice.diagnosis.response.exchanged import (
+    PutRight,
+    mislabelled,
+    planes_back,
+    righted,
+    swapped,
+)
 from tmlattice.diagnosis.response.few import few_causes, knows_more
 from tmlattice.diagnosis.response.first_guess import FAR, strange
 from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, fit_chi2, fit_families
@@ -47,7 +53,7 @@ from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.strangers import ODD, Strangers, reversed_ones, strangers
+from tmlattice.diagnosis.response.strangers import Strangers, reversed_ones, strangers
 from tmlattice.diagnosis.response.told import told
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.result import Diagnosis, Finding
@@ -182,7 +188,7 @@ def _families(
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
         odd = strangers(state)
-        others = set() if fit is None else _anothers(state)
+        others = set() if fit is None else mislabelled(state)
         far = fit is None and _far(state, odd)
         right = None if far else righted(state, measured, known, odd, others)
         if right is not None:
@@ -211,12 +217,6 @@ def _far(state: State, odd: Strangers) -> bool:
     gone = {name for name, _ in odd.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
-
-
-def _anothers(state: State) -> set[str]:
-    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
-    leaves far more of them than of the others."""
-    return {*(own.name for own in displaced(state)), *strangers(state, ODD).correctors}
 
 
 def _faults(

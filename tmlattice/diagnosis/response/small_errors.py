@@ -75,6 +75,8 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     nobody = np.zeros_like(split.held)
     everybody = Split(nobody, nobody, _halves(split), np.zeros_like(split.inner_rf))
     design = replace(begin(data, everybody), good=fitted.good, exploring=False)
+    noise = replace(design.noise, kinds=fitted.noise.kinds)
+    design = replace(design, noise=noise)
     families = _families(design, fitted.families)
     beside = _from(design, families, fitted)
     few = data.orbits.size <= ANEW

@@ -104,7 +104,8 @@ class Noise:
         size: prior rms of the amount of each common mode, [block, column, pattern].
         scale: of the kinds of common modes, [block, plane that is read, kind].
         waves: orbits of unit rms, [plane that is read, pattern, monitor].
-        kinds: of common modes that are admitted, names of `KINDS`.
+        kinds: of common modes that are admitted, names of `KINDS`. Waves are admitted by
+            validation alone: they absorb what gradients should explain.
     """
 
     column: Array
@@ -113,7 +114,7 @@ class Noise:
     size: Array
     scale: Array
     waves: Array
-    kinds: tuple[str, ...] = tuple(KINDS)
+    kinds: tuple[str, ...] = ("drift", "place")
 
     @classmethod
     def first(cls, at: Predicted, left: Array) -> "Noise":
