@@ -38,7 +38,7 @@ ROUNDS = 40
 GAIN, PATIENCE = 2e-3, 1
 """A fit has converged where so many rounds in turn gain less than this share of the cost: the
 variance components follow what is fitted. One round is enough for a fit that leads the way."""
-EACH = 1
+EACH = 4
 """Fisher steps of the prior scales in a round of the fit."""
 RETRIES, SHORTER, LONGER, LONGEST = 6, 4.0, 2.0, 8.0
 """How often a step that raised the cost is repeated; by what the step bounds fall then and grow
