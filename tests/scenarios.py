@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from tmlattice.machine.stored_beam import (
     simulate_tunes,
     simulate_turns,
 )
+from tmlattice.version import __version__
 
 LATTICE = Path(__file__).parent / "lattices" / "small_ring.py"
 USUAL = {"all": None}
@@ -180,15 +181,21 @@ def _number(value: float | None) -> float | None:
 # --- defects of the data ------------------------------------------------------------------------
 
 
-def readings(change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
-    """A change of a response's readings [corrector, monitor, plane] in place."""
+def changed(name: str, change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
+    """A change, in place, of a copy of an array of the record."""
 
-    def changed(data: Any, rng: np.random.Generator) -> Any:
-        response = data.response.copy()
-        change(response, data, rng)
-        return replace(data, response=response)
+    def made(data: Any, rng: np.random.Generator) -> Any:
+        values = getattr(data, name).copy()
+        change(values, data, rng)
+        return replace(data, **{name: values})
 
-    return changed
+    return made
+
+
+readings = partial(changed, "response")
+"""Of a response, [corrector, monitor, plane]."""
+in_turn = partial(changed, "readings")
+"""Of first turns or turns, [shot, turn, monitor, plane]."""
 
 
 def own_plane(data: Any) -> np.ndarray:
@@ -328,17 +335,6 @@ def zeros_across(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
         read[c, :, 1 - plane] = 0.0
 
 
-def in_turn(change: Callable[[np.ndarray, Any, np.random.Generator], None]) -> Change:
-    """A change of the readings of first turns or turns, [shot, turn, monitor, plane], in place."""
-
-    def changed(data: Any, rng: np.random.Generator) -> Any:
-        read = data.readings.copy()
-        change(read, data, rng)
-        return replace(data, readings=read)
-
-    return changed
-
-
 def no_x(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
     read[..., 0] = np.nan
 
@@ -424,7 +420,7 @@ def defect(name: str, damage: Change, *says: str, **more: Any) -> Scenario:
 
 
 RESPONSES = (
-    Scenario("response: nothing", verdicts=NOTHING),
+    Scenario("response: nothing", verdicts=NOTHING, lasts=True),
     one("quadrupole_gradient", "QF::2", -0.02),
     one("quadrupole_gradient", "QF::2", -0.05),
     one("quadrupole_roll", "QD::4", 0.01),
@@ -458,7 +454,7 @@ RESPONSES = (
         made={"kick": 1e-5, "noise": 2e-8, "engine": "ocelot", "rf_step": -3000.0},
         lasts=True,
     ),
-    Scenario("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY),
+    Scenario("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY, lasts=True),
     *(
         Scenario(
             f"response, usual errors: none, {k}", small=USUAL, seed=k, verdicts=SOUND, lasts=True
@@ -561,6 +557,7 @@ DEFECTS = (
             damage=exchanged_correctors(a, b),
             verdicts=LOCATED,
             found=(Cause("exchanged", f"{a},{b}", np.nan),),
+            lasts=True,
         )
         for a, b in (("v5", "v6"), ("v5", "v9"), ("generated_a", "v5"))
     ),
@@ -569,6 +566,7 @@ DEFECTS = (
         damage=exchanged_monitors("end_1", "end_14"),
         verdicts=LOCATED,
         found=(Cause("exchanged", "end_1,end_14", np.nan),),
+        lasts=True,
     ),
     defect("the noise is stated five times too small", noise_times([0.2, 1.0]), "the noise in x"),
     defect("the noise is stated ten times too large", noise_times(10.0), "it is too large"),
@@ -624,7 +622,8 @@ CHANGES = (
         "correctors exchanged in the reference",
         before_damage=exchanged_correctors("v5", "v9"),
         verdicts=NOTHING | LOCATED | MANY,
-        says=("v5 and v9",),
+        others=1,
+        says=("v5 and v9|v9 and v5",),
     ),
     since(
         "supplies, and every magnet by 1 %",
@@ -793,7 +792,8 @@ def main() -> None:
         print("wrong" if row["faults"] else "right", own.name, row.get("seconds"), row["verdict"],
               *row["faults"], sep="; ", flush=True)  # fmt: skip
         if given.into:
-            write_json(given.into, {"rows": list(rows.values())})
+            made_by = {"command": "python -m tests.scenarios --into FILE", "package": __version__}
+            write_json(given.into, {**made_by, "rows": list(rows.values())})
     wrong = sum(bool(row["faults"]) for row in rows.values())
     print(f"{len(rows) - wrong} of {len(rows)} right")
 

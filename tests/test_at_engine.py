@@ -614,7 +614,6 @@ def test_a_setting_that_cannot_be_is_named(small_ring):
     "element",
     [
         "TDCavity(l=0.5, eid='it')",
-        "Multipole(kn=[0.01, 0.0], eid='it')",
         "SBend(l=1.0, angle=0.1, h_pole1=0.2, eid='it')",
     ],
 )

@@ -385,7 +385,7 @@ def test_a_damaged_truth_is_closed_again(made, tmp_path):
     (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        with pytest.raises(TmlatticeError, match="cannot be read"):
+        with pytest.raises(TmlatticeError, match="does not hold arrays of a truth"):
             read_truth(folder, "0001")
         gc.collect()
     assert not [own for own in told if own.category is ResourceWarning]

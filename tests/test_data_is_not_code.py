@@ -5,10 +5,13 @@ import json
 import os
 import shutil
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import at
+import h5py
 import numpy as np
 import pytest
+import scipy.io
 from at_ring import at_lattice
 from command import tmlattice
 from test_lattice_files import madx, write
@@ -16,7 +19,13 @@ from test_other_codes import ELEGANT
 
 from tmlattice import load_ring
 from tmlattice.challenge import make, run
-from tmlattice.errors import LatticeError, TmlatticeError
+from tmlattice.errors import LatticeError, TmlatticeError, harmless
+from tmlattice.importers.columns import read_columns
+from tmlattice.input_files import check_shape, content_of, json_of, yaml_of
+from tmlattice.lattice.mat_file import read_mat
+from tmlattice.network import TaylorNetwork
+from tmlattice.network.stored import load_network, save_network
+from tmlattice.report.interactive import as_plain
 
 BEAM = "beam, particle=electron, energy=3.0;"
 
@@ -130,7 +139,91 @@ def test_modules_of_the_working_directory_are_not_loaded(tmp_path, monkeypatch, 
     lattice.append(at.Element("solenoid", Length=0.5, K=0.2, PassMethod="SolenoidLinearPass"))
     at.save_lattice(lattice, tmp_path / "ring.mat")
     assert "solenoid" in load_ring(tmp_path / "ring.mat").counts()
+    with h5py.File("a.h5", "w") as file:
+        file["bpm1 x"] = np.zeros(3)
+    assert len(read_columns(Path("a.h5"))) == 1
     assert not Path("MARK").exists()
+
+
+def test_what_reads_a_binary_file_has_limits_of_memory_and_time(tmp_path):
+    """2 MB that are a gigabyte: the process that reads them may not have as much."""
+    scipy.io.savemat(tmp_path / "a.mat", {"a": np.zeros(2**27)}, do_compression=True)
+    with pytest.raises(LatticeError, match="more than 512 MB of memory"):
+        read_mat(tmp_path / "a.mat")
+
+
+def test_a_file_is_read_only_if_it_is_regular_and_up_to_its_stated_size(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MARK", "stop;")
+    os.mkfifo("pipe")
+    for place in ("pipe", "/dev/zero", "."):
+        with pytest.raises(TmlatticeError, match="give a file"):
+            content_of(Path(place), TmlatticeError)
+    assert content_of(Path("/proc/self/environ"), TmlatticeError) == b""
+    path = write(tmp_path, "ring.seq", f'{BEAM} call, file="/proc/self/environ";\n' + madx())
+    assert load_ring(path).counts()["quadrupole"] == 16
+
+
+@pytest.mark.parametrize("link", [h5py.ExternalLink("other.h5", "x"), h5py.SoftLink("/elsewhere")])
+def test_hdf5_states_its_sizes_and_reaches_no_other_file(tmp_path, monkeypatch, link):
+    monkeypatch.chdir(tmp_path)
+    for name, own in (("other", "x"), ("a", "bpm1 x")):
+        with h5py.File(f"{name}.h5", "w") as file:
+            file[own] = np.zeros(3)
+    with h5py.File("a.h5", "r+") as file:
+        file["bpm2 x"] = link
+    with pytest.raises(TmlatticeError, match="'bpm2 x' is a link"):
+        read_columns(Path("a.h5"))
+    with h5py.File("a.h5", "r+") as file:
+        del file["bpm2 x"]
+        for i in range(6):
+            file.create_dataset(f"bpm{i} y", (200_000,), "f8")
+    with pytest.raises(TmlatticeError, match="its data sets state"):
+        read_columns(Path("a.h5"))
+
+
+@pytest.mark.parametrize("text", ["names: &a {x: y}\nbad: [*a]", "names: {x: &a [*a]}"])
+def test_yaml_is_texts_without_aliases_or_types(tmp_path, text):
+    path = tmp_path / "map.yaml"
+    path.write_text(text)
+    with pytest.raises(TmlatticeError, match="an alias"):
+        yaml_of(path, TmlatticeError)
+    path.write_text("a: !!python/object/apply:os.mkdir [MARK]\nb: 2001-01-01\nc: 1e3\nd: yes")
+    assert yaml_of(path, TmlatticeError) == {
+        "a": ["MARK"],
+        "b": "2001-01-01",
+        "c": "1e3",
+        "d": "yes",
+    }
+    assert not Path("MARK").exists()
+
+
+@pytest.mark.parametrize("read", [json_of, yaml_of])
+def test_an_object_has_a_key_once_and_values_of_its_types(tmp_path, read):
+    path = tmp_path / "map.yaml"
+    path.write_text('{"unit": "mm", "unit": "m"}')
+    with pytest.raises(TmlatticeError, match="stands twice"):
+        read(path, TmlatticeError)
+    path.write_text('{"unit": ["mm"]}')
+    with pytest.raises(TmlatticeError, match="unit is"):
+        check_shape(path, read(path, TmlatticeError), "map", TmlatticeError)
+
+
+def test_archives_of_arrays_are_not_compressed(tmp_path, small_ring):
+    path = tmp_path / "network.pt"
+    save_network(TaylorNetwork.from_ring(small_ring), path)
+    load_network(small_ring, path)
+    with ZipFile(path) as whole, ZipFile(tmp_path / "b.pt", "w", ZIP_DEFLATED) as other:
+        for name in whole.namelist():
+            other.writestr(name, whole.read(name))
+    with pytest.raises(TmlatticeError, match="compressed archive"):
+        load_network(small_ring, tmp_path / "b.pt")
+
+
+def test_what_a_file_says_is_shown_without_control_characters_and_escaped():
+    evil = "\x1b[2J\u202e<!--</script>%{x}<b>"
+    assert harmless(evil) == r"\x1b[2J\u202e<!--</script>%{x}<b>"
+    assert not set("<>%@") & set(as_plain(evil))
 
 
 @pytest.mark.parametrize(

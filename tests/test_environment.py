@@ -84,8 +84,9 @@ def test_a_reader_that_leaves_ends_the_command_quietly(data):
 def stopped(folder, words, number, ready):
     """Send a signal to the command as soon as it is ready; its status and stderr."""
     process = psutil.Popen(
-        [sys.executable, "-m", "tmlattice", *words], cwd=folder, stderr=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-m", "tmlattice", *words], cwd=folder, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # nohup and a shell's & ignore it
+    )  # fmt: skip
     end = time.monotonic() + 60
     while not ready(process) and process.poll() is None and time.monotonic() < end:
         time.sleep(0.01)
@@ -120,13 +121,20 @@ def test_a_stopped_command_stops_its_workers(data):
     assert said == "tmlattice: stopped; nothing was written\n"
 
 
+def two_workers(process):
+    """The worker processes of a command, once both are there."""
+    while len(children := process.children()) < 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    return children
+
+
 def test_a_killed_worker_of_simulate_is_one_sentence(data):
     words = ("simulate", "ring.py", "--shots", "100000", "--jobs", "2", "--out", "long", "-q")
     process = psutil.Popen(
         [sys.executable, "-m", "tmlattice", *words], cwd=data, stderr=subprocess.PIPE, text=True
     )
-    while len(children := process.children()) < 2:
-        time.sleep(0.01)
+    children = two_workers(process)
     time.sleep(0.5)
     children[0].kill()
     _, said = process.communicate(timeout=60)
@@ -139,8 +147,7 @@ def test_a_killed_worker_of_simulate_is_one_sentence(data):
 def test_workers_end_with_their_process(data):
     words = ("simulate", "ring.py", "--shots", "100000", "--jobs", "2", "--out", "long", "-q")
     process = psutil.Popen([sys.executable, "-m", "tmlattice", *words], cwd=data)
-    while len(children := process.children()) < 2:
-        time.sleep(0.01)
+    children = two_workers(process)
     process.kill()
     process.wait()
     _, alive = psutil.wait_procs(children, timeout=20)

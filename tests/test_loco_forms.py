@@ -8,12 +8,6 @@ import scipy.io
 from test_import import simulated  # noqa: F401  (a fixture)
 
 from tmlattice.importers import Options, bring_in
-from tmlattice.lattice import mat_file
-
-
-@pytest.fixture(autouse=True)
-def no_child(monkeypatch):
-    monkeypatch.setattr(mat_file, "check_mat", lambda path: None)
 
 
 @pytest.fixture

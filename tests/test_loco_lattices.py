@@ -11,14 +11,8 @@ from numpy.testing import assert_allclose
 from test_import import ENERGY, design, elements, simulated  # noqa: F401  (a fixture)
 
 from tmlattice.importers import Options, bring_in, matlab_ring
-from tmlattice.lattice import mat_file
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
-
-
-@pytest.fixture(autouse=True)
-def no_child(monkeypatch):
-    monkeypatch.setattr(mat_file, "check_mat", lambda path: None)
 
 
 @pytest.fixture

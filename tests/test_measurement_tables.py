@@ -5,7 +5,8 @@ import pandas as pd
 import pytest
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement import read_measurement, read_table, read_turn_by_turn
+from tmlattice.lattice.binary_files import turns
+from tmlattice.measurement import read_measurement, read_table, read_turn_by_turn, tables
 
 
 @pytest.fixture
@@ -113,6 +114,9 @@ def test_more_turns_than_a_file_states_are_read(tmp_path, ring_data, monkeypatch
     y = pd.DataFrame(ring_data[0, :, 2:, 1].T, index=["BPV.1"])
     stated = tbt.TbtData([tbt.TransverseData(X=x, Y=y)], 29, bunch_ids=[0])
     monkeypatch.setattr(tbt, "read", lambda path, datatype: stated)
+    monkeypatch.setattr(  # in this process
+        tables, "read_apart", lambda kind, path, what, error, *more: turns(str(path), *more)
+    )
     (tmp_path / "a.sdds").touch()
     m = read_turn_by_turn(tmp_path / "a.sdds", "sps", unit="mm")
     assert m.readings.shape == (1, 30, 3, 2)
@@ -121,13 +125,13 @@ def test_more_turns_than_a_file_states_are_read(tmp_path, ring_data, monkeypatch
 
 
 def test_turn_by_turn_files_that_cannot_be_read(tmp_path, ring_data):
-    with pytest.raises(MeasurementError, match="no turn-by-turn file"):
+    with pytest.raises(MeasurementError, match="No such file"):
         read_turn_by_turn(tmp_path / "nothing.sdds")
     path = tmp_path / "a.sdds"
     path.write_text("no such thing")
     with pytest.raises(MeasurementError, match="cannot be read as 'lhc'"):
         read_turn_by_turn(path)
-    with pytest.raises(MeasurementError, match="cannot be read as 'lhd'"):
+    with pytest.raises(MeasurementError, match="no kind 'lhd'"):
         read_turn_by_turn(path, "lhd")
     written(path, 1e-3 * ring_data, "lhc")
     with pytest.raises(MeasurementError, match=r"a.sdds: no monitor 'BPM.C'"):

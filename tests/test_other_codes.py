@@ -11,7 +11,7 @@ from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
 from tmlattice.errors import LatticeError
 from tmlattice.maps import ring_matrix
-from tmlattice.optics import off_momentum, twiss
+from tmlattice.optics import off_momentum, ring_tunes, twiss
 
 MADX = """
 beam, particle=proton, energy=26;
@@ -40,15 +40,16 @@ def madx(tmp_path_factory):
     return load_ring(path)
 
 
-def table(ring, folder, centre=0.0, drop=(), **header):
-    """The table that MAD-X's TWISS writes of a ring: no drifts, integrated strengths."""
+def table(ring, folder, centre=0.0, drop=(), drifts=False, **header):
+    """The table that MAD-X's TWISS writes of a ring, with or without drifts; integrated
+    strengths."""
     header = {"ENERGY": ring.energy, "MASS": ring.mass, "LENGTH": ring.length, **header}
     kept = [c for c in COLUMNS if c not in drop]
     lines = [f"@ {k} %le {v!r}" for k, v in header.items() if v is not None]
     types = ("%s" if c in kept[:2] else "%le" for c in kept)
     lines += ["* " + " ".join(kept), "$ " + " ".join(types)]
     for e in ring.elements:
-        if e.kind == "drift":
+        if e.kind == "drift" and not drifts:
             continue
         source = e.source
         row = {
@@ -73,6 +74,35 @@ def table(ring, folder, centre=0.0, drop=(), **header):
     path = folder / "twiss.tfs"
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+@pytest.mark.parametrize("keyword", ["QUADRUPOLE", "SBEND", "SEXTUPOLE", "DRIFT"])
+def test_a_row_that_is_gone_of_a_table_with_drifts_is_missed(madx, tmp_path, keyword):
+    path = table(madx, tmp_path, drifts=True)
+    assert load_ring(path).length == pytest.approx(madx.length)
+    lines = path.read_text().splitlines()
+    rows = [i for i, line in enumerate(lines) if f'"{keyword}"' in line]
+    for i in (rows[0], rows[-1]):
+        path.write_text("\n".join([*lines[:i], *lines[i + 1 :], ""]))
+        with pytest.raises(LatticeError, match="a row is missing"):
+            load_ring(path)
+
+
+def test_phase_advances_of_the_last_row_stand_for_tunes_of_the_header(madx, tmp_path):
+    path = table(madx, tmp_path)
+    x, y = ring_tunes(madx)
+    lines = path.read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("*"))
+    rows = [f"{line} 0.0 0.0" for line in lines[first + 2 : -1]]
+    path.write_text("\n".join([
+        *lines[:first], f"{lines[first]} MUX MUY", f"{lines[first + 1]} %le %le", *rows,
+        f"{lines[-1]} {x} {y}", "",
+    ]))  # fmt: skip
+    assert load_ring(path).length == pytest.approx(madx.length)
+    quadrupole = next(row for row in rows if '"QUADRUPOLE"' in row)
+    path.write_text(path.read_text().replace(f"{quadrupole}\n", "", 1))
+    with pytest.raises(LatticeError, match="contradicts its header"):
+        load_ring(path)
 
 
 @pytest.mark.parametrize("centre", [0.0, 0.5])

@@ -220,12 +220,12 @@ def test_a_map_may_say_that_devices_are_in_beam_order(small_ring, data, tmp_path
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("colour: red", "no key 'colour'; there are unit, noise, names, bad, columns"),
-        ("unit: inch", "no unit 'inch'; there are m, mm, um"),
-        ("noise: loud", "a noise of 'loud' cannot be"),
-        ("- a\n- b", "is no table"),
+        ("colour: red", 'the key "colour"; known are unit, noise, names, bad, columns'),
+        ("unit: inch", 'unit is "inch"; it should be one of "m", "mm", "um"'),
+        ("noise: loud", "noise is 'loud'; give a length"),
+        ("- a\n- b", "should be an object"),
         ("a: [1", "is no YAML"),
-        ("columns: {bpm: x}", "no column 'bpm'; there are monitor, plane"),
+        ("columns: {bpm: x}", 'columns has the key "bpm"; known are monitor, plane'),
     ],
 )
 def test_a_wrong_map_is_a_sentence(tmp_path, text, words):

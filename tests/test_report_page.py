@@ -3,15 +3,17 @@
 Debian's package `chromium` and `pip install '.[test]'` are all that it takes.
 """
 
+import json
 import shutil
 
 import numpy as np
 import pytest
 
-from tmlattice import Cause, diagnose, simulate
+from tmlattice import Cause, diagnose, load_ring, simulate
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.effects import apply
+from tmlattice.lattice import save_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import TuneReading
 from tmlattice.report.page import draw, page
@@ -102,6 +104,30 @@ def headings(tab):
     return tab.eval_on_selector_all("h2", "all => all.map(one => one.id)")
 
 
+def hovered(tab, figure, name):
+    """What a figure shows where the mouse is on the first point whose text has the name."""
+    place = tab.locator(f'.figure[data-figure="data-{figure}"]')
+    place.scroll_into_view_if_needed()
+    place.evaluate(
+        """(place, name) => {
+            const named = trace => (trace.text || []).findIndex(x => x.includes(name));
+            const own = place.data.findIndex(trace => named(trace) >= 0);
+            const k = named(place.data[own]);
+            const { xaxis, yaxis } = place._fullLayout;
+            const box = place.getBoundingClientRect();
+            window.at = [box.x + xaxis._offset + xaxis.d2p(place.data[own].x[k]),
+                         box.y + yaxis._offset + yaxis.d2p(place.data[own].y[k])];
+        }""",
+        name,
+    )
+    x, y = tab.evaluate("window.at")
+    tab.mouse.move(x - 3, y - 3)
+    tab.mouse.move(x, y)
+    hover = place.locator(".hoverlayer .hovertext")
+    hover.first.wait_for(timeout=5000)
+    return hover.first.text_content()
+
+
 def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turns):
     tab = opened(first_turns)
     assert headings(tab) == ["findings", "notes", "gap", "scan", "sensitivity", "provenance"]
@@ -112,26 +138,7 @@ def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turn
     assert tab.locator(".figure .main-svg").first.is_visible()
     assert tab.locator(".figure").count() == 5
     for figure in ("plan", "scan"):
-        place = tab.locator(f'.figure[data-figure="data-{figure}"]')
-        place.scroll_into_view_if_needed()
-        tab.evaluate(  # the place of the culprit in the figure, where the mouse goes
-            """place => {
-                const named = trace => (trace.text || []).findIndex(x => x.includes("QD::5"));
-                const own = place.data.findIndex(trace => named(trace) >= 0);
-                const k = named(place.data[own]);
-                const { xaxis, yaxis } = place._fullLayout;
-                const box = place.getBoundingClientRect();
-                window.at = [box.x + xaxis._offset + xaxis.d2p(place.data[own].x[k]),
-                             box.y + yaxis._offset + yaxis.d2p(place.data[own].y[k])];
-            }""",
-            place.element_handle(),
-        )
-        x, y = tab.evaluate("window.at")
-        tab.mouse.move(x - 3, y - 3)
-        tab.mouse.move(x, y)
-        hover = place.locator(".hoverlayer .hovertext")
-        hover.first.wait_for(timeout=5000)
-        assert "QD::5" in hover.first.text_content()
+        assert "QD::5" in hovered(tab, figure, "QD::5")
 
 
 def test_zoom_changes_what_is_drawn(opened, first_turns):
@@ -196,3 +203,24 @@ def test_page_fits_a_phone_dark_paper_and_a_reader_without_scripts(opened, kind,
     assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     plain = opened(address, java_script_enabled=False)
     assert plain.locator("#answer img").is_visible()
+
+
+def test_names_that_are_markup_are_shown_as_they_stand(opened, small_ring, tmp_path):
+    """To HTML, to plotly (tags, entities, templates, the page's colours) and to matplotlib."""
+    name = '@ink q<!--<b>%{x}</b>&lt;$\\frac$<a href="https://e.example/">z</a></script>'
+    save_ring(small_ring, tmp_path / "ring.json")
+    document = json.loads((tmp_path / "ring.json").read_text())
+    definitions = document["definitions"]
+    document["definitions"] = {name if k == "QD" else k: d for k, d in definitions.items()}
+    document["sequence"] = [name if k == "QD" else k for k in document["sequence"]]
+    (tmp_path / "ring.json").write_text(json.dumps(document))
+    ring = load_ring(tmp_path / "ring.json")
+    weak = Cause("quadrupole_gradient", f"{name}::5", -0.02)
+    data = simulate(ring, [weak], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
+                    noise=2e-6).measurement()  # fmt: skip
+    tab = opened(written(diagnose(ring, data), tmp_path))
+    assert name in tab.inner_text("#answer")
+    for figure in ("plan", "scan"):
+        assert f"{name}::5" in hovered(tab, figure, "z&#60;/a&#62;&#60;/script&#62;::5")
+    links = tab.eval_on_selector_all(".figure a", "all => all.map(one => one.outerHTML)")
+    assert not [link for link in links if "e.example" in link]

@@ -9,6 +9,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -27,6 +28,11 @@ from tmlattice.temporaries import PREFIX
 OTHER = 54321
 """A user without a name or a home."""
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
+_PACKAGE = Path(cache.__file__).parent
+for_others = pytest.mark.skipif(
+    any(not folder.stat().st_mode & 0o001 for folder in (_PACKAGE, *_PACKAGE.parents)),
+    reason="another user cannot reach the package's files",
+)
 
 
 def as_other(work):
@@ -53,11 +59,12 @@ def as_other(work):
 
 
 @pytest.fixture
-def open_folder(tmp_path):
-    """A folder that every user can enter and write to, as /tmp."""
-    for folder in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+def open_folder():
+    """A folder that everybody may write to, and reach: pytest's own are this user's alone."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         folder.chmod(0o1777)
-    return tmp_path
+        yield folder
 
 
 @pytest.fixture
@@ -170,6 +177,7 @@ main()
 
 
 @as_root
+@for_others
 def test_a_user_without_a_name_or_a_home_can_work(open_folder, beside):
     (open_folder / "his").mkdir()
     os.chown(open_folder / "his", OTHER, OTHER)

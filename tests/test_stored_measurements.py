@@ -198,7 +198,7 @@ STEP = {"frequency_hz": 5e8, "harmonic": 100, "step_hz": 100.0}
         ({"kind": "turn_by_turn"}, ["shot"], 'it has no "shots"'),
         (
             {"kind": "turn_by_turn", "shots": [{"id": 0, "launch": {"x": 0.0}}]}, ["shot"],
-            r'shots\[0\] has a key "launch"; known are id, settings',
+            r'shots\[0\] has the key "launch"; known are id, settings',
         ),
         (
             {"kind": "turn_by_turn", "shots": SHOT},

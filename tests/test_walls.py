@@ -20,6 +20,7 @@ ORDER = (
 BESIDE = {
     "errors",
     "files",
+    "input_files",
     "temporaries",
     "cache",
     "compiled",

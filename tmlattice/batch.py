@@ -5,7 +5,6 @@ is missing, and what has failed, again.
 """
 
 import hashlib
-import json
 import logging
 import os
 import time
@@ -20,6 +19,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.errors import TmlatticeError, missing_package
 from tmlattice.files import OutputError, output_file, write_json
+from tmlattice.input_files import json_of
 from tmlattice.workers import Caught, Processes, caught, heard
 
 log = logging.getLogger(__name__)
@@ -32,19 +32,13 @@ PATIENCE = 60.0
 Work = Callable[[Any], dict[str, Any]]
 
 
-def _whole(text: str) -> int:
-    """A whole number that can be worked with; OverflowError where it has hundreds of digits."""
-    float(number := int(text))
-    return number
-
-
 def finished(folder: Path) -> dict[str, dict[str, Any]]:
     """The results that are there, by case; failed ones have a key "error"."""
     results = {}
     for path in sorted(folder.glob("*.json")):
         try:
-            result = json.loads(path.read_text(encoding="utf-8"), parse_int=_whole)
-        except (OSError, ValueError, OverflowError, RecursionError):
+            result = json_of(path, TmlatticeError)
+        except TmlatticeError:
             result = None  # another program's, or cut off: done again
         if isinstance(result, dict):
             results[path.stem] = result

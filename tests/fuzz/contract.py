@@ -1,7 +1,8 @@
 """The contract of every reader, in one place.
 
 A damaged file is accepted, with some meaning, or refused: one sentence that begins with
-`tmlattice: `, exit code 2, within `SECONDS` of the processor, with less than `BYTES` of memory,
+`tmlattice: `, exit code 2, within `SECONDS` of the processor, with less than `BYTES` of memory more
+than the package itself,
 nothing printed that steers a terminal or past the package, nothing left behind, and the process
 alive. A verdict's exit code is 0 or 1.
 """
@@ -13,6 +14,7 @@ import os
 import re
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import traceback
@@ -21,14 +23,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
 
-from damage import damaged_bytes, damaged_json, damaged_mat
+from damage import (
+    damaged_bytes,
+    damaged_hdf5,
+    damaged_json,
+    damaged_mat,
+    damaged_names,
+    damaged_sizes,
+    damaged_yaml,
+)
 
 SECONDS = 5.0
 HANG = 60
 """s, of a clock."""
-BYTES = 6 << 30
-VALUES = {".json": damaged_json, ".mat": damaged_mat}
-"""By what a file is: damage to its values instead of its bytes, two times of three."""
+BYTES = 1 << 30
+VALUES = {".json": damaged_json, ".mat": damaged_mat, ".h5": damaged_hdf5, ".yaml": damaged_yaml}
+"""By what a file is: damage to its types and values, every second time."""
+BINARY = (".mat", ".h5", ".sdds", ".npz", ".pt")
+"""Files with sizes in them; the others have names in them."""
 STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\x80-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
@@ -58,6 +70,7 @@ class Tally:
     accepted: int = 0
     refused: int = 0
     slow: int = 0
+    undamaged: int = 0
     longest: float = 0.0
     broken: list[str] = field(default_factory=list)
 
@@ -131,16 +144,30 @@ def broken(words, folder, tally):
     return None
 
 
+def damages(path, whole):
+    """Four kinds of damage to choose from."""
+    other = damaged_sizes if path.suffix in BINARY else damaged_names
+    values = VALUES.get(path.suffix, damaged_bytes)
+    if path.suffix == ".mat" and whole.startswith(b"MATLAB 7.3"):
+        values = damaged_hdf5
+    return damaged_bytes, other, values, values
+
+
 def tried(seed, folder, inputs, rng):
     """One damaged input: (format, what of the contract it breaks or None)."""
     name = inputs.names[seed % len(inputs.names)]
     words, path = inputs.of(name)
     whole = path.read_bytes()
     tally = inputs.tallies.setdefault(name, Tally())
-    damage = VALUES[path.suffix] if path.suffix in VALUES and rng.integers(3) else damaged_bytes
+    damage = damages(path, whole)[int(rng.integers(4))]
     try:
-        content = damage(rng, whole)
+        try:
+            content = damage(rng, whole)
+        except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError):
+            tally.undamaged += 1  # twice damaged values that their own library does not write
+            return name, None
         if content == whole:
+            tally.undamaged += 1
             return name, None
         path.write_bytes(content)
         said = broken(words, folder, tally)
@@ -152,10 +179,44 @@ def tried(seed, folder, inputs, rng):
         inputs.put_back()
 
 
+def tried_whole(name, folder, inputs):
+    """An input that is not damaged is accepted."""
+    words, _ = inputs.of(name)
+    tally = Tally()
+    said = broken(words, folder, tally)
+    inputs.put_back()
+    assert said is None, f"{name}: {said}"
+    assert tally.accepted == 1, name
+
+
 def limit_memory():
     """A command that asks for more ends with a MemoryError, which it has to put into words."""
     with contextlib.suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_AS, (BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        most = pages * os.sysconf("SC_PAGE_SIZE") + BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
+def forked(command, **options):
+    """In place of `subprocess.run` for the process that reads a file: a copy of this one, which
+    has its libraries already."""
+    from tmlattice.lattice import binary_files
+
+    with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as answer:
+        given.write(options["input"])
+        given.seek(0)
+        child = os.fork()
+        if not child:
+            os.dup2(given.fileno(), 0)
+            os.dup2(answer.fileno(), 1)
+            sys.stdin = open(0, closefd=False)  # noqa: SIM115
+            with contextlib.suppress(BaseException):
+                signal.alarm(0)
+                binary_files.main()
+            os._exit(0)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        answer.seek(0)
+        return subprocess.CompletedProcess(command, code, answer.read(), b"")
 
 
 @dataclass

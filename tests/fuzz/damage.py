@@ -1,9 +1,13 @@
-"""Damage to a file, by a seed: bytes, lines, values of a JSON document, MATLAB variables."""
+"""Damage to a file, by a seed: bytes, lines, sizes, names; types and values of JSON, YAML, MATLAB
+and HDF5; the structure of HDF5."""
 
+import contextlib
 import io
 import json
 import re
+import tempfile
 import warnings
+from pathlib import Path
 
 import numpy as np
 
@@ -63,6 +67,41 @@ def damaged_bytes(rng, content):
     return bytes(content)
 
 
+# --- names and sizes ------------------------------------------------------------------------------
+ODD_NAMES = (
+    "q<!--", "</script>", "%{x}", "<b>q</b>", '<a href="https://e.example/">q</a>', "$\\frac$",
+    "@ink", "", " ", "nan", "..", "/etc/passwd", "x" * 5000, "\u202eq", "\x1b[2J", "qf::0", "QF",
+    "µ", "\ud83d", "0", "__class__", "a,b", 'a"b', "a\\nb",
+)  # fmt: skip
+NAME = re.compile(rb"[A-Za-z_][A-Za-z_0-9.:]+")
+ODD_SIZES = (0, 1, 2, 7, -1, -(2**31), 2**31 - 1, 2**24, 2**16, 255)
+
+
+def damaged_names(rng, content):
+    """A word of a text that is another everywhere, or in one place."""
+    words = NAME.findall(content)
+    if not words:
+        return content
+    word = words[int(rng.integers(len(words)))]
+    odd = ODD_NAMES[int(rng.integers(len(ODD_NAMES)))].encode("utf-8", "surrogatepass")
+    return content.replace(word, odd, -1 if rng.integers(2) else 1)
+
+
+def damaged_sizes(rng, content):
+    """A whole number of four or eight bytes of a binary file, at an even place."""
+    content = bytearray(content)
+    for _ in range(int(rng.choice([1, 1, 2, 4]))):
+        wide = int(rng.choice([4, 8]))
+        if len(content) <= wide:
+            break
+        reach = len(content) if rng.integers(2) else min(len(content), 2048)  # headers are first
+        at = int(rng.integers(0, max(1, reach // 4))) * 4
+        odd = ODD_SIZES[int(rng.integers(len(ODD_SIZES)))]
+        content[at : at + wide] = odd.to_bytes(wide, ["little", "big"][int(rng.integers(2))],
+                                               signed=True)  # fmt: skip
+    return bytes(content)
+
+
 def places(value, path=()):
     """Every place of a document."""
     yield path
@@ -73,7 +112,27 @@ def places(value, path=()):
 
 def damaged_json(rng, content):
     """A document with odd values, keys that are gone or misspelt, lists that are too deep."""
-    document = json.loads(content)
+    return _damaged_document(rng, json.loads(content))
+
+
+ODD_YAML = (
+    "a: &a [x, x]\nb: &b [*a, *a]\nnames: [*b, *b]\n", "names: " + "[" * 9000, "unit: [mm]\n",
+    "noise: 2001-13-45\n", "noise: " + "9" * 6000, "? [a, b]\n: c\n", "names: !!binary =\n",
+    "unit: !!python/name:os.system\n", "--- a\n--- b\n", "unit: mm\nunit: m\n", "%YAML 9.9\n",
+    "names: {<<: {a: b}}\n",
+)  # fmt: skip
+
+
+def damaged_yaml(rng, content):
+    """The same of YAML, and what JSON does not have."""
+    import yaml
+
+    if not rng.integers(3):
+        return content + ODD_YAML[int(rng.integers(len(ODD_YAML)))].encode()
+    return _damaged_document(rng, yaml.safe_load(content))
+
+
+def _damaged_document(rng, document):
     for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
         every = list(places(document))
         path = every[int(rng.integers(len(every)))]
@@ -91,7 +150,7 @@ def damaged_json(rng, content):
                 del owner[key]
             case 3 if isinstance(owner, dict):
                 owner[str(key).upper() if rng.integers(2) else f"{key}\x1b[2J"] = owner.pop(key)
-            case 4 if isinstance(owner[key], int | float) and not isinstance(owner[key], bool):
+            case 4 if isinstance(owner[key], int | float) and abs(owner[key]) < 1e300:
                 owner[key] = owner[key] * float(10.0 ** rng.integers(-12, 13))
             case _:
                 owner[key] = "HERE"
@@ -181,3 +240,89 @@ def _damaged_numbers(rng, value):
         case _:
             rng.shuffle(flat)
     return array
+
+
+# --- HDF5 -----------------------------------------------------------------------------------------
+def damaged_hdf5(rng, content):
+    """Objects that are gone, linked, renamed, of another type, shape or size, or elsewhere."""
+    import h5py
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.h5"
+        path.write_bytes(content)
+        with h5py.File(path, "r+") as file:
+            for _ in range(int(rng.choice([1, 1, 1, 2]))):
+                names = []
+                file.visit(names.append)
+                if not names:
+                    break
+                # what the library itself does not write is no damage
+                with contextlib.suppress(TypeError, ValueError, OSError, RuntimeError, KeyError):
+                    _damage_object(rng, file, names[int(rng.integers(len(names)))])
+        changed = path.read_bytes()
+    head = content[:512]  # of MATLAB, whose words stand before the file's own
+    return head + changed[512:] if head.startswith(b"MATLAB") else changed
+
+
+def _damage_object(rng, file, name):
+    import h5py
+
+    item = file[name]
+    group, own = item.parent, name.rsplit("/", 1)[-1]
+    data = isinstance(item, h5py.Dataset)
+    shape = item.shape if data and item.shape else (3, 2)
+    attributes = dict(item.attrs)
+    chunks = tuple(10**5 for _ in shape)
+    outside = [("/etc/hostname", 0, h5py.h5f.UNLIMITED)]
+    make = group.create_dataset
+    made = (
+        lambda: None,  # gone
+        lambda: group.__setitem__(own, h5py.SoftLink("/nowhere" if rng.integers(2) else "/")),
+        lambda: group.__setitem__(own, h5py.ExternalLink("/etc/hostname", own)),
+        lambda: group.__setitem__(own, group),
+        lambda: make(own, (40_000_000, 60), "f8"),
+        lambda: make(own, shape, "f8", chunks=chunks, maxshape=tuple(None for _ in shape)),
+        lambda: make(own, (10_000_000,), "f8", chunks=(1000,), compression="gzip"),
+        lambda: make(own, shape, _KINDS[int(rng.integers(len(_KINDS)))]),
+        lambda: make(own, data=h5py.Empty("f8")),
+        lambda: make(own, shape, "f8", external=outside),
+        lambda: group.create_group(own),
+        lambda: h5py.h5g.create(group.id, b"bpm\xff\xfe"),
+        lambda: make(own, data=ODD_DATA[int(rng.integers(len(ODD_DATA)))]),
+    )
+    case = int(rng.integers(18))
+    if case < len(made):
+        del group[own]
+        made[case]()
+        return
+    if case == 13:
+        odd = ODD_NAMES[int(rng.integers(len(ODD_NAMES)))]
+        if odd.strip(" ./") and "\ud83d" not in odd:
+            group.move(own, odd.replace("\x00", "") + str(int(rng.integers(3))))
+    elif case == 14:
+        key = [*attributes, "unit", "units", "MATLAB_class", "MATLAB_empty"]
+        odd = ODD_DATA[int(rng.integers(len(ODD_DATA)))]
+        item.attrs[key[int(rng.integers(len(key)))]] = odd
+    elif case == 15 and data and item.dtype == object and h5py.check_ref_dtype(item.dtype):
+        every = []
+        file.visit(every.append)
+        value = item[()]
+        for _ in range(int(rng.choice([1, 3, value.size]))):
+            other = file[every[int(rng.integers(len(every)))]].ref
+            value.flat[int(rng.integers(value.size))] = other
+        item[()] = value
+    elif data and item.dtype.kind in "fiu" and item.shape:
+        value = np.asarray(_damaged_numbers(rng, item[()]))
+        value = value.astype("S") if value.dtype.kind == "U" else value
+        del group[own]
+        group[own] = value
+        for key, one in attributes.items():
+            group[own].attrs[key] = one
+
+
+_KINDS = ("c16", "f8,i4", "S7", "V9", "3f8", "i1", "?", "f2", ">i8")
+ODD_DATA = (
+    0.0, -1.0, float("nan"), 10**18, True, "x", "", "\x1b[31m", np.bytes_(b"\xff\xfe"), ["a", "bc"],
+    np.zeros((2, 3, 4)), np.arange(7), np.zeros(0), np.full((3, 2), np.inf), 1j, "x" * 60_000,
+    np.bytes_(b"char"), np.bytes_(b"cell"), np.uint64(2**64 - 1),
+)  # fmt: skip

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from command import tmlattice
@@ -122,6 +123,62 @@ def write_loco(folder):
     }  # fmt: skip
 
 
+def write_matlab_and_hdf5(folder):
+    """LOCO as MATLAB 7.3 writes it, and the ESRF's files, which the tests of the importer make."""
+    import scipy.io
+    import test_import
+
+    simulated = test_import.simulated.__wrapped__()
+    test_import.save_as_hdf5(folder / "seven.mat", simulated)
+    seven = ["import", "seven.mat", "--out", "loco73", "--force"]
+    for name, variables in zip("abc", test_import.middle_layer(simulated), strict=True):
+        scipy.io.savemat(folder / f"{name}.mat", variables)
+    layer = ["import", "a.mat", "b.mat", "c.mat", "--out", "layer", "--force"]
+    (folder / "esrf").mkdir()
+    factory = SimpleNamespace(mktemp=lambda name: folder / "esrf")
+    test_import.esrf.__wrapped__(simulated, factory)
+    parts = ["orm.h5", "eta.h5", "noise.h5", "names.json", "ring.mat"]
+    esrf = ["import", *(f"esrf/{part}" for part in parts), "--out", "brought", "--force"]
+    for words in (seven, layer, esrf):
+        tmlattice(*words, "-q", cwd=folder, check=0)
+    return {"LOCO .mat 7.3": (seven, "seven.mat"),
+            "Middle Layer, response": (layer, "b.mat"), "Middle Layer, others": (layer, "c.mat"),
+            **{f"ESRF {part}": (esrf, f"esrf/{part}") for part in parts}}  # fmt: skip
+
+
+def write_turns_of_others(folder):
+    """Turn-by-turn files of the kinds that the tests write."""
+    import test_input_files
+
+    found = {}
+    for kind in ("superkekb", "madng", "trackone"):
+        name = f"turns.{kind}"
+        getattr(test_input_files, kind)(folder / name)
+        words = ["import", name, "--turns", kind, "--unit", "m", "--out", f"of_{kind}", "--force"]
+        tmlattice(*words, "-q", cwd=folder, check=0)
+        found[f"turns of {kind}"] = words, name
+    return found
+
+
+def write_together(folder):
+    """Several measurements at once, one before, and settings of shots."""
+    joint = ["diagnose", "ring.json", "closed-orbit", "dispersion", "tunes"]
+    before = ["diagnose", "ring.json", "closed-orbit", "--reference", "earlier"]
+    shutil.copytree(folder / "closed-orbit", folder / "earlier")
+    (folder / "settings.json").write_text('[{"qf::0": {"k1_relative": 0.01}}, {}]')
+    simulate = ["simulate", "ring.json", "--shots", "2", "--settings", "settings.json", "--engine",
+                "ocelot", "--out", "simulated", "--force", "-q"]  # fmt: skip
+    tmlattice(*simulate, cwd=folder, check=0)
+    return {
+        "joint, JSON": (joint, "dispersion/measurement.json"),
+        "joint, table": (joint, "tunes/tunes.csv"),
+        "reference, JSON": (before, "earlier/measurement.json"),
+        "reference, table": (before, "earlier/readings.csv"),
+        "settings": (simulate, "settings.json"),
+        "names in a lattice": (["diagnose", "own.json", "closed-orbit"], "own.json"),
+    }
+
+
 def write_calibration(folder):
     """What monitors and correctors do, of `predict`."""
     from tmlattice.effects import Cause
@@ -152,6 +209,9 @@ def write_measured(ten, folder):
         **write_network(ten, folder),
         **write_control_room(folder),
         **write_loco(folder),
+        **write_matlab_and_hdf5(folder),
+        **write_turns_of_others(folder),
+        **write_together(folder),
         **write_calibration(folder),
         **write_lattices(ten, folder),
     }

@@ -71,6 +71,29 @@ def test_slopes_of_both_are_the_scans_own(turns, orbit):
     assert_allclose(slope, (down - up) / (2 * h), atol=2e-4 * np.abs(slope).max())
 
 
+def test_many_fixed_causes_act_as_ones_that_are_sought(turns, orbit):
+    """They stand in the model, or are put on each trajectory: of magnets, monitors and the beam."""
+    rng = np.random.default_rng(2)
+    fixed = tuple(
+        Cause(effect, f"{name}::{i}", size * rng.standard_normal())
+        for i in range(1, 8)
+        for effect, name, size in (
+            ("quadrupole_gradient", "QF", 1e-2), ("quadrupole_offset_x", "QD", 3e-4),
+            ("monitor_gain_y", "bpm", 0.05), ("monitor_offset_x", "bpm", 1e-4),
+        )
+    )  # fmt: skip
+    fixed += (Cause("energy_offset", None, 1e-4),)
+    both = Together.of([turns, orbit])
+    standing = replace(both, fixed=fixed).at([WEAK], both.first)
+    assert_allclose(
+        standing.residual, both.at([*fixed, WEAK], both.first).residual, rtol=1e-9, atol=1e-6
+    )
+    assert np.abs(standing.residual - both.at([WEAK], both.first).residual).max() > 10
+    slope = replace(both, fixed=fixed).slope(standing, 0)
+    point = both.at([*fixed, WEAK], both.first)
+    assert_allclose(slope, both.slope(point, len(fixed)), rtol=1e-6, atol=1e-4)
+
+
 def test_a_reference_has_what_is_fixed_and_not_what_is_sought(orbit):
     both = Together.of([orbit], [orbit])
     cause = Cause("corrector_kick_x", "v6", 2e-5)

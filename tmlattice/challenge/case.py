@@ -11,7 +11,6 @@ DIR/results/NAME.json                the diagnosis
 DIR/oracle/NAME.json                 what the data allow, and plain baselines
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -25,8 +24,9 @@ from numpy.typing import NDArray
 from tmlattice.batch import fingerprint
 from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.effects import Cause
-from tmlattice.errors import TmlatticeError, plain
+from tmlattice.errors import TmlatticeError, plain, unknown_choice
 from tmlattice.files import output_file, write_json
+from tmlattice.input_files import check_shape, json_of, zip_of
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.load import contents
 from tmlattice.measurement import (
@@ -200,13 +200,8 @@ def read_set(folder: Path) -> dict[str, Any]:
     """
     path = folder / "challenge.json"
     found = _read(path, SET)
-    missing = [
-        key for key in ("tier", "lattice", "reference", "shots", "amount") if key not in found
-    ]
-    if missing or found["tier"] not in TIERS:
-        raise TmlatticeError(
-            f"{path} has no valid {(missing or ['tier'])[0]}; make the challenge anew"
-        )
+    if found["tier"] not in TIERS:
+        raise unknown_choice("tier", found["tier"], TIERS)
     return found
 
 
@@ -275,10 +270,8 @@ def read_case(folder: Path, name: str) -> Case:
     own = folder / "cases" / name
     public = _read(own / "case.json", PUBLIC)
     kinds = public.get("kinds", [])
-    good = isinstance(public.get("options"), dict) and isinstance(public.get("reference"), bool)
-    good = good and isinstance(kinds, list) and all(kind in RECORDS for kind in kinds)
-    if not good or "lattice" not in public:
-        raise TmlatticeError(f"{own / 'case.json'} is damaged; make the challenge anew")
+    if strange := [kind for kind in kinds if kind not in RECORDS]:
+        raise unknown_choice("kind of measurement", strange[0], RECORDS)
     wanted = {kind: kind for kind in kinds} or {"fit": "trajectory", "heldout": "trajectory"}
     if public["reference"]:
         wanted |= {BEFORE + kind: kind for kind in kinds} or {"reference": "trajectory"}
@@ -310,7 +303,15 @@ def read_truth(folder: Path, name: str) -> Truth:
         if not (few <= len(truth.causes) <= many and known):
             raise ValueError(f"{len(truth.causes)} causes are none of tier {truth.tier}")
         return truth
-    except (OSError, ArithmeticError, LookupError, TypeError, ValueError, BadZipFile) as error:
+    except (
+        OSError,
+        ArithmeticError,
+        LookupError,
+        TypeError,
+        ValueError,
+        MemoryError,
+        BadZipFile,
+    ) as error:
         said = plain(str(error), 100)
         raise TmlatticeError(
             f"the truth of case {name} in '{folder}' cannot be read ({said}); make it anew"
@@ -321,8 +322,8 @@ def _truth(folder: Path, name: str) -> Truth:
     secret = _read(folder / "truth" / f"{name}.json", TRUTH)
     launches: dict[str, Array] = {}
     clean: dict[str, Array] = {}
-    path = folder / "truth" / f"{name}.npz"
-    with path.open("rb") as file, np.load(file) as arrays:  # NumPy leaves a damaged one open
+    content = zip_of(folder / "truth" / f"{name}.npz", TmlatticeError, "arrays of a truth")
+    with np.load(content) as arrays:
         for key in arrays:
             kind, part = key.split("_", 1)
             (launches if kind == "launches" else clean)[part] = arrays[key]
@@ -348,14 +349,8 @@ def _truth(folder: Path, name: str) -> Truth:
 
 
 def _read(path: Path, kind: str) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TmlatticeError(
-            f"{path}: {error.strerror}; name a folder that `tmlattice challenge make` made"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise TmlatticeError(f"{path} is no JSON: {error}; make the challenge anew") from error
+    document = json_of(path, TmlatticeError)
     if not isinstance(document, dict) or document.get("format") != kind:
         raise TmlatticeError(f"{path} is not of the format '{kind}'; make the challenge anew")
+    check_shape(path, document, kind.removeprefix("tmlattice-"), TmlatticeError)
     return document

@@ -1,6 +1,5 @@
 """Cases with a withheld cause: AT is the real machine, every case has random numbers of its own."""
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -40,6 +39,7 @@ from tmlattice.effects import (
 )
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
+from tmlattice.input_files import json_of
 from tmlattice.lattice import Ring
 from tmlattice.lattice.load import contents
 from tmlattice.machine import Machine, Shots, draw_background, draw_shots
@@ -254,9 +254,9 @@ def _begin(folder: Path, public: Mapping[str, Any], seed: int) -> None:
 def _seed(folder: Path) -> int | None:
     """The seed that a challenge was made with, where that is known."""
     try:
-        made = json.loads((folder / "truth" / "made.json").read_text(encoding="utf-8"))
+        made = json_of(folder / "truth" / "made.json", TmlatticeError)
         return int(made["seed"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+    except (TmlatticeError, ValueError, LookupError, TypeError):
         return None
 
 

@@ -100,6 +100,8 @@ def main() -> NoReturn:
         _fail(error.format_message(), BAD_INPUT)
     except TmlatticeError as error:
         _fail(str(error), BAD_INPUT)
+    except MemoryError:
+        _fail("there is not enough memory for this; give less of it", BAD_INPUT)
     except (
         BrokenPipeError,
         SystemExit,

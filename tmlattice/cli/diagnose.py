@@ -1,7 +1,9 @@
 """`tmlattice diagnose`: where the gap lies, what causes it, how far it shrinks."""
 
 import logging
+import warnings
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -251,10 +253,18 @@ def _not_used(lattice: str) -> list[str]:
 
 def _known(ring: "Ring", lattice: str) -> "Known | None":
     """What an earlier diagnosis left known beside the ring as it found it."""
-    from tmlattice.diagnosis.twin import known_beside, read_known
+    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, read_known
 
     beside = known_beside(Path(lattice))
-    return read_known(beside, ring) if beside.is_file() else None
+    if beside.is_file():
+        return read_known(beside, ring)
+    if ring.model == ESTIMATED:
+        warnings.warn(
+            f"'{lattice}' is an estimated ring, and '{beside}' is not there: what the diagnosis "
+            "left uncertain is not used; copy that file too",
+            stacklevel=2,
+        )
+    return None
 
 
 def _write(
@@ -281,7 +291,7 @@ def _write_rings(
     repaired_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
-    from tmlattice.diagnosis.twin import known_beside, known_document, known_of
+    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document, known_of
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
@@ -289,7 +299,11 @@ def _write_rings(
 
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
-        written[str(lattice_out)] = write_ring(result.as_found, lattice_out)
+        tell("what is left known")  # minutes, of a large response
+        known = known_of(result)
+        ring = result.as_found
+        ring = ring if known is None else replace(ring, model=ESTIMATED)
+        written[str(lattice_out)] = write_ring(ring, lattice_out)
         beside = calibration_beside(lattice_out)
         if result.calibration or result.by_steps:
             write_calibration(beside, result.calibration, result.dispersion, result.rejected)
@@ -298,8 +312,7 @@ def _write_rings(
             beside.unlink(missing_ok=True)
         beside = known_beside(lattice_out)
         beside.unlink(missing_ok=True)  # that of the ring which stood there
-        tell("what is left known")  # minutes, of a large response
-        if lattice_out.is_file() and (known := known_of(result)) is not None:
+        if lattice_out.is_file() and known is not None:
             with output_file(beside) as temporary:
                 write_json(temporary, known_document(known, lattice_out))
             written[str(beside)] = ()

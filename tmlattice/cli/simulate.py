@@ -1,6 +1,5 @@
 """`tmlattice simulate`: a measurement whose cause is known."""
 
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -368,24 +367,10 @@ def _named(ring: Any, cause: Any) -> Any:
 
 def _settings(path: Path | None) -> list[dict[str, dict[str, float]]]:
     from tmlattice.errors import MeasurementError
+    from tmlattice.input_files import check_shape, json_of
 
     if path is None:
         return []
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
-        raise MeasurementError(f"'{path}' is no JSON: {error}") from error
-    good = isinstance(value, list) and all(
-        isinstance(shot, dict)
-        and all(
-            isinstance(s, dict) and all(isinstance(v, int | float) for v in s.values())
-            for s in shot.values()
-        )
-        for shot in value
-    )
-    if not good:
-        raise MeasurementError(
-            f"'{path}' should hold a list with one object for each shot, such as "
-            '[{"qd::12": {"k1_relative": 0.01}}, {}]'
-        )
+    value = json_of(path, MeasurementError)
+    check_shape(path, value, "settings", MeasurementError)
     return list(value)

@@ -49,6 +49,10 @@ BESIDE = ".known.json"
 """What the name of a lattice file ends in besides."""
 
 
+ESTIMATED = "estimated ring"
+"""What a lattice file says that it is whose knowledge stands in a file of its own."""
+
+
 def known_beside(lattice: Path) -> Path:
     """Where the knowledge of a lattice file stands."""
     return Path(f"{lattice}{BESIDE}")

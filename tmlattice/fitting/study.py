@@ -24,6 +24,7 @@ from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.fitting.experiment import DEFAULT_LAUNCH, network_tunes, perturbed_ring
 from tmlattice.fitting.methods import fine_tune
+from tmlattice.input_files import json_of
 from tmlattice.lattice import Element, Ring, load_ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.lattice.load import contents
@@ -253,8 +254,8 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
     text = json.loads(json.dumps(identity))
     if stated.exists():
         try:
-            there = json.loads(stated.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:
+            there = json_of(stated, TmlatticeError)
+        except TmlatticeError as error:
             raise TmlatticeError(
                 f"'{stated}' is damaged ({error}); name another folder with --out, or remove it"
             ) from error

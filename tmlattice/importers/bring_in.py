@@ -1,5 +1,6 @@
 """Which importer files are for: by what they hold, not by their names."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, TmlatticeError, plain
 from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, text_of
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
@@ -22,6 +23,8 @@ from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.tables import Unit
+
+log = logging.getLogger(__name__)
 
 MATLAB, NAMES = (".mat",), (".json",)
 Content = Mapping[str, Any]
@@ -83,7 +86,17 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     known = [] if options.turns else files
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
-    brought = _bring(files, matlab, hdf5, options)
+    try:
+        brought = _bring(files, matlab, hdf5, options)
+    except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
+        if isinstance(error, TmlatticeError):
+            raise
+        log.info("not imported", exc_info=True)
+        shown = ", ".join(f"'{path}'" for path in files)
+        said = plain(f"{type(error).__name__}: {error}", 200)
+        raise MeasurementError(
+            f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
+        ) from error
     if options.noise is not None and brought.measurement.noise is None:
         noise = np.full((len(brought.measurement.monitors), 2), options.noise)
         brought = replace(brought, measurement=replace(brought.measurement, noise=noise))

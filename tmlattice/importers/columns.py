@@ -14,13 +14,16 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
-from tmlattice.lattice.mat_file import check_hdf5
+from tmlattice.input_files import content_of
+from tmlattice.lattice.mat_file import read_apart
 
 CSV, HDF5, SDDS = (".csv", ".tsv", ".txt", ".dat"), (".h5", ".hdf5", ".hdf"), (".sdds",)
 
 _BRACKETS = re.compile(r"^\s*(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 _TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_](?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
 
+_POSITION = re.compile(r"(?:^|[^a-z])(?:x|y|hor\w*|ver\w*)(?:[^a-z]|$)", re.IGNORECASE)
+"""Of names of readings: a plane as a word."""
 
 SHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
 _ARCHIVE, _OLD_SHEET, _UTF_16 = b"PK\x03\x04", b"\xd0\xcf\x11\xe0", (b"\xff\xfe", b"\xfe\xff")
@@ -32,10 +35,7 @@ def text_of(path: Path) -> str:
     Raises:
         MeasurementError: it cannot be read, or is no text.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise MeasurementError(f"cannot read '{path}': {error.strerror or error}") from error
+    content = content_of(path, MeasurementError)
     if path.suffix.lower() in SHEETS or content.startswith((_ARCHIVE, _OLD_SHEET)):
         raise MeasurementError(f"'{path}' is a spreadsheet, which is not read; save it as CSV")
     try:
@@ -67,8 +67,6 @@ def read_columns(path: Path) -> list[Column]:
     Raises:
         MeasurementError: no such file, or no table in it.
     """
-    if not path.is_file():
-        raise MeasurementError(f"no file '{path}'; check the path")
     suffix = path.suffix.lower()
     if suffix in HDF5:
         found = _hdf5(path)
@@ -127,40 +125,21 @@ def _is_number(text: str) -> bool:
 def _hdf5(path: Path) -> list[Column]:
     """A column for each array [row]; `x`, `y` [row, monitor] beside a list of names are taken apart
     into a column a monitor. The unit is an attribute `unit` or `units`, or stands in the name."""
-    import h5py
-
-    check_hdf5(path, MeasurementError)
-
-    arrays: dict[str, tuple[Any, str]] = {}
-
-    def take(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            unit = item.attrs.get("units", item.attrs.get("unit", ""))
-            arrays[name] = item[()], unit.decode() if isinstance(unit, bytes) else str(unit)
-
-    try:
-        with h5py.File(path) as file:
-            file.visititems(take)
-    except (OSError, RuntimeError, TypeError, ValueError, KeyError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise MeasurementError(f"'{path}' cannot be read as HDF5 ({said})") from error
-    return _apart(path, arrays)
+    content, attributes = read_apart("hdf5", path, "HDF5", MeasurementError)
+    units = {name: own.get("units", own.get("unit", "")) for name, own in attributes.items()}
+    for name, unit in units.items():
+        if not isinstance(unit, str):
+            raise MeasurementError(f"'{path}': the unit of '{name}' is no text")
+    return _apart(path, {name: (value, units[name]) for name, value in content.items()})
 
 
 def _sdds(path: Path) -> list[Column]:
-    """Columns and arrays; by the package `sdds`."""
-    import sdds
-
+    """Columns and arrays."""
     try:
-        content = sdds.read(path)
-        arrays = {
-            name: (content.values[name], str(getattr(definition, "units", None) or ""))
-            for name, definition in content.definitions.items()
-        }
-    except Exception as error:  # whatever a reader meets in a file of another kind
+        arrays = read_apart("sdds", path, "SDDS", MeasurementError)
+    except MeasurementError as error:
         raise MeasurementError(
-            f"'{path}' cannot be read as SDDS ({type(error).__name__}: {error}); a turn-by-turn "
-            "file is read by `tmlattice import --turns KIND`"
+            f"{error}; a turn-by-turn file is read by `tmlattice import --turns KIND`"
         ) from error
     return _apart(path, arrays)
 
@@ -168,35 +147,49 @@ def _sdds(path: Path) -> list[Column]:
 def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
     """Arrays of numbers and names as columns of one length."""
     texts = {name: _texts(value) for name, (value, _) in arrays.items() if _is_text(value)}
-    flat: list[Column] = []
+    for name in texts:
+        if _POSITION.search(name.rsplit("/", 1)[-1]):
+            raise MeasurementError(f"'{path}': '{name}' holds texts; readings are numbers")
+    flat: list[tuple[str, str, Any]] = []  # texts of them would take ten times the memory
     for name, (value, unit) in arrays.items():
         if name in texts:
             continue
         array = np.asarray(value)
-        if array.dtype.kind not in "fiu" or array.ndim not in (1, 2):
+        if array.ndim == 0:  # about the file
             continue
+        if array.dtype.kind not in "fiu" or array.ndim > 2:
+            raise MeasurementError(
+                f"'{path}': '{name}' is an array of {array.ndim} dimensions of {array.dtype}; "
+                "readings are numbers [row] or [shot, monitor]"
+            )
         short = name.rsplit("/", 1)[-1]
         if array.ndim == 1:
             plain, own = named(name)
-            flat.append(Column(plain, unit or own, [str(v) for v in array.tolist()]))
+            flat.append((plain, unit or own, array))
             continue
         fits = [list_ for list_ in texts.values() if len(list_) == array.shape[1]]
         if not fits:
-            continue
+            raise MeasurementError(
+                f"'{path}': '{name}' has {array.shape[1]} columns, and no list of names has as "
+                f"many entries ({', '.join(f'{n} {len(t)}' for n, t in texts.items()) or 'none'})"
+            )
         plain, own = named(short)
         flat += [
-            Column(f"{monitor} {plain}", unit or own, [str(v) for v in array[:, i].tolist()])
-            for i, monitor in enumerate(fits[0])
+            (f"{monitor} {plain}", unit or own, array[:, i]) for i, monitor in enumerate(fits[0])
         ]
-    lengths = [len(column.values) for column in flat]
+    lengths = [len(values) for _, _, values in flat]
     if not lengths:
         raise MeasurementError(
             f"'{path}' holds no readings: an array for each monitor and plane, or x and y [shot, "
             "monitor] with the monitors' names"
         )
     most = max(set(lengths), key=lengths.count)
+    for name, _, values in flat:
+        if len(values) != most and _POSITION.search(name):
+            raise MeasurementError(f"'{path}': '{name}' has {len(values)} rows, others {most}")
     names = [Column(name, "", list_) for name, list_ in texts.items() if len(list_) == most]
-    return [*names, *(column for column in flat if len(column.values) == most)]
+    kept = [column for column in flat if len(column[2]) == most]
+    return [*names, *(Column(name, unit, list(map(str, v.tolist()))) for name, unit, v in kept)]
 
 
 def _is_text(value: Any) -> bool:

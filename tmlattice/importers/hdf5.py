@@ -10,7 +10,6 @@
 Monitors stand in the order of the lattice.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,23 @@ from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, device_names, numbers
 from tmlattice.importers.lattices import Elements
 from tmlattice.importers.matlab_ring import Roles, ring_of_elements
-from tmlattice.lattice.mat_file import check_hdf5
+from tmlattice.input_files import MOST_DIGITS, json_of, short
+from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
 Array = NDArray[np.float64]
 Plane = {"B1L": "x", "A1L": "y"}
+ARRAYS = (
+    "matrix", "inputs_delta", "raw_up", "raw_down", "measured_eta_x", "measured_eta_y",
+    "Noise_BPMx", "Noise_BPMy",
+)  # fmt: skip
+SCALARS = ("shots_per_orbit", "rf_full_step", "bipolar")
+TEXTS = ("input_names",)
+"""What is read of a file, and of which type; anything else in it may be of any."""
+NOTHING = "python-None"
+"""What pyLOCO writes in place of what it does not have."""
+MOST_SHOTS = 1_000_000
 
 
 def read_hdf5(path: Path) -> dict[str, Any]:
@@ -36,25 +46,25 @@ def read_hdf5(path: Path) -> dict[str, Any]:
     Raises:
         MeasurementError: no HDF5 file, or one that holds its reader.
     """
-    import h5py
-
-    check_hdf5(path, MeasurementError)
-    content: dict[str, Any] = {}
-
-    def take(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            content[name.rsplit("/", 1)[-1]] = item[()]
-
-    try:
-        with h5py.File(path) as file:
-            content.update(dict(file.attrs))
-            file.visititems(take)
-    except (OSError, RuntimeError, TypeError, ValueError, KeyError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise MeasurementError(
-            f"'{path}' cannot be read as HDF5 ({said}); save it again"
-        ) from error
+    arrays, attributes = read_apart("hdf5", path, "HDF5", MeasurementError)
+    names = [name.rsplit("/", 1)[-1] for name in arrays]
+    if twice := [n for n in (*ARRAYS, *SCALARS, *TEXTS) if names.count(n) > 1]:
+        raise MeasurementError(f"'{path}': '{twice[0]}' stands in two groups; keep one of the two")
+    content = {**attributes[""], **dict(zip(names, arrays.values(), strict=True))}
+    content = {name: value for name, value in content.items() if not _nothing(value)}
+    for name, value in content.items():
+        single = np.ndim(value) == 0 and isinstance(value, np.generic) and np.isfinite(value)
+        if name in SCALARS and not single:
+            raise MeasurementError(f"'{path}': {name} should be one finite number")
+        if name in ARRAYS and not isinstance(value, np.ndarray):
+            raise MeasurementError(f"'{path}': {name} should be an array of numbers")
+        if name in TEXTS and not isinstance(value, list | str):
+            raise MeasurementError(f"'{path}': {name} should be a list of texts")
     return content
+
+
+def _nothing(value: Any) -> bool:
+    return isinstance(value, str) and value == NOTHING
 
 
 def read_mapping(path: Path) -> dict[str, tuple[int, str]]:
@@ -63,17 +73,16 @@ def read_mapping(path: Path) -> dict[str, tuple[int, str]]:
     Raises:
         MeasurementError: no JSON table of names.
     """
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-        found = {}
-        for key, name in table.items():
-            place, _, component = key.partition("/")
-            if component in Plane:
-                found[str(name)] = int(place), Plane[component]
-    except (OSError, ValueError, AttributeError) as error:
-        raise MeasurementError(
-            f'\'{path}\' is no table of names such as "39/B1L": "srmag/hst-sf2/c04-a" ({error})'
-        ) from error
+    table = json_of(path, MeasurementError)
+    found = {}
+    for key, name in table.items() if isinstance(table, dict) else [("", table)]:
+        place, _, component = key.partition("/")
+        if not isinstance(name, str) or not place.isdecimal() or len(place) > MOST_DIGITS:
+            raise MeasurementError(
+                f'{path}: {short({key: name})} is no entry such as "39/B1L": "srmag/hst-sf2/c04-a"'
+            )
+        if component in Plane:
+            found[name] = int(place), Plane[component]
     return found
 
 
@@ -99,7 +108,10 @@ def bring_hdf5(
         raise MeasurementError(
             f"'{parts[0][0]}' holds no 'matrix'; give the file of the orbit response"
         )
-    names = _texts(data.get("input_names"))
+    names = data.get("input_names")
+    if names is None:
+        raise MeasurementError("no 'input_names'; the columns are unknown")
+    names = [names] if isinstance(names, str) else names
     unknown = [name for name in names if name not in mapping]
     if unknown:
         raise MeasurementError(
@@ -151,19 +163,11 @@ def _is_monitor(fields: Mapping[str, Any]) -> bool:
     return str(fields.get("Class", "")).lower() == "monitor" or "GCR" in fields
 
 
-def _texts(value: Any) -> list[str]:
-    if value is None:
-        raise MeasurementError("no 'input_names'; the columns cannot be told")
-    items = np.atleast_1d(np.asarray(value, dtype=object)).tolist()
-    return [item.decode() if isinstance(item, bytes) else str(item) for item in items]
-
-
 def _orbits(data: Mapping[str, Any], steps: Array, rows: int) -> tuple[Array, str]:
     """Orbit changes, m, [row, column]."""
     shape = rows, len(steps)
-    sizes = [np.size(data.get(name, ())) for name in ("raw_up", "raw_down")]
-    if sizes == [rows * len(steps)] * 2:
-        up, down = (numbers(data[name], name, shape) for name in ("raw_up", "raw_down"))
+    if "raw_up" in data or "raw_down" in data:
+        up, down = (numbers(data.get(name), name, shape) for name in ("raw_up", "raw_down"))
         two = bool(data.get("bipolar", True))
         sides = "two-sided" if two else "one-sided; the diagnosis takes them as two-sided"
         return up - down, (
@@ -182,7 +186,9 @@ def _noise(
     orbit = np.stack(
         [numbers(found.get(f"Noise_BPM{p}"), f"Noise_BPM{p}", (monitors,)) for p in "xy"], axis=1
     )
-    shots = max(1, int(data.get("shots_per_orbit", 1)))
+    shots = int(data.get("shots_per_orbit", 1))
+    if not 1 <= shots <= MOST_SHOTS:
+        raise MeasurementError(f"shots_per_orbit is {shots}; it should be from 1 to {MOST_SHOTS}")
     return np.where(orbit > 0, orbit, np.nan) * np.sqrt(2 / shots), (
         "Noise_BPMx is the rms of one orbit; an orbit change is the difference of two"
         + (f", each the mean of {shots}" if shots > 1 else "")

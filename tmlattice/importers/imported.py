@@ -1,6 +1,6 @@
 """What an importer makes of files: a measurement, the lattice where they hold one, and words."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -64,6 +64,35 @@ def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
             )
         array = array.reshape(tuple(shape))
     return array
+
+
+Shape = Mapping[str, Any]
+"""Of fields by name: `str`, `float` (numbers of any shape) or another shape."""
+
+
+def check_fields(content: Any, shape: Shape, place: str) -> None:
+    """Whether the fields of a structure that are there have their types.
+
+    Args:
+        content: of the file.
+        shape: of it.
+        place: its name, for the error.
+
+    Raises:
+        MeasurementError: a field of another type, by its name.
+    """
+    if not isinstance(content, Mapping):
+        raise MeasurementError(f"{place} should be a structure with {', '.join(shape)}")
+    for name, kind in shape.items():
+        value = content.get(name)
+        if value is None:
+            continue
+        if isinstance(kind, Mapping):
+            check_fields(value, kind, f"{place}.{name}")
+        elif kind is float:
+            numbers(value, f"{place}.{name}")
+        elif not isinstance(value, str):
+            raise MeasurementError(f"{place}.{name} should be a text")
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported, numbers
+from tmlattice.importers.imported import Imported, check_fields, numbers
 from tmlattice.importers.loco import Iteration, bring_loco, conventions
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
@@ -28,6 +28,12 @@ Device = tuple[int, ...]
 
 METRES = {"mm": 1e-3, "m": 1.0, "meter": 1.0, "metre": 1.0, "um": 1e-6, "micron": 1e-6, "nm": 1e-9}
 RADIANS = {"rad": 1.0, "radian": 1.0, "radians": 1.0, "mrad": 1e-3, "urad": 1e-6}
+FIELDS = {
+    "Data": float, "ActuatorDelta": float, "Sigma": float, "dp": float, "DeviceList": float,
+    "UnitsString": str, "Monitor": {"DeviceList": float},
+    "Actuator": {"DeviceList": float, "UnitsString": str},
+}  # fmt: skip
+"""Types of what is read of a structure."""
 
 
 def is_response(content: Fields) -> bool:
@@ -76,12 +82,12 @@ def bring_middle_layer(
         columns = [i for i, q in enumerate(model.planes) if q == plane]
         table = dict(zip(_devices(data.get(f"{'HV'[p]}CM"), "CM"), columns, strict=False))
         found = [_look_up(table, device, f"corrector of {plane}") for device in devices]
-        steps = np.broadcast_to(numbers(own.get("ActuatorDelta"), "ActuatorDelta"), len(devices))
+        steps = _each(own.get("ActuatorDelta"), "ActuatorDelta", len(devices))
         radians = _kicks(own, steps, data, model, columns, found, "HV"[p])
         change = np.full((len(devices), len(model.monitors), 2), np.nan)
         for r in range(2):
-            orbits = _orbits(blocks[r][p], steps)
             where = _devices(blocks[r][p].get("Monitor"), "Monitor")
+            orbits = _orbits(blocks[r][p], steps, len(where))
             at = [_look_up(reads[r], device, f"monitor of {'xy'[r]}") for device in where]
             change[:, at, r] = orbits.T
         names += [model.correctors[i] for i in found]
@@ -144,6 +150,8 @@ def _blocks(content: Fields) -> list[list[Fields]]:
     if not square:
         raise MeasurementError("Rmat is no 2 x 2 of planes with Data; give measrespmat's file")
     assert isinstance(Rmat, list)
+    for block in (block for row in Rmat for block in row):
+        check_fields(block, FIELDS, "Rmat")
     return Rmat
 
 
@@ -151,6 +159,8 @@ def _devices(structure: Any, what: str) -> list[Device]:
     if not isinstance(structure, Mapping) or "DeviceList" not in structure:
         raise MeasurementError(f"{what} has no DeviceList; give the Middle Layer's whole file")
     rows = np.atleast_2d(numbers(structure["DeviceList"], "DeviceList"))
+    if not (np.abs(rows) < 1e6).all():
+        raise MeasurementError(f"the DeviceList of {what} holds numbers that are of no device")
     return [tuple(row) for row in rows.astype(int).tolist()]
 
 
@@ -180,12 +190,18 @@ def _unit(text: Any, units: Mapping[str, float], what: str) -> float:
     return units[str(text).strip().lower()]
 
 
-def _orbits(block: Fields, steps: Array) -> Array:
+def _each(value: Any, what: str, count: int) -> Array:
+    """A number for each of so many, or one for all."""
+    found = numbers(value, what).ravel()
+    return np.repeat(found, count) if found.size == 1 else numbers(found, what, (count,))
+
+
+def _orbits(block: Fields, steps: Array, monitors: int) -> Array:
     """Orbit changes, m, [monitor, column]."""
     length = str(block.get("UnitsString", "mm/")).split("/")[0]
     return (
         _unit(length, METRES, "orbits") * steps
-        * np.reshape(numbers(block["Data"], "Rmat.Data"), (-1, len(steps)))
+        * numbers(block["Data"], "Rmat.Data", (monitors, len(steps)))
     )  # fmt: skip
 
 
@@ -211,7 +227,7 @@ def _kicks(
             f"kicks in '{per}', and LOCO's file has no step in it (Delta{letter}CMHardware); save "
             "the response in physics units"
         )
-    own = np.broadcast_to(numbers(hardware, f"Delta{letter}CMHardware"), len(columns))
+    own = _each(hardware, f"Delta{letter}CMHardware", len(columns))
     place = {column: i for i, column in enumerate(columns)}
     return np.array(
         [model.kicks[c] * step / own[place[c]] for c, step in zip(found, steps, strict=True)]
@@ -219,8 +235,10 @@ def _kicks(
 
 
 def _part(beside: Sequence[Fields], name: str) -> Fields | None:
-    parts = (content.get(name) for content in beside)
-    return next((part for part in parts if isinstance(part, Mapping)), None)
+    part = next((content[name] for content in beside if name in content), None)
+    if part is not None:
+        check_fields(part, FIELDS, name)
+    return part
 
 
 def _noise(
@@ -255,9 +273,10 @@ def _rf(
         ]
         length, _, per = str(part.get("UnitsString", "")).partition("/")
         unit = _unit(length, METRES, "dispersion")
-        step = float(numbers(part.get("ActuatorDelta"), "ActuatorDelta").ravel()[0])
-        times = part.get("dp") if "dp" in per else step
-        orbit[at, p] = unit * float(times or np.nan) * numbers(part["Data"], "Data", (len(at),))
+        step = float(_each(part.get("ActuatorDelta"), "ActuatorDelta", 1)[0])
+        dp = numbers(part.get("dp", np.nan), "dp", (1,))[0]
+        times = (dp if "dp" in per else step) or np.nan
+        orbit[at, p] = unit * times * numbers(part["Data"], "Data", (len(at),))
         hertz = str((part.get("Actuator") or {}).get("UnitsString", "Hz")).lower()
         step *= {"mhz": 1e6, "khz": 1e3}.get(hertz, 1.0)
     return replace(model.rf, step=step, orbit=orbit)

@@ -4,9 +4,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, plain
+from tmlattice.input_files import check_shape, yaml_of
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
 IN_ORDER = "in-order"
@@ -50,48 +50,33 @@ def read_told(path: Path) -> Told:
     Raises:
         MeasurementError: no YAML, or a key or value that is not known.
     """
-    import yaml
-
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except OSError as error:
-        raise MeasurementError(f"cannot read '{path}': {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise MeasurementError(f"'{path}' is no YAML ({said})") from error
-    if not isinstance(document, dict):
-        raise MeasurementError(f"'{path}' is no table; its lines are such as 'unit: mm'")
-    known = ("unit", "noise", "names", "bad", "columns")
-    for key in document:
-        if key not in known:
-            raise MeasurementError(f"'{path}': no key '{key}'; there are {', '.join(known)}")
-    unit, names = document.get("unit"), document.get("names") or {}
-    if unit is not None and unit not in METRES:
-        raise MeasurementError(f"'{path}': no unit '{unit}'; there are {', '.join(METRES)}")
-    if names != IN_ORDER and not isinstance(names, dict):
-        raise MeasurementError(f"'{path}': names are 'device: monitor', or {IN_ORDER}")
-    columns = document.get("columns") or {}
-    wrong = [key for key in columns if key not in COLUMNS]
-    if wrong:
-        raise MeasurementError(f"'{path}': no column '{wrong[0]}'; there are {', '.join(COLUMNS)}")
-    bad = document.get("bad") or []
+    document = yaml_of(path, MeasurementError)
+    document = {} if document is None else document
+    check_shape(path, document, "map", MeasurementError)
+    stated = {key: value for key, value in document.items() if value is not None}
+    names = stated.get("names", {})
+    if isinstance(names, str) and names != IN_ORDER:
+        raise MeasurementError(f"{path}: names are 'device: monitor', or {IN_ORDER}")
+    bad = stated.get("bad", [])
     return Told(
-        unit=unit,
-        noise=None if document.get("noise") is None else _length(document["noise"], path),
-        names={} if names == IN_ORDER else {str(k): str(v) for k, v in names.items()},
+        unit=stated.get("unit"),
+        noise=_length(stated["noise"], path) if "noise" in stated else None,
+        names={} if names == IN_ORDER else names,
         in_order=names == IN_ORDER,
-        bad=tuple(str(name) for name in (bad if isinstance(bad, list) else [bad])),
-        columns={key: str(value) for key, value in columns.items()},
+        bad=(bad,) if isinstance(bad, str) else tuple(bad),
+        columns=stated.get("columns", {}),
     )
 
 
-def _length(value: Any, path: Path) -> float:
+def _length(value: str, path: Path) -> float:
     """m, of a number or of a number with its unit."""
-    match = re.match(r"^\s*([-+0-9.eE]+)\s*(m|mm|um|µm|nm)?\s*$", str(value))
+    match = re.match(r"^\s*([-+0-9.eE]+)\s*(m|mm|um|µm|nm)?\s*$", value)
     try:
         length = float(match[1]) * METRES[match[2] or "m"] if match else 0.0
     except ValueError:
         length = 0.0
-    if not length > 0:
-        raise MeasurementError(f"'{path}': a noise of '{value}' cannot be; give 20 um, say")
+    if not 0 < length < 1:
+        raise MeasurementError(
+            f"{path}: the noise is '{plain(value, 40)}'; give a length below 1 m, such as 20 um"
+        )
     return length

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError, plain
+from tmlattice.input_files import content_of
 from tmlattice.lattice.lines import DEEPEST, Items, chosen, inner_names, items_of, laid_out
 from tmlattice.lattice.parts import Part, Report, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
@@ -329,7 +330,8 @@ class _Reader:
             raise LatticeError(f"it includes '{path}', which is no file")
         if self._files > MOST_FILES or depth > DEEPEST or path.stat().st_size > MOST_BYTES:
             raise LatticeError(f"it includes '{path}': too many files, or too large ones")
-        lines = path.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff").splitlines()
+        text = content_of(path, LatticeError).decode("utf-8", errors="replace")
+        lines = text.lstrip("\ufeff").splitlines()
         for text, number, after in _statements(lines):
             self.rpn.work(10)
             where = f"line {number} of {plain(path.name, 60)}"

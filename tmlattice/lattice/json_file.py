@@ -8,8 +8,6 @@ reading, as everywhere. A matrix is stored by its nonzero entries (`"12"` is row
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import numpy as np
 
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
+from tmlattice.input_files import check_shape, json_of
 from tmlattice.lattice.alike import Supplies
 from tmlattice.lattice.places import place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, NO_ERRORS, Element, Errors, Ring, number_names
@@ -135,7 +134,7 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
             f"'{path}' has version {content.get('version')!r} of '{FORMAT}', and this package "
             f"reads version {VERSION}; save it again with save_ring"
         )
-    _validate(path, content)
+    check_shape(path, content, "lattice", LatticeError)
     definitions = content["definitions"]
     sources = {key: made(path, key, value) for key, value in definitions.items()}
     for place, key in enumerate(content["sequence"]):
@@ -174,28 +173,7 @@ def _supplies(path: Path, ring: Ring, stated: Mapping[str, list[str]] | None) ->
 
 
 def _content(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise LatticeError(f"'{path}' is no JSON ({error}); mend it or save it again") from error
-
-
-@cache
-def _validator() -> Any:
-    from jsonschema import Draft202012Validator
-
-    schema = files("tmlattice") / "schemas" / "lattice.schema.json"
-    return Draft202012Validator(json.loads(schema.read_text(encoding="utf-8")))
-
-
-def _validate(path: Path, content: Any) -> None:
-    from jsonschema.exceptions import best_match
-
-    fault = best_match(_validator().iter_errors(content))
-    if fault is not None:
-        where = "/".join(map(str, fault.absolute_path)) or "the top"
-        said = fault.message if len(fault.message) < 200 else f"{fault.message[:200]}..."
-        raise LatticeError(f"'{path}', at {where}: {said}; mend it there or save the ring again")
+    return json_of(path, LatticeError, finite=False)
 
 
 def described(element: Element) -> dict[str, Any]:

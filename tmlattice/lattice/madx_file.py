@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError, first_of, plain
+from tmlattice.input_files import content_of
 from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out
 from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.madx_language import (
@@ -285,7 +286,8 @@ class _Reader:
             raise LatticeError(f"it calls '{path}': too many files, or too large ones")
         self._files.append(path)
         try:
-            self._read_text(path.read_text(encoding="utf-8", errors="replace"))
+            content = content_of(path, LatticeError)
+            self._read_text(content.decode("utf-8", errors="replace"))
         except _Stop as stop:
             if stop.everything:
                 raise

@@ -53,11 +53,12 @@ class Stated:
 
     @classmethod
     def of_header(cls, header: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> "Stated":
-        """Of a TWISS table. Its tunes are those of the design only where the orbit is straight."""
+        """Of a TWISS table. Its tunes are those of the design only where the orbit is straight;
+        without them in the header, the phase advances of the last row are."""
 
-        def number(key: str) -> float | None:
+        def number(key: str, where: Mapping[str, Any] = header) -> float | None:
             try:
-                value = float(header[key])
+                value = float(where[key])
             except (KeyError, TypeError, ValueError):
                 return None
             return value if np.isfinite(value) else None
@@ -72,11 +73,14 @@ class Stated:
             return cls(number("LENGTH"))
         if orbit > STRAIGHT:
             return cls(number("LENGTH"), orbit=orbit)
+        last = rows[-1] if rows else {}
+        mux, muy = number("MUX", last), number("MUY", last)
+        phases = None if mux is None or muy is None or not (mux or muy) else (mux, muy)
         # of second order BV=-1 is not the reversed fields in MAD-X itself
         slopes = None if number("BV_FLAG") == -1 else pair("DQ1", "DQ2")
         rf = any(row.get("VOLT") for row in rows)
         return cls(
-            number("LENGTH"), pair("Q1", "Q2"), slopes, number("ALFA") or None,
+            number("LENGTH"), pair("Q1", "Q2") or phases, slopes, number("ALFA") or None,
             tolerance=TUNES_WITH_RF if rf else TUNES,
         )  # fmt: skip
 
@@ -196,13 +200,8 @@ def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
     chain: list[list[tuple[Array, Array, Array]]] = []
     for element in ring.elements:
         own = vars(element.source.element).values()
-        key: Any = (
-            type(element.source),
-            element.kind,
-            *(v for v in own if isinstance(v, int | float)),
-        )
-        if element.kind in ("matrix", "wiggler", "solenoid"):  # arrays
-            key = id(element.source)
+        numbers = (v for v in own if isinstance(v, int | float | list | tuple | np.ndarray))
+        key = (type(element.source), element.kind, *(np.asarray(v).tobytes() for v in numbers))
         if key not in known:
             known[key] = _parts(element, ring.map_energy)
         chain.append(known[key])

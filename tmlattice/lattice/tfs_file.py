@@ -178,6 +178,15 @@ def _with_drifts(
             f"'{path}' has elements that overlap, whether S is at their exits or in their middle; "
             "give a table of all elements in their order"
         )
+    listed = any(str(row["KEYWORD"]).upper() == "DRIFT" for row in rows)
+    begins = [*zip((str(row["NAME"]) for row in rows), starts[fits[0]], strict=True)]
+    ends = [0.0, *(start + row["L"] for row, (_, start) in zip(rows, begins, strict=True))]
+    for (name, start), end in zip([*begins, ("its end", length or ends[-1])], ends, strict=True):
+        if listed and start - end > close:
+            raise LatticeError(
+                f"'{path}' has nothing from {end:.6g} m to {start:.6g} m, before "
+                f"'{plain(name, 60)}', and lists its drifts: a row is missing; write it again"
+            )
     parts: list[Part] = []
     at = 0.0
     for row, start in zip(rows, starts[fits[0]], strict=True):

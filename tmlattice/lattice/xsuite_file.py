@@ -6,7 +6,6 @@ Every class is in one of three lists: modelled; without effect on the static opt
 """
 
 import cmath
-import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, plain
+from tmlattice.input_files import json_of
 from tmlattice.lattice.expressions import Arithmetic
 from tmlattice.lattice.lines import chosen
 from tmlattice.lattice.parts import Part, Report, edge_focusing, fringe_of, ring_of_parts
@@ -114,7 +114,7 @@ def read_xsuite(
     """
     if path.stat().st_size > MOST_BYTES:
         raise LatticeError(f"'{path}' is larger than {MOST_BYTES / 1e9:g} GB; save one line")
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = json_of(path, LatticeError, finite=False)
     try:
         return _ring(path, content, name, sequence, energy)
     except LatticeError as error:

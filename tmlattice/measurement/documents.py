@@ -2,28 +2,16 @@
 
 import difflib
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import MeasurementError, UnknownNameError, plain
+from tmlattice.input_files import check_shape, json_of, schema_of, short
 
-MOST_DIGITS = 300
-"""Of a whole number: as a float it would be beyond all of them."""
 NEAR = 0.8
 """Likeness of a key to a known one from which it is taken for a slip of the pen."""
-
-
-@cache
-def _validator(schema: str) -> Any:
-    from jsonschema import Draft202012Validator
-
-    text = (files("tmlattice") / "schemas" / f"{schema}.schema.json").read_text(encoding="utf-8")
-    return Draft202012Validator(json.loads(text))
 
 
 def read_document(
@@ -46,37 +34,18 @@ def read_document(
         MeasurementError: no such file, not UTF-8, not JSON (with the line), another format or
             version, or not as the schema has it (with the place).
     """
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise MeasurementError(f"cannot read '{path}': {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise not_utf8(path, error) from error
-    try:
-        document = json.loads(
-            text, object_pairs_hook=_once, parse_constant=_no_constant, parse_int=_whole
-        )
-    except json.JSONDecodeError as error:
-        raise MeasurementError(
-            f"{path}, line {error.lineno}: not JSON ({error.msg}); mend it, or write it anew"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise MeasurementError(f"{path}: {error}") from error
+    document = json_of(path, MeasurementError)
     if not isinstance(document, dict) or document.get("format") != name:
         found = document.get("format") if isinstance(document, dict) else None
-        raise MeasurementError(f'{path}: its "format" is {_short(found)}; it should be "{name}"')
+        raise MeasurementError(f'{path}: its "format" is {short(found)}; it should be "{name}"')
     if document.get("version") != version or isinstance(document["version"], bool):
         raise MeasurementError(
-            f'{path}: its "version" is {_short(document.get("version"))}; this package reads '
+            f'{path}: its "version" is {short(document.get("version"))}; this package reads '
             f"{version}: write it in that version, or update tmlattice"
         )
     first(document)
-    from jsonschema.exceptions import best_match
-
-    wrong = best_match(_validator(schema).iter_errors(document))
-    if wrong is not None:
-        raise MeasurementError(f"{path}: {_explain(wrong)}")
-    if said := _misspelt(document, _validator(schema).schema):
+    check_shape(path, document, schema, MeasurementError)
+    if said := _misspelt(document, schema_of(schema).schema):
         raise MeasurementError(f"{path}: {said}")
     return document
 
@@ -152,67 +121,3 @@ def not_utf8(path: Path, error: UnicodeDecodeError, before: int = 0) -> Measurem
     """The error for a text file in another encoding; `before` lines were already read."""
     line = before + error.object[: error.start].count(b"\n") + 1
     return MeasurementError(f"{path}, line {line}: not UTF-8; save the file as UTF-8")
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    made: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in made:
-            raise ValueError(f'the key "{key}" stands twice in one object; keep one of the two')
-        made[key] = value
-    return made
-
-
-def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is not JSON; a number that is not finite is written as null")
-
-
-def _whole(digits: str) -> int:
-    if len(digits) > MOST_DIGITS:
-        raise ValueError(f"a number of {len(digits)} digits; write it with an exponent")
-    return int(digits)
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, default=str, ensure_ascii=False)
-    return text if len(text) <= 40 else f"{text[:37]}..."
-
-
-_KINDS = {
-    "number": "a number",
-    "integer": "a whole number",
-    "string": "a text",
-    "object": "an object {...}",
-    "array": "a list [...]",
-    "null": "null",
-    "boolean": "true or false",
-}
-
-
-def _explain(error: Any) -> str:
-    """One sentence: where, what stands there, what should."""
-    place = "".join(
-        f"[{step}]" if isinstance(step, int) else f".{step}" for step in error.absolute_path
-    ).lstrip(".")
-    kind, wanted, value = error.validator, error.validator_value, error.instance
-    if kind == "required":
-        missing = next(name for name in wanted if name not in value)
-        return f'{place or "it"} has no "{missing}"; add it'
-    if kind == "additionalProperties":
-        known = error.schema.get("properties", {})
-        strange = next((name for name in value if name not in known), "?")
-        return f'{place} has a key "{strange}"; known are {", ".join(known)}'
-    if kind == "type":
-        types = [wanted] if isinstance(wanted, str) else wanted
-        should = f"should be {' or '.join(_KINDS[t] for t in types)}"
-    elif kind == "enum":
-        should = f"should be one of {', '.join(_short(w) for w in wanted)}"
-    elif kind == "exclusiveMinimum":
-        should = f"should be above {wanted}"
-    elif kind == "minimum":
-        should = f"should be {wanted} or more"
-    elif kind in ("minItems", "minProperties", "minLength"):
-        should = "should not be empty"
-    else:
-        should = f"breaks the rule {kind} = {_short(wanted)}"
-    return f"{place or 'it'} is {_short(value)}; it {should}"

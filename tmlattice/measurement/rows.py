@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.input_files import check_regular
 from tmlattice.measurement.documents import not_utf8
 from tmlattice.measurement.monitors import Names, merge_spellings
 
@@ -105,8 +106,7 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
     columns: dict[str, list[Any]] = defaultdict(list)
     index: dict[str, dict[str, int]] = {}
     done = 0
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise MeasurementError(f"'{path}' is a pipe or a device; give a file")
+    check_regular(path, MeasurementError)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, skipinitialspace=True)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
+from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement.documents import located
 from tmlattice.measurement.monitors import Names, merge_spellings
 from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read_rows
@@ -97,30 +98,22 @@ def read_turn_by_turn(
         OtherFormatError: the file cannot be read as that kind.
         MeasurementError: its readings cannot be metres.
     """
-    import turn_by_turn
-
     path = Path(path)
     scale = _scale(unit)
-    if not path.is_file():
-        raise MeasurementError(f"no turn-by-turn file '{path}'")
-    try:
-        data = turn_by_turn.read(path, datatype=datatype)
-        tables = [(bunch.X, bunch.Y) for bunch in data.matrices]
-    except Exception as error:  # whatever a reader meets in a file of another kind
-        raise OtherFormatError(
-            f"{path}: cannot be read as '{datatype}' ({type(error).__name__}: {error}); name the "
-            f"kind of the file ({KINDS})"
-        ) from error
-    spellings = list(dict.fromkeys(str(n) for x, y in tables for n in (*x.index, *y.index)))
+    if datatype not in KINDS.split(", "):
+        raise OtherFormatError(f"no kind '{datatype}' of turn-by-turn files; there are {KINDS}")
+    tables, bunches = read_apart(
+        "turns", path, f"'{datatype}' (kinds: {KINDS})", OtherFormatError, datatype
+    )
+    spellings = list(dict.fromkeys(n for table in tables for names, _ in table for n in names))
     found, places = merge_spellings(spellings)
     place = dict(zip(spellings, places.tolist(), strict=True))
     # a file may state fewer turns than it has: the tables count
-    turns = max((frame.shape[1] for planes in tables for frame in planes), default=0)
+    turns = max((values.shape[1] for planes in tables for _, values in planes), default=0)
     readings = np.full((len(tables), turns, len(found), 2), np.nan)
     for shot, planes in enumerate(tables):
-        for plane, frame in enumerate(planes):
-            values = frame.to_numpy(dtype=float)
-            index = [place[str(name)] for name in frame.index]
+        for plane, (names, values) in enumerate(planes):
+            index = [place[name] for name in names]
             if len(set(index)) < len(index):
                 raise MeasurementError(f"{path}: a monitor stands twice; name each once")
             readings[shot, : values.shape[1], index, plane] = scale * values
@@ -141,7 +134,7 @@ def read_turn_by_turn(
             readings=readings,
             monitors=found,
             noise=noise,
-            shots=tuple(int(i) for i in data.bunch_ids),
+            shots=tuple(bunches),
         )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 from tmlattice.errors import TmlatticeError
+from tmlattice.input_files import zip_of
 from tmlattice.lattice.ring import Ring
 from tmlattice.network.network import TaylorNetwork
 
@@ -23,16 +24,16 @@ def load_network(ring: Ring, path: Path) -> TaylorNetwork:
     Raises:
         TmlatticeError: no such file, no network's, or one of a ring of other magnets.
     """
+    wanted = (
+        f"the weights of a network of '{ring.name}'; name the network.pt that `tmlattice tune-fit` "
+        "wrote for this lattice"
+    )
+    content = zip_of(path, TmlatticeError, wanted)
     try:
-        weights = torch.load(path, weights_only=True)
+        weights = torch.load(content, weights_only=True)
         dimension = int(weights["W0"].shape[1])
         network = TaylorNetwork.from_ring(ring, dimension)
         network.load_state_dict(weights)
-    except OSError as error:
-        raise TmlatticeError(f"cannot read '{path}': {error.strerror or error}") from error
     except Exception as error:
-        raise TmlatticeError(
-            f"'{path}' does not hold the weights of a network of '{ring.name}'; name the "
-            "network.pt that `tmlattice tune-fit` wrote for this lattice"
-        ) from error
+        raise TmlatticeError(f"'{path}' does not hold {wanted}") from error
     return network

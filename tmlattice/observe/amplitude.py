@@ -151,8 +151,8 @@ def _fill(
         squares = (np.abs(change) ** 2).sum(axis=(1, 2))
         return np.asarray(np.sqrt(squares / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))))
 
-    # a mode without a line was not kicked
-    there = np.isfinite(rms(whole) + rms(half) + tune)
+    # a mode without a line was not kicked, or its plane was not read
+    there = np.isfinite(rms(whole) + rms(half) + tune) & (size != 0)
     large = there & (rms(whole) > SEEN)
     share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
     shift.modes[shots] = np.where(there[:, None, None], whole, 0.0)

@@ -45,6 +45,7 @@ def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
     try:
         _check(causes)
         check(ring, causes)
+        _once(causes)
     except TmlatticeError as error:
         raise type(error)(f"{path}: {error}") from error
     return causes
@@ -227,3 +228,13 @@ def _check(causes: Iterable[Cause]) -> None:
             raise EffectError(
                 f"'{cause.effect}' is no calibration; those are {', '.join(CALIBRATES)}"
             )
+
+
+def _once(causes: Iterable[Cause]) -> None:
+    """Of an effect that is stated twice of one element, the amounts would be added."""
+    seen: set[tuple[str, str]] = set()
+    for cause in causes:
+        place = cause.element or "the beam"
+        if (key := (cause.effect, place.casefold())) in seen:
+            raise EffectError(f"the effect {cause.effect} of '{place}' stands twice; keep one")
+        seen.add(key)

@@ -87,10 +87,12 @@ class FirstTurns(Problem):
     def standing(self, causes: Sequence[Cause]) -> "FirstTurns":
         """With errors of magnets and monitors in the model itself, where there are many: each
         trajectory would build all these magnets again."""
-        built = [c for c in causes if isinstance(find(c.effect), RingEffect | ReadingEffect)]
+        rest, built = list[Cause](), list[Cause]()
+        for cause in causes:
+            of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
+            (built if of_model else rest).append(cause)
         if len(built) < MANY:
             return super().standing(causes)
-        rest = [c for c in causes if not isinstance(find(c.effect), RingEffect | ReadingEffect)]
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:

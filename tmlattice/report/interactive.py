@@ -72,6 +72,17 @@ def _short(values: ArrayLike, digits: int = 5) -> list[float | None]:
     ]
 
 
+def as_plain(text: str) -> str:
+    """A text for plotly that is shown as it stands, in the lines that it has.
+
+    Plotly takes tags, entities and, in templates, `%{x}` for its own; `"@..."` is a colour of the
+    page's style (`page.js`).
+    """
+    for character in "&<>%@":  # & first: the others become entities
+        text = text.replace(character, f"&#{ord(character)};")
+    return text.replace("\n", "<br>")
+
+
 def _colour(name: str) -> str:
     return name if name.startswith("@") else str(to_hex(name))
 
@@ -80,21 +91,24 @@ def _trace(
     x: ArrayLike, y: ArrayLike, name: str, colour: str, *, mode: str = "lines", size: float = 1.2,
     text: Sequence[str] | None = None, told: str = "", dash: str = "solid", **more: Any,
 ) -> Figure:  # fmt: skip
-    """A line, or markers, whose points tell their `text`, and then what `told` makes of them."""
+    """A line, or markers, whose points show their `text`, and then the template `told`."""
     style: Figure = {"line": {"width": size, "color": _colour(colour), "dash": dash}}
     if mode == "markers":
         style = {"marker": {"size": size, "color": _colour(colour)}}
     hover: Figure = {"hoverinfo": "skip"}
     if text is not None:
-        hover = {"text": list(text), "hovertemplate": f"%{{text}}{told}<extra></extra>"}
+        hover = {
+            "text": [as_plain(one) for one in text],
+            "hovertemplate": f"%{{text}}{told}<extra></extra>",
+        }
     return {
-        "type": "scatter", "x": _short(x, 6), "y": _short(y, 4), "name": name, "mode": mode,
-        **style, **hover, **more,
+        "type": "scatter", "x": _short(x, 6), "y": _short(y, 4), "name": as_plain(name),
+        "mode": mode, **style, **hover, **more,
     }  # fmt: skip
 
 
 def _axis(title: str, **more: Any) -> Figure:
-    return {"title": {"text": title}, "automargin": True, "zeroline": False, **more}
+    return {"title": {"text": as_plain(title)}, "automargin": True, "zeroline": False, **more}
 
 
 def _layout(height: int, **axes: Any) -> Figure:
@@ -170,7 +184,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         own = [ring.elements[i] for i in places]
         trace = _trace(at[:, 0], at[:, 1], plural(kind), colour, mode="markers",
                        size=3 if small else 4, told=f"<br>{kind}",
-                       text=[f"{e.name}<br>s = {e.s:.2f} m" for e in own])  # fmt: skip
+                       text=[f"{e.name}\ns = {e.s:.2f} m" for e in own])  # fmt: skip
         trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
         traces.append(trace)
     for number, finding, place, lines_off in plan_view.placed(diagnosis, view):
@@ -180,7 +194,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         traces.append({
             **_trace(place[:1], place[1:], name, "@culprit", mode="markers", size=20,
                      text=[plan_view.label(number, finding)], showlegend=False,
-                     told=f"<br>{name}<br>s = {_s_text(finding.s, finding.where)}"),
+                     told=f"<br>{as_plain(name)}<br>s = {_s_text(finding.s, finding.where)}"),
             "mode": "markers+text",
             "texttemplate": f"{aside[4:]}<br> %{{text}} " if aside and high == "bottom"
             else f" %{{text}} {aside}",
@@ -228,7 +242,7 @@ def readings(diagnosis: Diagnosis) -> Figure:
             values = 1e3 * (read - predicted)[shot, first, plane]
             traces.append(
                 _trace(s, values, model, colour, text=names, showlegend=not plane,
-                       told=f"<br>s = %{{x:.2f}} m<br>{name} less {model}: %{{y:.4f}} mm",
+                       told=f"<br>s = %{{x:.2f}} m<br>{name} less {as_plain(model)}: %{{y:.4f}} mm",
                        legendgroup=model, yaxis="y2" if plane else "y")
             )  # fmt: skip
     layout = _layout(
@@ -254,12 +268,13 @@ def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
         ):
             traces.append(
                 _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
-                       told=f"<br>{part.label}, {model}<br>%{{y:.3g}} times the noise",
+                       told=f"<br>{as_plain(part.label)}, {as_plain(model)}<br>"
+                       "%{y:.3g} times the noise",
                        showlegend=not k, legendgroup=model, yaxis=axis)
             )  # fmt: skip
         top = 1 - k * height
         axes[axis.replace("y", "yaxis")] = _axis(
-            f"{part.label}<br>left / noise", type="log", dtick=1, domain=[top - 0.85 * height, top]
+            f"{part.label}\nleft / noise", type="log", dtick=1, domain=[top - 0.85 * height, top]
         )
     last = f"y{len(shown) + 1}"
     axes[last.replace("y", "yaxis")] = {**_STRIP_AXIS, "domain": [0, 0.06]}
@@ -297,7 +312,7 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
     shown: set[str] = set()
     for effect, own in sorted(by_effect.items(), key=lambda item: order_of[find(item[0]).group]):
         group = find(effect).group
-        told = [f"{found.hypotheses[i][1]}<br>{_amount(effect, found.amount[i])}" for i in own]
+        told = [f"{found.hypotheses[i][1]}\n{_amount(effect, found.amount[i])}" for i in own]
         traces.append(
             _trace(s[own], found.statistic[own], group, COLOURS[group], mode="markers", size=4,
                    told=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
@@ -327,7 +342,7 @@ def gap(diagnosis: Diagnosis) -> Figure:
     assert diagnosis.heldout is not None
     rms = [1e6 * step.rms for step in diagnosis.heldout.misfits]
     wrapped = [wrap(label, 28) for label in gap_labels(diagnosis)]
-    labels = ["<br>".join(lines) for lines in wrapped]
+    labels = [as_plain("\n".join(lines)) for lines in wrapped]
     pitch = max(48, 10 + 17 * max(len(lines) for lines in wrapped))
     rows = list(range(len(rms)))
     noise = noise_rms(diagnosis)
@@ -374,7 +389,7 @@ def steps(diagnosis: Diagnosis) -> Figure:
     traces.append(
         _trace([0, len(kept) - 1], [noise, noise], f"noise {noise:.2g} µm", "@faint", dash="dot")
     )
-    names = ["<br>".join(wrap(step.effect.replace("_", " "), 16)) for step in kept]
+    names = [as_plain("\n".join(wrap(step.effect.replace("_", " "), 16))) for step in kept]
     layout = _layout(
         400, xaxis={"tickvals": at, "ticktext": names, "automargin": True},
         yaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
@@ -389,7 +404,7 @@ def gradients(diagnosis: Diagnosis) -> Figure:
         for c, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True)
         if c.effect == "quadrupole_gradient"
     ]
-    told = [f"{name}<br>{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
+    told = [f"{name}\n{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
     trace = _trace([r[1] for r in rows], [r[2] for r in rows], "gradient error", "tab:red",
                    mode="markers", size=5, text=told, told="<br>s = %{x:.2f} m",
                    showlegend=False)  # fmt: skip

@@ -66,11 +66,26 @@ def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Pic
     pictures = []
     for name, caption, figure in figures:
         path = folder / f"{name}.png"
+        _no_formulas(figure)
         figure.savefig(path, dpi=DPI)
         plt.close(figure)
         shrink(path)
         pictures.append(Picture(name, caption, path))
     return pictures
+
+
+def _no_formulas(figure: "Figure") -> None:
+    """Dollar signs of names are no formula, which matplotlib would set, or fail to."""
+    from matplotlib.text import Text
+    from matplotlib.ticker import FixedFormatter
+
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and "$" in text.get_text().replace(r"$\mathdefault", ""):
+            text.set_parse_math(False)
+    for axis in (a for axes in figure.axes for a in (axes.xaxis, axes.yaxis)):
+        formatter = axis.get_major_formatter()
+        if isinstance(formatter, FixedFormatter):  # its texts come when it is drawn
+            formatter.seq = [str(text).replace("$", r"\$") for text in formatter.seq]
 
 
 def shrink(path: Path) -> None:
@@ -126,4 +141,4 @@ LIBRARY = "vendor/plotly-basic.min.js"
 def _inlined(figure: Any) -> str:
     """As JSON that may stand between the tags of a script."""
     text = json.dumps(figure, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
-    return text.replace("</", "<\\/").replace("<!--", "<\\!--")
+    return text.replace("<", "\\u003c")
