@@ -54,15 +54,17 @@ def test_gradients_of_bends_are_found(bent):
     data, bends, wrong = bent
     fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), OPEN)
     assert all(error > 0 for _, error in told(fit.state)[0])
-    found = {(c.effect, c.element): c.amount for c, _ in told(fit.state)[0]}
-    mean = np.mean([found["bend_gradient", name] for name in bends]) / GRADIENT
+    found = {(c.effect, c.element): (c.amount, error) for c, error in told(fit.state)[0]}
+    own = np.array([found["bend_gradient", name] for name in bends])
+    mean, error = np.mean(own[:, 0]) / GRADIENT, np.mean(own[:, 1]) / abs(GRADIENT)
     left = [
         amount - WRONG.get(name, 0.0)
-        for (effect, name), amount in found.items()
+        for (effect, name), (amount, _) in found.items()
         if effect == "quadrupole_gradient"
     ]
-    assert abs(mean - np.mean(wrong)) < 1e-3
-    assert np.std(left) < 2e-4
+    assert error < 1.5e-3  # the scatter of the bends, which is a misfit
+    assert abs(mean - np.mean(wrong)) < 2 * error
+    assert np.std(left) < 3e-4
 
 
 def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
@@ -80,9 +82,9 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
         ]
         return np.sqrt(np.mean(np.square(left)))
 
-    assert pull(state) > 4
     tried = replace(state, closed=(BendGradient(),))
-    assert pull(tried) < 2
+    assert pull(state) > 10
+    assert pull(tried) < 3  # their scale is a first guess, one number
     assert not allow(tried, [BendGradient()]).closed
 
 

@@ -157,7 +157,7 @@ def test_a_scale_that_fell_is_found_again(rng):
     assert_allclose(found, found[1], rtol=0.15)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, 3, 7])
 def test_gains_come_in_with_any_seed(small_ring, seed):
     """Gains of 10 % and gradients of 1 % in readings that tell little of each: nothing was kept
     with most seeds, for the gains' size had fallen to nothing before the gradients came in."""
@@ -173,12 +173,13 @@ def test_gains_come_in_with_any_seed(small_ring, seed):
         for plane in "xy"
     ]
     measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=4e-6, rf_step=-3000.0, engine="ocelot",
+        small_ring, causes, kick=1e-5, noise=2e-6, rf_step=-3000.0, engine="ocelot",
         progress=False, seed=3,
     ).measured  # fmt: skip
     data = response_data(small_ring, measured)
     fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(seed)), FAMILIES[:4])
-    assert fit.state.groups["monitor_gain"].rms == pytest.approx(0.1, rel=0.5)
+    # the scale of Student's distribution with four degrees of freedom is its rms over sqrt(2)
+    assert fit.state.groups["monitor_gain"].rms == pytest.approx(0.1 / np.sqrt(2), rel=0.5)
     first, last = fit.steps[0], fit.steps[-1]
     assert last.dispersion_rms < 0.7 * first.dispersion_rms
     assert last.heldout_chi2_per_dof < 1.05 * first.heldout_chi2_per_dof

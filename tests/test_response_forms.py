@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tmlattice.diagnosis.response.odd_readings import without_gross
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import FAMILIES
@@ -15,6 +14,7 @@ from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing import control, weigh
+from tmlattice.diagnosis.response.outliers import without_gross
 from tmlattice.diagnosis.response.strangers import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT

@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 
 LARGEST_GRADIENT = 0.02
 """Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
-LARGEST_SKEW = 5e-4  # 1/m: half a millimetre of orbit in a sextupole
 FURTHEST = 0.05
 """m, prior rms of the way to a corrector's field at most: further off is another corrector's."""
 
@@ -156,15 +155,24 @@ class BendGradient(_Magnets):
 
 
 class SkewGradient(_Thin):
-    """Skew gradients in quadrupoles."""
+    """Skew gradients in quadrupoles that are rolled, and in sextupoles: of windings, and of a beam
+    that passes above their axis."""
 
     name = effect = "skew_gradient"
     effects: ClassVar[tuple[str, ...]] = ("skew_gradient",)
-    block, variable, trust = 1, "skew", 3e-4  # 1/m: larger steps move the tunes
+    block, variable, trust = 1, "skew", 1e-3  # 1/m: larger steps move the tunes
+
+    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
+        return magnets(ring, ("quadrupole", "sextupole"))
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each."""
-        return [Group(self.name, np.eye(self.size(data)), 3e-4, TAILS, most=LARGEST_SKEW)]
+        """Of each, with a scale for either kind."""
+        kinds = np.array([own[0].kind for own in self._places(data.ring)])
+        each = np.eye(len(kinds))
+        return [
+            Group(f"{self.name} of {kind}s", each[:, kinds == kind], 3e-4, TAILS)
+            for kind in dict.fromkeys(kinds.tolist())
+        ]
 
 
 class OtherGradient(_Thin):

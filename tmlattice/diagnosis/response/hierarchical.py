@@ -23,11 +23,20 @@ from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.steps import FAMILIES, SECOND
 from tmlattice.diagnosis.response.exchanged import exchanged, mislabelled
 from tmlattice.diagnosis.response.first_guess import begun, strange
-from tmlattice.diagnosis.response.judges import Chi2, Score, against, inner, lost, score
+from tmlattice.diagnosis.response.judges import (
+    CORRECTORS,
+    Chi2,
+    Score,
+    against,
+    inner,
+    lost,
+    score,
+)
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.outliers import good_monitors, outliers, without
-from tmlattice.diagnosis.response.rounds import settle
+from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import Outcome, State, allow, begin, bend, forbid, jump
+from tmlattice.diagnosis.response.weights import with_waves
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import solve
 from tmlattice.observe.response_data import ResponseData
@@ -38,17 +47,17 @@ Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
-WAVES = "waves"
-"""The kind of common modes that is admitted by validation."""
+WORTH = 10.0
+"""Log evidence from which on waves of the orbit in each step are asked for."""
 LEADS, ROUGH = 5e-3, 0.03
 """Share of the cost that a round has to gain for another one, of a fit that leads to the next one;
 and of one that is compared."""
 ASTRAY, NEAR = 1.2, 1e-3
 """So many times what the design leaves of the typical column's square no result may leave; or this
 share of it, if that is more."""
-SPOILT, ENOUGH = 0.05, 3
+SPOILT, SURELY, ENOUGH = 0.05, 2.0, 3
 """By how much the logarithms of the validation scores may rise with all families, if that is more
-than their standard error, and inner correctors that it takes to say so."""
+than so many of their standard errors, and inner correctors that it takes to say so."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +175,7 @@ def fit_families(
         (*refused, replace(Step.scored(title, count, score(state, split.held)), kept=False)),
         (before, before), tuple(messages),
     )  # fmt: skip
-    if enough and -rise > max(SPOILT, unsure):
+    if enough and -rise > max(SPOILT, SURELY * unsure):
         return nothing
     progress("all correctors")
     # the inner ones begin at what they say: a column far off would weigh nothing, and stay there
@@ -197,14 +206,15 @@ def _refused(state: State, family: Family) -> Step:
 
 
 def _validated(state: State, refused: list[Step], progress: Callable[[str], Any]) -> State:
-    """The state with waves of the orbit in each step, if inner correctors want them, for these
-    absorb what gradients should explain; and without late families that they reject."""
+    """The state with waves of the orbit in each step, if the readings ask for them and inner
+    correctors do not object, for waves absorb what gradients should explain; and without late
+    families that inner correctors reject."""
     progress("validation")
-    kinds = (*state.noise.kinds, WAVES)
-    more = settle(replace(state, noise=replace(state.noise, kinds=kinds)), gain=LEADS)
-    rise = lost(inner(more), inner(state))
-    log.info("without waves: validation %+.3f +- %.3f", -rise[0], rise[1])
-    if against(rise):
+    more = settle(with_waves(state), gain=LEADS)
+    rise = lost(inner(state), inner(more), CORRECTORS)
+    gained = log_evidence(more) - log_evidence(state)
+    log.info("waves: evidence %+.1f, validation %+.3f +- %.3f", gained, *rise)
+    if gained > WORTH and not against(rise):
         state = more
     for family in [own for own in state.families if own.name in SECOND]:
         if not state.values[family.variable].any():

@@ -20,6 +20,8 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
 reading a monitor), and by how much their sum may fall without a step that stays all the same:
 evidence takes what the model lacks for noise, and gladly fits it."""
+CORRECTORS = np.array([1.0, 1.0, 0.0])
+"""The same, of correctors alone: all monitors share a jitter of the RF's orbit."""
 FLOOR = np.array([0.1, 0.1, 1.0])
 """Of the noise, beside what is left in-plane, across and of the RF: what is left of nothing (a
 model's own orbit) is no better for being less."""
@@ -181,14 +183,19 @@ def inner(state: State) -> Judged:
     return Judged(columns, rf)
 
 
-def lost(without: Judged, within: Judged) -> tuple[float, float]:
+def lost(without: Judged, within: Judged, counts: Array = JUDGES) -> tuple[float, float]:
     """By how much the judges' figures rise, and its standard error: by the jackknife, each
-    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing."""
-    whole = float(np.nansum(JUDGES * (without.logs - within.logs)))
+    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing.
+
+    Args:
+        without, within: what is compared.
+        counts: weights of in-plane, across and RF readings.
+    """
+    whole = float(np.nansum(counts * (without.logs - within.logs)))
     variance = 0.0
     for now, then, weights in (
-        (within.columns, without.columns, JUDGES[:2]),
-        (within.rf[:, None], without.rf[:, None], JUDGES[2:]),
+        (within.columns, without.columns, counts[:2]),
+        (within.rf[:, None], without.rf[:, None], counts[2:]),
     ):
         judged = now[:, 0, 1] > 0
         if judged.sum() > 1:

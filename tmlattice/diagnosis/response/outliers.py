@@ -146,7 +146,8 @@ def _robust(patterns: Array, read: Array) -> Array:
 
 def misfits(state: State, left: Array) -> Array:
     """By how many times what a step leaves is more than what the typical one of its plane does,
-    both in metres and as a share of its orbit, in the plane read where that is more, [column].
+    in metres, as a share of its orbit and of what is read, in the plane read where that is more,
+    [column].
 
     Args:
         state: of the fit.
@@ -154,21 +155,41 @@ def misfits(state: State, left: Array) -> Array:
     """
     data = state.data
     out = np.zeros(len(data.plane))
+    noise = np.median(data.noise, axis=0)
+    orbits, sizes = (
+        np.stack([_typical(own[:-1, state.good, read]) for read in (0, 1)], axis=1)
+        for own in (data.orbits, left)
+    )
+    columns = np.arange(len(orbits))
+    straight = data.plane[:-1]
+    usual = np.nanmedian(sizes[columns, straight] / np.fmax(orbits, noise)[columns, straight])
     for kicked in (0, 1):
-        rows = np.flatnonzero(data.plane[:-1] == kicked)
-        orbit = _typical(data.orbits[rows][:, state.good, kicked])
+        rows = np.flatnonzero(straight == kicked)
         for read in (0, 1):
-            size = _typical(left[rows, :, read])
+            size, orbit = sizes[rows, read], orbits[rows, kicked]
             told = np.isfinite(size) & np.isfinite(orbit)
             if told.sum() < COLUMNS:
                 continue
-            noise = float(np.median(data.noise[:, read]))
-            share = size / np.maximum(orbit, noise)
-            least = max(float(np.median(size[told])), NOISE * noise / STEP)
-            ratio = np.minimum(size / least, share / max(float(np.median(share[told])), 1e-300))
-            ratio = np.where(told, ratio, 0.0)
+            share = size / np.maximum(orbit, float(np.median(data.noise)))
+            # what is not fitted is left larger
+            least = np.maximum(_medians(size, told, state.fitted[rows]), NOISE * noise[read] / STEP)
+            typical = np.maximum(_medians(share, told, state.fitted[rows]), 1e-300)
+            ratio = np.minimum(size / least, share / typical)
+            # a corrector that is rolled makes an orbit in the other plane, which the fit leaves as
+            # large a share of as of others
+            across = usual * np.fmax(orbits[rows, read], noise[read])
+            ratio = np.where(told, np.fmin(ratio, size / np.maximum(across, 1e-300)), 0.0)
             if (ratio > STEP).sum() <= MOST * told.sum():
                 out[rows] = np.maximum(out[rows], ratio)
+    return out
+
+
+def _medians(own: Array, told: Flags, fitted: Flags) -> Array:
+    """Of each row, the median of all or of those that are fitted, or not, as it is; the larger."""
+    out = np.full(len(own), np.median(own[told]))
+    for alike in (fitted, ~fitted):
+        if (told & alike).any():
+            out[alike] = np.maximum(out[alike], np.median(own[told & alike]))
     return out
 
 

@@ -20,7 +20,7 @@ from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.weights import weight
+from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.normal import Normal, solve
@@ -125,7 +125,9 @@ def _rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
     column = len(state.data.plane) - 1
     own = weight(state, 0)[column]
     read = np.flatnonzero(own > 0)
-    return read, np.diag(own[read]), state.data.pick(state.at.left)[column, read]
+    common = taken(state, 0)[column, read]
+    inverse = np.diag(own[read]) - common @ common.T
+    return read, inverse, state.data.pick(state.at.left)[column, read]
 
 
 def _pulls(

@@ -81,8 +81,14 @@ def patterns(state: State, block: int) -> Array:
     if "place" in noise.kinds and block == 0:
         kicks = data.kicks * (1 + at.errors.calibration)
         out[:, KINDS["place"]] = (data.pick(at.seen(at.jumps)) * kicks[:, None])[:, None]
-    out[-1] = 0.0  # the RF's orbit is one: what is common to it is its own
-    return np.asarray(out * noise.size[block][:, :, None])
+    out *= noise.size[block][:, :, None]
+    # the RF's orbit is one: what is common to it is its own, but for a jitter of the beam, which
+    # readings across show best
+    out[-1] = 0.0
+    if "waves" in noise.kinds:
+        read = plane[-1]
+        out[-1, KINDS["waves"]] = noise.waves[read] * noise.scale[1, read, 0]
+    return out
 
 
 def taken(state: State, block: int) -> Array:
@@ -147,6 +153,39 @@ def learnt(state: State, spent: dict[int, Spent], alike: bool = False) -> State:
     return replace(state, noise=replace(new, column=column, monitor=monitor))
 
 
+def with_waves(state: State) -> State:
+    """With waves of the orbit in each step, as large as least squares of what the fit leaves makes
+    them: beside misfits that have learnt them they would stay at nothing."""
+    old = state.noise
+    noise = replace(
+        old, kinds=(*old.kinds, "waves"), column=old.column.copy(), size=old.size.copy(),
+        scale=old.scale.copy(),
+    )  # fmt: skip
+    for block in (0, 1):
+        use, plane = used(state, block), state.data.plane_of(block)
+        left = np.where(use, state.data.pick(state.at.left, block), 0.0)
+        amounts = np.full((len(use), noise.waves.shape[1]), np.nan)
+        for c in np.flatnonzero(use.sum(axis=1) > 2 * noise.waves.shape[1])[:-1]:
+            seen = use[c]
+            modes = noise.waves[plane[c]][:, seen].T
+            amounts[c] = np.linalg.lstsq(modes, left[c, seen], rcond=None)[0]
+            rest = np.sum((left[c, seen] - modes @ amounts[c]) ** 2) / (seen.sum() - modes.shape[1])
+            square = rest - np.mean(state.data.noise_of(block)[c, seen] ** 2)
+            noise.column[block, c] = min(noise.column[block, c], max(square, _floor(state)))
+        for read in (0, 1):
+            own = amounts[plane == read]
+            own = own[np.isfinite(own[:, 0])]
+            if len(own):
+                noise.scale[block, read, 0] = float(np.sqrt(np.mean(np.median(own**2, axis=0))))
+            noise.size[block, plane == read, KINDS["waves"]] = noise.scale[block, read, 0]
+    return replace(state, noise=noise)
+
+
+def _floor(state: State) -> float:
+    """The misfit of a column at least, m^2."""
+    return (LEAST * float(np.median(state.data.noise))) ** 2
+
+
 def _learn_modes(
     state: State, block: int, use: Flags, likely: Array, kept: Array, alike: bool
 ) -> None:
@@ -203,7 +242,7 @@ def _learn_misfits(
         use, np.minimum((FREEDOM + 1) / (FREEDOM + left**2 * grown / usual), 1.0), 1.0
     )
     square = noise.share[block] * left**2 * grown - data.noise_of(block) ** 2
-    floor = (LEAST * float(np.median(data.noise))) ** 2
+    floor = _floor(state)
     before = noise.monitor[block].copy()
     for _ in range(3):  # columns and monitors explain the same squares
         rest = np.where(use, square - noise.monitor[block][plane], 0.0).sum(axis=1)
