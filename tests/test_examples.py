@@ -113,3 +113,21 @@ def test_what_several_measurements_say_together(place, monkeypatch):
     right(finding.remedy)
     (printed,) = re.findall(r"seen_by  # (.*)", code)
     assert finding.seen_by == pytest.approx(json.loads(printed), abs=0.05)
+
+
+def test_the_ring_as_a_layer_learns_as_written():
+    names = {}
+    exec("\n".join(blocks("network_layer.md", "python")), names)
+    assert names["losses"][-1] < 0.5 * names["losses"][0]
+    assert names["closure"]().item() < 1e6 * names["losses"][-1]  # LBFGS goes further
+    moved = (names["tuned"].W1 != names["network"].W1).any(dim=(1, 2)).tolist()
+    magnets = names["ring"].magnets
+    free = [m.kind == "sextupole" or m.name.startswith("qd") for m in magnets]
+    assert moved == free
+    assert names["two"].shape == (32, 2, 246, 2)
+    assert names["found"].shape == (2, 32, 246, 2)
+    small = names["tunes"].fraction[0]
+    assert small == pytest.approx(names["optics"].tunes, abs=1e-3)
+    motion = names["optics"].normalised(names["centroid"])[:, 0]  # of a rigid beam its size is kept
+    assert abs(motion[0]) == pytest.approx(2e-5 * names["optics"].beta[0] ** 0.5, rel=0.1)
+    assert abs(motion[-1]) < 1.05 * abs(motion[0])

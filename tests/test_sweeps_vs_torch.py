@@ -8,7 +8,7 @@ import torch
 from tmlattice import TaylorNetwork
 from tmlattice.beam import sweeps, threads
 from tmlattice.errors import BeamLostError
-from tmlattice.network.reference import plain_readings
+from tmlattice.network import plain_readings
 
 
 def dense(network, rng, size=1e-3):

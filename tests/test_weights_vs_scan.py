@@ -20,7 +20,7 @@ from tmlattice.fitting.weights import read_gradient, read_network
 from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import scan
 from tmlattice.machine import simulate
-from tmlattice.network.reference import plain_readings
+from tmlattice.network import plain_readings
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 

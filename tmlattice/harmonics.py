@@ -79,7 +79,7 @@ def tunes(states: Array, optics: Optics | None = None, method: Method | str = "n
     states = np.asarray(states, dtype=float)
     if states.ndim != 3 or states.shape[2] < 4:
         raise ValueError(f"states have the shape {states.shape}; it should be [batch, turns, 4]")
-    batch, turns = states.shape[:2]
+    turns = states.shape[1]
     if turns < MIN_TURNS:
         raise TooFewTurnsError(f"{turns} turns are too few for a tune; {MIN_TURNS} at least do")
     finite = np.all(np.isfinite(states), axis=2)
@@ -87,16 +87,11 @@ def tunes(states: Array, optics: Optics | None = None, method: Method | str = "n
         trajectory = int(np.any(~finite, axis=1).argmax())
         turn = int((~finite[trajectory]).argmax())
         raise TooFewTurnsError(f"trajectory {trajectory} is lost in turn {turn}: it has no tune")
-    fraction, error, amplitude = (np.empty((batch, 2)) for _ in range(3))
-    z = normalised(states, optics)
+    signals = levelled(np.ascontiguousarray(normalised(states, optics).swapaxes(1, 2)))
     half = turns // 2
-    for trajectory in range(batch):
-        for plane in range(2):
-            signal = levelled(z[trajectory, :, plane])
-            fraction[trajectory, plane], amplitude[trajectory, plane] = frequency(signal, method)
-            first, _ = frequency(signal[:half], method)
-            second, _ = frequency(signal[-half:], method)
-            error[trajectory, plane] = abs((first - second + 0.5) % 1.0 - 0.5) / 2
+    fraction, amplitude = frequency(signals, method)
+    first, second = (frequency(s, method)[0] for s in (signals[..., :half], signals[..., -half:]))
+    error = np.abs((first - second + 0.5) % 1.0 - 0.5) / 2
     if not np.isfinite(fraction).all():
         raise TooFewTurnsError(
             f"no steady line in {turns} turns; track more turns, or closer to the closed orbit"
@@ -123,22 +118,32 @@ def normalised(states: Array, optics: Optics | None = None) -> ComplexArray:
     return np.stack(planes, axis=-1)
 
 
-def levelled(signal: ComplexArray) -> ComplexArray:
-    """A complex signal [turns] without its exponential growth; its first amplitude stays."""
-    size = np.abs(signal)
-    if not (size > 0).all():  # no motion at all, or motion that passes through zero
-        return signal
-    turn = np.arange(len(signal))
-    rate = np.polyfit(turn, np.log(size), 1)[0]
-    return np.asarray(signal * np.exp(-rate * turn))
+def levelled(signals: ComplexArray) -> ComplexArray:
+    """Complex signals [..., turns] without their exponential growth; first amplitudes stay."""
+    size = np.abs(signals)
+    moves = np.asarray(
+        (size > 0).all(axis=-1)
+    )  # not: no motion at all, or motion that passes through zero
+    turn = np.arange(signals.shape[-1])
+    centred = turn - turn.mean()
+    growth = np.log(np.where(moves[..., None], size, 1.0))
+    rate = growth @ centred / (centred @ centred)
+    return np.asarray(signals * np.exp(-rate[..., None] * turn))
 
 
-def frequency(signal: ComplexArray, method: Method = Method.NAFF) -> tuple[float, float]:
-    """Frequency in [0, 1) and amplitude of the strongest line of a complex signal [turns]."""
-    if method is Method.NAFF:
-        lines, values = _naff()(signal.copy(), num_harmonics=1)
-        return float(np.real(values[0])) % 1.0, float(abs(lines[0]))
-    return _interpolated_fft(signal)
+def frequency(signals: ComplexArray, method: Method = Method.NAFF) -> tuple[Array, Array]:
+    """Frequencies in [0, 1) and amplitudes of the strongest lines of complex signals [..., turns],
+    each [...]."""
+    if method is Method.FFT:
+        return _interpolated_fft(signals)
+    flat = signals.reshape(-1, signals.shape[-1])
+    lines = np.array([_strongest(signal) for signal in flat]).reshape(*signals.shape[:-1], 2)
+    return lines[..., 0] % 1.0, lines[..., 1]
+
+
+def _strongest(signal: ComplexArray) -> tuple[float, float]:
+    lines, values = _naff()(signal.copy(), num_harmonics=1)
+    return float(np.real(values[0])), float(abs(lines[0]))
 
 
 @cache
@@ -152,18 +157,21 @@ def _naff() -> Callable[..., Any]:
     return cast(Callable[..., Any], nafflib.naff)
 
 
-def _interpolated_fft(signal: ComplexArray) -> tuple[float, float]:
-    """The peak of the Hann-windowed spectrum, between its bins.
+def _interpolated_fft(signals: ComplexArray) -> tuple[Array, Array]:
+    """The peaks of the Hann-windowed spectra, between their bins.
 
     With the Hann window the two largest neighbours of a single line at k + d have the exact ratio
     r = (1 + d) / (2 - d) for long signals, so d = (2 r - 1) / (r + 1).
     """
-    turns = len(signal)
+    turns = signals.shape[-1]
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(turns) / turns)
-    spectrum = np.abs(np.fft.fft(signal * window))
-    peak = int(spectrum.argmax())
-    right, left = spectrum[(peak + 1) % turns], spectrum[peak - 1]
-    side, ratio = (1, right / spectrum[peak]) if right >= left else (-1, left / spectrum[peak])
-    shift = side * (2 * ratio - 1) / (ratio + 1)
+    spectrum = np.abs(np.fft.fft(signals * window))
+    peak = spectrum.argmax(axis=-1)[..., None]
+    height, right, left = (
+        np.take_along_axis(spectrum, place % turns, -1)[..., 0]
+        for place in (peak, peak + 1, peak - 1)
+    )
+    ratio = np.maximum(right, left) / height
+    shift = np.where(right >= left, 1, -1) * (2 * ratio - 1) / (ratio + 1)
     hann = np.sinc(shift) / (1 - shift**2) / 2  # the window's response off the bin
-    return ((peak + shift) / turns) % 1.0, float(spectrum[peak] / turns / hann)
+    return ((peak[..., 0] + shift) / turns) % 1.0, height / turns / hann

@@ -22,14 +22,20 @@ def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) ->
     last = states[:, -1]
     if np.isfinite(last).all() and np.abs(last).max(initial=0.0) < APERTURE:
         return
-    alive = np.abs(states) < APERTURE  # false for NaN too
-    lost = ~np.all(alive, axis=2)  # [block, layer + 1, lane]
+    lost = ~np.all(np.abs(states) < APERTURE, axis=2)  # [block, layer + 1, lane], true for NaN
     anywhere = np.any(lost, axis=1)
     block, lane = np.unravel_index(int(anywhere.argmax()), anywhere.shape)
-    exit_ = int(lost[block, :, lane].argmax())
     trajectory = int(block) * len(size[1]) + int(lane)
+    raise lost_beam(states[block, :, :, lane], trajectory, maps)
+
+
+def lost_beam(states: Array, trajectory: int, maps: RingMaps, turn: int = 0) -> BeamLostError:
+    """The error for a lost trajectory with these states [layer + 1, n] in its turn."""
+    gone = ~np.all(np.abs(states) < APERTURE, axis=1)
+    exit_ = int(gone.argmax())
     where = f"in layer {exit_ - 1} ('{maps.layers[exit_ - 1]}')" if exit_ else "at the launch"
-    raise BeamLostError(
-        f"trajectory {trajectory} is lost {where}: a coordinate exceeds {APERTURE:g} m or rad; "
-        "launch closer to the axis, or lower the learning rate"
+    when = f" in turn {turn}" if turn else ""
+    return BeamLostError(
+        f"trajectory {trajectory} is lost {where}{when}: a coordinate exceeds {APERTURE:g} m or "
+        "rad; launch closer to the axis, or lower the learning rate"
     )

@@ -165,19 +165,22 @@ class LayerChain:
         """
         if turns < 1:
             raise ValueError(f"{turns} turns cannot be tracked; one at least can")
-        start = self._start(launch)
-        size = sweeps.size_of(self.dimension, len(start))
-        packed = sweeps.pack(start, len(size[1]))
-        history = np.empty((len(packed), turns + 1, *packed.shape[1:]))
-        history[:, 0] = packed
-        self._track(size, history)
-        states = sweeps.unpack(history, len(start))
+        states = self._turns(self._start(launch), turns)
         if keep_lost:
             lost = ~np.all(np.abs(states) < APERTURE, axis=2)
             states[np.logical_or.accumulate(lost, axis=1)] = np.nan
         else:
             self._check_alive(states)
         return states
+
+    def _turns(self, start: Array, turns: int) -> Array:
+        """States [batch, turns + 1, n] at the start of every turn, from `start` [batch, n]."""
+        size = sweeps.size_of(self.dimension, len(start))
+        packed = sweeps.pack(start, len(size[1]))
+        history = np.empty((len(packed), turns + 1, *packed.shape[1:]))
+        history[:, 0] = packed
+        self._track(size, history)
+        return sweeps.unpack(history, len(start))
 
     def _check_alive(self, states: Array) -> None:
         lost = ~np.all(np.abs(states) < APERTURE, axis=2)  # [batch, turn], true for NaN

@@ -152,7 +152,8 @@ def reverse(  # type: ignore[no-untyped-def]
     first, last, size, W1, W2, curved, R1, R2, bent, start, states, pulls, adjoint
 ):
     """Fill adjoint [block, layer + 1, n, lane] = d loss / d states from
-    pulls [block, monitor, 2, lane] = d loss / d readings.
+    pulls [block, monitor, 2, lane] = d loss / d readings; adjoint[:, -1] holds what does not come
+    from the readings.
 
     The monitors at exit k are start[k] to start[k + 1] - 1: they stand in beam order.
     """
@@ -160,10 +161,10 @@ def reverse(  # type: ignore[no-untyped-def]
     for block in range(first, last):
         for k in range(W1.shape[0], -1, -1):
             below = adjoint[block, k]
-            for b in range(n):
-                for v in range(lanes):
-                    below[b, v] = 0.0
             if k < W1.shape[0]:
+                for b in range(n):
+                    for v in range(lanes):
+                        below[b, v] = 0.0
                 _pull(
                     size, size[0], k, W1, W2, curved, states[block, k], adjoint[block, k + 1], below
                 )
@@ -225,4 +226,5 @@ def pack(rows: Array, lanes: int) -> Array:
 def unpack(blocks: Array, batch: int) -> Array:
     """The inverse of `pack`: [block, ..., lane] as [batch, ...], a copy."""
     rows = np.moveaxis(blocks, -1, 1)
-    return np.ascontiguousarray(rows.reshape(-1, *rows.shape[2:])[:batch])
+    flat = rows.reshape(rows.shape[0] * rows.shape[1], *rows.shape[2:])
+    return np.ascontiguousarray(flat[:batch])

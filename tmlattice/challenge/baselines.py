@@ -115,7 +115,7 @@ def _weight_change(case: Case, data: Data, paths: Paths, launches: Array) -> Gue
     network = _design(case.lattice)
     at_energy = launches.copy()
     at_energy[:, 4] = 0.0  # a network of four coordinates has none
-    unset = network(at_energy[:, :4]).detach().numpy()
+    unset = network.readings(at_energy[:, :4])
     readings = np.where(data.valid, data.readings - paths.readings + unset, np.nan)
     orbit = Measurement(at_energy, readings[:, None], network.monitors, noise=case.fit.noise)
     tuned = fine_tune(network, orbit, progress=False).network

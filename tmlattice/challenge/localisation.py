@@ -135,7 +135,7 @@ def _sigma(
 ) -> float:
     """Standard deviation of the fault's amount, from the design's own readings."""
     drawn = simulate(ring, shots=shots, amplitude=amplitude, noise=noise, seed=seed).shots
-    readings = network(drawn.nominal[:, :4]).detach().numpy()[:, None]
+    readings = network.readings(drawn.nominal[:, :4])[:, None]
     sigma = np.tile(drawn.sigma, (shots, 1))
     design = Measurement(
         drawn.nominal, readings, network.monitors, noise=np.full((len(network.monitors), 2), noise),
@@ -175,7 +175,7 @@ def _case(
     monitors = np.array([monitor.s for monitor in ring.monitors])
     before = int(np.searchsorted(monitors, true.s))
     magnets = ring.magnets
-    after = fitted.network(launched.launches[:, :4]).detach().numpy()
+    after = fitted.network.readings(launched.launches[:, :4])
     assert measured.noise is not None
     left = (measured.in_order_of(network.monitors).readings[:, 0] - after) / measured.noise
     return Case(

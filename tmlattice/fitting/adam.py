@@ -146,8 +146,11 @@ def fit_adam(
         raise unknown_choice("regularization", regularization, Regularization) from None
     weight, target = _target(measurement, network.monitors)
     beam = _beam(network, measurement, launch_sigma)
-    launch = torch.from_numpy(beam.launches)
     model, free = _freed(network, free)
+    device = next(model.parameters()).device
+    launch, weight, target = (
+        t.to(device) for t in (torch.from_numpy(beam.launches), weight, target)
+    )
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
     design = _defect(network) if relative_to_design else None
@@ -208,7 +211,7 @@ def fit_adam(
             "clip": clip,
             "patience": patience,
         },
-        launches=beam.settled(model, best_launch.numpy()),
+        launches=beam.settled(model, best_launch.cpu().numpy()),
     )
 
 
@@ -223,8 +226,9 @@ class _Beam:
     def after(self, readings: Tensor, launch: Tensor) -> Tensor:
         if self.gains is None:
             return launch
-        now = launch.numpy()
-        return torch.from_numpy(now + 0.5 * self.gains(readings.detach().numpy(), now))
+        now = launch.cpu().numpy()
+        moved = now + 0.5 * self.gains(readings.detach().cpu().numpy(), now)
+        return torch.from_numpy(moved).to(launch.device)
 
     def settled(
         self, network: TaylorNetwork | SymplecticNetwork, launch: NDArray[np.float64]
@@ -301,7 +305,7 @@ def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
     from torch.optim.adam import adam
 
     mean, square = ([torch.zeros_like(p) for p in moving] for _ in range(2))
-    counts = [torch.zeros((), dtype=torch.float32) for _ in moving]
+    counts = [torch.zeros((), dtype=torch.float32, device=p.device) for p in moving]
 
     @torch.no_grad()
     def step() -> None:
@@ -339,7 +343,7 @@ def _penalty(
     if kind is Regularization.SYMPLECTIC and isinstance(model, TaylorNetwork):
         return symplectic_penalty(model.W1, model.W2, design).sum()
     if kind in (Regularization.NONE, Regularization.SYMPLECTIC):
-        return torch.zeros((), dtype=torch.float64)
+        return torch.zeros((), dtype=torch.float64, device=start[0].device)
     moved = [p - s for p, s in zip(model.parameters(), start, strict=True)]
     if kind is Regularization.L1:
         return torch.stack([m.abs().sum() for m in moved]).sum()

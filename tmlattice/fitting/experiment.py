@@ -151,7 +151,7 @@ def tune_fit(
         network = TaylorNetwork.from_ring(ring)
         truth = TaylorNetwork.from_ring(machine)
         design_tunes = matrix_tunes(ring_matrix(ring))
-    readings = truth(start[None]).detach().numpy()
+    readings = truth.readings(start[None])
     readings = readings + noise * np.random.default_rng(seed).standard_normal(readings.shape)
     rms = np.full((len(network.monitors), 2), max(noise, NOISE_FLOOR))
     exact = np.zeros_like(start[None])
@@ -288,7 +288,7 @@ def _fit_and_track(
     with work.watch.stage("compile"):
         compile_kernels(network, work.methods)
     design = FreeLaunches(nominal, sigma, read, measurement.noise).fitted(network)
-    before = network(design).detach().numpy()
+    before = network.readings(design)
     columns = [_column(name, network, measurement, sigma, shown, work) for name in work.methods]
     fitted = [column for column in columns if column.fit is not None]
     if not fitted:
@@ -337,7 +337,7 @@ def _column(
     if fit is not None:
         nominal = measurement.states(network.dimension)
         launches = nominal if fit.launches is None else fit.launches
-        readings = fit.network(launches).detach().numpy()
+        readings = fit.network.readings(launches)
     left = read - readings
     pulls = (left / noise) ** 2
     return MethodFit(

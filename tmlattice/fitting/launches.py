@@ -122,7 +122,7 @@ class FreeLaunches:
         if not self.sigma.any():
             return launches
         for _ in range(steps):
-            readings = network(launches).detach().numpy()
+            readings = network.readings(launches)
             launches = launches + self.gains(network, launches)(readings, launches)
         return launches
 
@@ -131,5 +131,5 @@ def launch_slopes(network: NetworkChain, launches: Array) -> Array:
     """d readings / d launch, [shot, monitor, 2, n], by central differences."""
     shots, n = launches.shape
     moved = launches[:, None, None] + STEP * np.stack([np.eye(n), -np.eye(n)])[None]
-    ends = network(moved.reshape(-1, n)).detach().numpy().reshape(shots, 2, n, -1, 2)
+    ends = network.readings(moved.reshape(-1, n)).reshape(shots, 2, n, -1, 2)
     return np.asarray(np.moveaxis((ends[:, 0] - ends[:, 1]) / (2 * STEP), 1, -1))

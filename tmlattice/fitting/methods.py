@@ -98,5 +98,5 @@ def _judged(result: FitResult, measurement: Measurement) -> FitResult:
         return result
     n = result.network.dimension
     launches = ordered.states(n) if result.launches is None else result.launches
-    left = ordered.readings[:, 0] - result.network(launches).detach().numpy()
+    left = ordered.readings[:, 0] - result.network.readings(launches)
     return replace(result, chi2=float(np.nanmean((left / np.maximum(sigma, NOISE_FLOOR)) ** 2)))

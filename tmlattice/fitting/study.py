@@ -172,7 +172,7 @@ def run_case(
     launches = turned_launches(optics, start, phases)
     # Each magnet has noise of its own: cases that share one would err together.
     generator = np.random.default_rng([seed, zlib.crc32(empty.magnet.encode())])
-    clean = truth(launches).detach().numpy()
+    clean = truth.readings(launches)
     readings = clean + noise * generator.standard_normal(clean.shape)
     stated = np.full((len(design.monitors), 2), noise) if noise else None
     exact = np.zeros_like(launches)
@@ -196,12 +196,12 @@ def run_case(
     new = turned_launches(optics, NEW_AMPLITUDE * start, 2 * np.pi * np.random.default_rng(
         [seed, 1]).random((4, 2)))  # fmt: skip
     try:
-        miss = (truth(new) - fit.network(new)).detach().numpy()
+        miss = truth.readings(new) - fit.network.readings(new)
         prediction = float(np.sqrt(np.mean(miss**2)))
     except TmlatticeError:
         prediction = None  # five times the amplitude is lost in one of them
     rms = [
-        float(np.sqrt(np.mean((readings - n(launches).detach().numpy()) ** 2)))
+        float(np.sqrt(np.mean((readings - n.readings(launches)) ** 2)))
         for n in (design, fit.network)
     ]
     return dataclasses.replace(

@@ -9,7 +9,8 @@
 from tmlattice.errors import missing_package
 
 try:
-    from tmlattice.network.network import TaylorNetwork
+    from tmlattice.network.free_layers import FreeLayers
+    from tmlattice.network.network import TaylorNetwork, plain_readings
     from tmlattice.network.stored import load_network, save_network
     from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
     from tmlattice.network.symplectic_network import SymplecticNetwork
@@ -17,10 +18,12 @@ except ModuleNotFoundError as error:  # torch, of which a diagnosis needs nothin
     raise missing_package(error, "networks, and fits of their weights, need", "network") from error
 
 __all__ = [
+    "FreeLayers",
     "SymplecticNetwork",
     "TaylorNetwork",
     "load_network",
     "penalty_parts",
+    "plain_readings",
     "save_network",
     "symplectic_penalty",
 ]

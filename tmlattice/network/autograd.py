@@ -1,56 +1,110 @@
-"""The compiled sweeps as one autograd function, so that any torch loss and optimiser works."""
+"""The sweeps as one autograd function, so that any torch loss and optimiser works.
 
-from typing import Any
+First derivatives come from the adjoint sweep of a back end: compiled for the CPU, or Triton kernels
+for a graphics card. It costs about two forward sweeps, whatever the number of weights. Second
+derivatives come from the plain torch loop: exact, and as slow as that loop.
+"""
 
-import numpy as np
+from typing import Any, Protocol
+
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from tmlattice.beam import sweeps
-from tmlattice.beam.chain import first_pass
-from tmlattice.beam.sweeps import curved
-from tmlattice.maps import RingMaps
+from tmlattice.network.reference import plain_pass
 
-Array = NDArray[np.float64]
+Tensors = tuple[Tensor, ...]
+
+
+class BackEnd(Protocol):
+    """What runs the sweeps.
+
+    Attributes:
+        r: read-outs [monitor, 2, 1 + n + n (n + 1) / 2], see `plain_pass`.
+        start: the monitors at exit k are start[k] to start[k + 1] - 1, [layer + 2].
+    """
+
+    r: Tensor
+    start: Tensor
+
+    def forward(self, launch: Tensor, weights: Tensors) -> tuple[Tensor, Tensor, Tensor]:
+        """Readings [batch, monitor, 2], states behind the last layer [batch, n], and what
+        `backward` needs besides."""
+
+    def backward(
+        self, launch: Tensor, weights: Tensors, kept: Tensor, pulls: Tensors, wanted: bool
+    ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        """Gradients by the launch and, if wanted, by the weights, from those by the readings and
+        by the last states."""
 
 
 class Sweep(torch.autograd.Function):
-    """(launch [batch, n], W0, W1, W2) -> readings [batch, monitor, 2] and exits' states.
-
-    The backward pass is the adjoint sweep: it costs about two forward sweeps, whatever the number
-    of weights.
-    """
+    """(launch [batch, n], W0, W1, W2) -> readings [batch, monitor, 2], states behind the last
+    layer [batch, n]."""
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, launch: Tensor, W0: Tensor, W1: Tensor, W2: Tensor, maps: RingMaps
-    ) -> Tensor:
-        """Readings of one pass through all layers."""
-        w0, w1, w2 = (w.detach().numpy() for w in (W0, W1, W2))
-        batch, n = launch.shape
-        states, readings = first_pass((w0, w1, w2), maps, launch.detach().numpy())
-        size, bends, bent = sweeps.size_of(n, batch), curved(w2), curved(maps.R2)
-        ctx.save_for_backward(W1, W2)
-        ctx.kept = (maps, size, states, bends, bent, batch)
-        return torch.from_numpy(sweeps.unpack(readings, batch))
+        launch: Tensor, W0: Tensor, W1: Tensor, W2: Tensor, back_end: BackEnd
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One pass through all layers."""
+        return back_end.forward(launch, (W0, W1, W2))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """What the gradient needs."""
+        *tensors, ctx.back_end = inputs
+        ctx.mark_non_differentiable(output[2])
+        ctx.save_for_backward(*tensors, output[2])
+
+    @staticmethod
+    def backward(ctx: Any, pulls: Tensor, end: Tensor, _: Tensor) -> Any:  # type: ignore[override]
+        """Gradients by the launch and all weights."""
+        wanted = any(ctx.needs_input_grad[1:4])
+        gradients = _Gradient.apply(  # type: ignore[no-untyped-call]
+            pulls, end, *ctx.saved_tensors, ctx.back_end, wanted
+        )
+        return *gradients, None
+
+    @staticmethod
+    def vmap(*_: Any) -> Any:
+        """Refused: a launch is a batch already."""
+        raise NotImplementedError(
+            "torch.func.vmap cannot batch a network: give it all launches at once, [batch, n], or "
+            "use tmlattice.network.plain_readings, which is made of torch's own operations"
+        )
+
+    @staticmethod
+    def jvp(*_: Any) -> Any:
+        """Refused: the sweeps carry gradients back, not forward."""
+        raise NotImplementedError(
+            "a network has no forward-mode derivative (jvp, jacfwd, hessian): use torch.func.vjp "
+            "or torch.autograd, network.one_turn_map for matrices, or "
+            "tmlattice.network.plain_readings, which is made of torch's own operations"
+        )
+
+
+class _Gradient(torch.autograd.Function):
+    """The adjoint sweep, which can be differentiated once more."""
+
+    @staticmethod
+    def forward(pulls: Tensor, end: Tensor, *others: Any) -> Any:  # type: ignore[override]
+        launch, W0, W1, W2, kept, back_end, wanted = others
+        by_launch, by_weights = back_end.backward(launch, (W0, W1, W2), kept, (pulls, end), wanted)
+        return by_launch, *by_weights
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        *tensors, _kept, ctx.back_end, _ = inputs
+        ctx.save_for_backward(*tensors)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, pulls: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        """Gradients with respect to the launch and to all weights."""
-        W1, W2 = (w.detach().numpy() for w in ctx.saved_tensors)
-        maps, size, states, bends, bent, batch = ctx.kept
-        packed = sweeps.pack(np.ascontiguousarray(pulls.numpy()), len(size[1]))
-        adjoint = np.empty_like(states)
-        sweeps.run(
-            sweeps.reverse, len(states), size, W1, W2, bends, maps.R1, maps.R2, bent, maps.start,
-            states, packed, adjoint,
-        )  # fmt: skip
-        gradients: list[Tensor | None] = [None, None, None]
-        if any(ctx.needs_input_grad[1:4]):
-            g0, g1, g2 = np.zeros(W1.shape[:2]), np.zeros_like(W1), np.zeros_like(W2)
-            sweeps.run(sweeps.weights, len(W1), size, states, adjoint, g0, g1, g2)
-            gradients = [torch.from_numpy(g) for g in (g0, g1, g2)]
-        launch = torch.from_numpy(sweeps.unpack(adjoint[:, 0], batch))
-        return launch, *gradients, None
+    def backward(ctx: Any, *pulls: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        given = [tensor.detach().requires_grad_() for tensor in ctx.saved_tensors]
+        back_end: BackEnd = ctx.back_end
+        with torch.enable_grad():
+            passed = plain_pass(given[2], given[3:], back_end.r, back_end.start)
+            first = torch.autograd.grad(passed, given[2:], given[:2], create_graph=True)
+            pairs = [(f, p) for f, p in zip(first, pulls, strict=True) if p is not None]
+            total = sum(((f * p).sum() for f, p in pairs), torch.zeros((), dtype=torch.float64))
+            second = torch.autograd.grad(total, given, allow_unused=True)
+        return *second, None, None, None

@@ -1,17 +1,32 @@
 """The network: weights stacked over layers, readings of a launch, tracking over many turns."""
 
+from enum import StrEnum
+from importlib import import_module
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from tmlattice.beam.aperture import APERTURE, lost_beam
 from tmlattice.beam.chain import Chain
+from tmlattice.errors import missing_package, unknown_choice
 from tmlattice.maps import RingMaps
-from tmlattice.network.autograd import Sweep
+from tmlattice.network.autograd import BackEnd, Sweep
 from tmlattice.network.base import NetworkChain
+from tmlattice.network.compiled_sweep import CompiledSweep
+from tmlattice.network.reference import monomials, packed, plain_pass
 from tmlattice.network.symplectic_network import SymplecticNetwork
 
 Array = NDArray[np.float64]
+
+
+class OnLost(StrEnum):
+    """What a lost trajectory does."""
+
+    RAISE = "raise"
+    INF = "inf"
 
 
 class TaylorNetwork(NetworkChain, Chain):
@@ -20,6 +35,8 @@ class TaylorNetwork(NetworkChain, Chain):
     Layer k sends the state x at the exit of magnet k - 1 to W0[k] + W1[k] x + W2[k] x^[2] at the
     exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and
     units of the reference momentum. All weights are float64 and of their layer alone.
+
+    `network.to("cuda")` moves it to a graphics card, and everything that it does runs there.
 
     Args:
         maps: weights and read-outs of a ring.
@@ -33,12 +50,25 @@ class TaylorNetwork(NetworkChain, Chain):
     Source: A. Ivanov, I. Agapov, Phys. Rev. Accel. Beams 23 (2020) 074601, for the architecture.
     """
 
+    DEVICES = ("cpu", "cuda")
+    _read_outs: Tensor
+    _closing: Tensor
+    _first_monitor: Tensor
+
     def __init__(self, maps: RingMaps) -> None:
         torch.nn.Module.__init__(self)
         self.maps = maps
         self.W0 = torch.nn.Parameter(torch.from_numpy(maps.W0.copy()))
         self.W1 = torch.nn.Parameter(torch.from_numpy(maps.W1.copy()))
         self.W2 = torch.nn.Parameter(torch.from_numpy(maps.W2.copy()))
+        read_outs = (torch.from_numpy(r) for r in (maps.R0, maps.R1, maps.R2))
+        closing = (torch.from_numpy(c) for c in maps.closing.coefficients)
+        for name, fixed in (  # these follow `.to`, and are no part of `state_dict`
+            ("_read_outs", packed(*read_outs)),
+            ("_closing", packed(*closing)),
+            ("_first_monitor", torch.from_numpy(maps.start)),
+        ):
+            self.register_buffer(name, fixed, persistent=False)
 
     def symplectic(self) -> SymplecticNetwork:
         """The same ring in layers that are symplectic exactly, and stay so whatever is fitted.
@@ -48,31 +78,104 @@ class TaylorNetwork(NetworkChain, Chain):
         return SymplecticNetwork.from_network(self)
 
     def weights(self) -> tuple[Array, Array, Array]:
-        """W0, W1, W2 as numpy arrays that share the parameters' memory: do not change them."""
-        W0, W1, W2 = (w.detach().numpy() for w in (self.W0, self.W1, self.W2))
+        """W0, W1, W2 as numpy arrays; on the CPU they share the parameters' memory: do not change
+        them."""
+        W0, W1, W2 = (w.detach().cpu().numpy() for w in (self.W0, self.W1, self.W2))
         return W0, W1, W2
 
     def copy(self) -> "TaylorNetwork":
         """A network of its own with the same weights."""
-        new = TaylorNetwork(self.maps)
+        new = TaylorNetwork(self.maps).to(self.W0.device)
         new.ring = self.ring
         new.load_state_dict(self.state_dict())
         return new
 
-    def forward(self, launch: ArrayLike | Tensor) -> Tensor:
-        """Readings of every monitor on one pass.
+    def sweep(self) -> BackEnd:
+        """What runs the sweeps on the device of the weights."""
+        if self.W0.is_cuda:
+            on_card: BackEnd = _cuda().TritonSweep(self._read_outs, self._first_monitor)
+            return on_card
+        return CompiledSweep(self.maps, self._read_outs, self._first_monitor)
+
+    def forward(
+        self,
+        launch: ArrayLike | Tensor,
+        turns: int | None = None,
+        *,
+        on_lost: OnLost | str = "raise",
+    ) -> Tensor:
+        """Readings of every monitor, differentiable by launch and weights.
+
+        First derivatives are fast. Second ones (`create_graph=True`) are exact and take seconds:
+        they come from a loop of torch operations (`plain_readings`). Of `torch.func`, `grad` and
+        `vjp` work; `vmap` and `jvp` are refused.
 
         Args:
             launch: states at the start of the ring, [batch, n].
+            turns: how many turns are read; None: the first one, without an axis for it.
+            on_lost: "raise" an error for a lost trajectory, or let its readings be "inf" from that
+                turn on: it then adds nothing to a gradient.
 
         Returns:
-            (x, y) in m, [batch, monitor, 2]; differentiable by launch and weights.
+            (x, y) in m, [batch, monitor, 2]; with `turns`, [batch, turn, monitor, 2].
 
         Raises:
             BeamLostError: names the layer where a trajectory was lost.
-            ValueError: a launch of another shape.
+            ChoiceError: another word for `on_lost`.
+            ValueError: a launch of another shape, or no turn.
         """
-        readings: Tensor = Sweep.apply(  # type: ignore[no-untyped-call]
-            self._launch(launch), self.W0, self.W1, self.W2, self.maps
+        if on_lost not in (known := [choice.value for choice in OnLost]):
+            raise unknown_choice("on_lost", on_lost, known)
+        if turns is not None and turns < 1:
+            raise ValueError(f"{turns} turns have no reading; read one at least")
+        x = self._launch(launch)
+        every = x.new_full((len(x), len(self.monitors), 2), torch.inf)
+        rows = torch.arange(len(x), device=x.device)
+        passes = []
+        for turn in range(turns or 1):
+            readings, end = self._pass(x)
+            alive = (end.detach().abs() < APERTURE).all(dim=1)  # false for NaN
+            if not alive.all():
+                if on_lost == OnLost.RAISE:
+                    first = int(alive.to(torch.int8).argmin())
+                    raise lost_beam(self.states(x[[first]])[0], first, self.maps, turn)
+                x, rows = x[alive], rows[alive]
+                readings, end = self._pass(x)
+            passes.append(readings if len(x) == len(every) else every.index_copy(0, rows, readings))
+            if turns is not None and turn + 1 < turns:
+                x = monomials(end) @ self._closing.mT
+        return passes[0] if turns is None else torch.stack(passes, dim=1)
+
+    def _pass(self, launch: Tensor) -> tuple[Tensor, Tensor]:
+        """Readings, and states behind the last layer."""
+        readings, end, _ = Sweep.apply(  # type: ignore[no-untyped-call]
+            launch, self.W0, self.W1, self.W2, self.sweep()
         )
-        return readings
+        return readings, end
+
+    def _turns(self, start: Array, turns: int) -> Array:
+        if not self.W0.is_cuda:
+            return super()._turns(start, turns)
+        with torch.no_grad():
+            layers = packed(self.W0, self.W1, self.W2)
+            turn = torch.cat([layers, self._closing[None]])
+            launch = torch.from_numpy(start).to(turn.device)
+            return np.asarray(_cuda().track(launch, turn, turns).cpu().numpy())
+
+
+def _cuda() -> Any:
+    try:
+        return import_module("tmlattice.network.cuda")
+    except ModuleNotFoundError as error:
+        raise missing_package(error, "networks on a graphics card need", "cuda") from error
+
+
+def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
+    """Readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
+
+    The same mathematics as `network(launch)`, differentiated by torch alone: any order, any
+    `torch.func` transform.
+    """
+    sweep = network.sweep()
+    weights = network.W0, network.W1, network.W2
+    return plain_pass(launch, weights, sweep.r, sweep.start)[0]

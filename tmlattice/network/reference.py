@@ -1,30 +1,71 @@
-"""The plain torch loop over layers: slow, obvious, and the referee of the compiled sweeps."""
+"""The network and its penalty in torch's own operations: obvious, differentiable to any order, and
+the referee of the compiled sweeps. The loop over layers is slow; the penalty, which has no loop, is
+what a graphics card uses."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from tmlattice.network.network import TaylorNetwork
+
+def packed(W0: Tensor, W1: Tensor, W2: Tensor) -> Tensor:
+    """Coefficients of polynomials side by side, [..., row, 1 + n + n (n + 1) / 2]."""
+    return torch.cat([W0[..., None], W1, W2], dim=-1)
 
 
-def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
-    """Readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
+def monomials(x: Tensor) -> Tensor:
+    """1, x_i, x_i x_j (i <= j) of states [batch, n], [batch, 1 + n + n (n + 1) / 2]."""
+    i, j = torch.triu_indices(x.shape[1], x.shape[1], device=x.device)
+    return torch.cat([torch.ones_like(x[:, :1]), x, x[:, i] * x[:, j]], dim=1)
 
-    The same mathematics as `network(launch)`, differentiated by torch alone.
+
+def plain_pass(
+    launch: Tensor, weights: Sequence[Tensor], r: Tensor, start: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Readings [batch, monitor, 2] and the states behind the last layer [batch, n].
+
+    Args:
+        launch: [batch, n].
+        weights: W0 [layer, n], W1 [layer, n, n], W2 [layer, n, n (n + 1) / 2].
+        r: read-outs, as `packed`, [monitor, 2, 1 + n + n (n + 1) / 2].
+        start: the monitors at exit k are start[k] to start[k + 1] - 1, [layer + 2].
     """
-    maps = network.maps
-    i, j = torch.triu_indices(network.dimension, network.dimension)
-    R0, R1, R2 = (torch.from_numpy(r) for r in (maps.R0, maps.R1, maps.R2))
-    readings = []
-    state = launch
+    first = [int(m) for m in start]
+    w = packed(*weights)
+    readings, state = [], launch
+    for k in range(len(w) + 1):
+        terms = monomials(state)
+        readings += [terms @ r[m].mT for m in range(first[k], first[k + 1])]
+        if k < len(w):
+            state = terms @ w[k].mT
+    return torch.stack(readings, dim=1), state
 
-    def read_at(exit_: int) -> None:
-        for m in range(int(maps.start[exit_]), int(maps.start[exit_ + 1])):
-            products = state[:, i] * state[:, j]
-            readings.append(R0[m] + state @ R1[m].T + products @ R2[m].T)
 
-    read_at(0)
-    for k in range(len(network.layers)):
-        products = state[:, i] * state[:, j]
-        state = network.W0[k] + state @ network.W1[k].T + products @ network.W2[k].T
-        read_at(k + 1)
-    return torch.stack(readings, dim=1)
+def plain_coefficients(W1: Tensor, W2: Tensor, form: Tensor) -> Tensor:
+    """`symplectic_coefficients` [layer, pair, entry], differentiable; form: S [n, n]."""
+    layers, n, _ = W1.shape
+    i, j = torch.triu_indices(n, n, device=W1.device)
+    second = W2.new_zeros(layers, n, n, n)
+    second[:, :, i, j] = W2
+    second = second + second.mT
+    G = torch.cat([W1[:, :, None], second], dim=2).flatten(2)  # [layer, image, (u, b)]
+    M = (G.mT @ (form @ G)).reshape(layers, n + 1, n, n + 1, n)
+    M = M + M.permute(0, 3, 2, 1, 4)  # [layer, u, b, v, c]
+    u, v = torch.triu_indices(n + 1, n + 1, device=W1.device)
+    b, c = torch.triu_indices(n, n, 1, device=W1.device)
+    M = M[:, u[:, None], b, v[:, None], c] * torch.where(u == v, 0.5, 1.0)[:, None].to(M)
+    constant = torch.zeros_like(M[0])
+    constant[0] = form[b, c]
+    difference: Tensor = M - constant
+    return difference
+
+
+def plain_penalty_parts(
+    W1: Tensor, W2: Tensor, form: Tensor, design: Tensor | None = None
+) -> Tensor:
+    """`penalty_parts` [layer, 3]; form: S [n, n]."""
+    n = W1.shape[1]
+    M = plain_coefficients(W1, W2, form)
+    squares = (M if design is None else M - design).square().sum(dim=2)
+    degrees = squares[:, :1], squares[:, 1 : n + 1], squares[:, n + 1 :]
+    return torch.stack([own.sum(dim=1) for own in degrees], dim=1)

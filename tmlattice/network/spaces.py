@@ -67,14 +67,14 @@ class Space:
             BeamLostError: names the layer.
         """
         self.put(amounts)
-        return np.asarray(self.network(launches).detach().numpy())
+        return self.network.readings(launches)
 
 
 class Strengths(Space):
     """Relative changes of strengths, in units of `STRENGTH_RMS`."""
 
     def __init__(self, network: TaylorNetwork, ring: Ring, kinds: Sequence[str]) -> None:
-        self.network = network.copy()
+        self.network = network.copy().cpu()
         self.network.requires_grad_(False)
         self.known = ring_strengths(ring, kinds, network.dimension)
         self.layer = self.known.layer

@@ -30,7 +30,7 @@ def load_network(ring: Ring, path: Path) -> TaylorNetwork:
     )
     content = zip_of(path, TmlatticeError, wanted)
     try:
-        weights = torch.load(content, weights_only=True)
+        weights = torch.load(content, map_location="cpu", weights_only=True)
         dimension = int(weights["W0"].shape[1])
         network = TaylorNetwork.from_ring(ring, dimension)
         network.load_state_dict(weights)

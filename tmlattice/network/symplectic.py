@@ -20,6 +20,8 @@ from torch import Tensor
 
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit
+from tmlattice.maps.taylor import symplectic_form
+from tmlattice.network.reference import plain_penalty_parts
 
 Array = NDArray[np.float64]
 
@@ -239,7 +241,7 @@ def symplectic_coefficients(W1: Tensor, W2: Tensor) -> Array:
     """
     n = W1.shape[1]
     out = np.empty((len(W1), *_no_design(n).shape[1:]))
-    w1, w2 = (w.detach().contiguous().numpy() for w in (W1, W2))
+    w1, w2 = (w.detach().cpu().contiguous().numpy() for w in (W1, W2))
     _coefficients((None,) * n, _signs(n), w1, w2, _no_design(n), out)
     return out
 
@@ -256,6 +258,11 @@ def penalty_parts(W1: Tensor, W2: Tensor, design: Array | None = None) -> Tensor
         design: coefficients of the unperturbed layers, from `symplectic_coefficients`.
     """
     n = W1.shape[1]
+    if W1.is_cuda:
+        form = torch.from_numpy(symplectic_form(n)).to(W1.device)
+        return plain_penalty_parts(
+            W1, W2, form, None if design is None else torch.from_numpy(design).to(W1.device)
+        )
     given = _no_design(n) if design is None else design
     parts: Tensor = _Squares.apply(W1, W2, given)  # type: ignore[no-untyped-call]
     return parts

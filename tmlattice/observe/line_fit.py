@@ -188,8 +188,7 @@ def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[f
     slow[_cosines(width, turns) :] = 0
     envelope = idct(slow, norm="ortho")
     if span:
-        found, _ = strongest(envelope[:span])
-        found = (found + 0.5) % 1.0 - 0.5
+        found = (float(strongest(envelope[:span])[0]) + 0.5) % 1.0 - 0.5
         if abs(found) < width:
             near, envelope = near + found, envelope * np.exp(-2j * np.pi * found * turn)
     shift = _peak(np.abs(envelope) * envelope)
