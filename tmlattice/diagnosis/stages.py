@@ -3,7 +3,7 @@
 The models are the design, the design with small errors, and that with what was found.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from tmlattice.inference.among import Among, Learnt, chains, signatures_of
 from tmlattice.inference.judge import Gap, Misfit, held_out_gap
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, settled
-from tmlattice.inference.problem import Point, Problem
+from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.together import Blocks, Together
 from tmlattice.observe.first_turns import FirstTurns, judged
@@ -40,8 +40,8 @@ class Stage:
         static: small errors, which a reference has too.
         causes: what was found.
         point: what they leave.
-        share: of the likeliest small errors that stands in `static`: 1, or less where no beam is
-            stored with all of them.
+        share: of the way to the likeliest small errors, from those of the fit, that `static` goes:
+            1, or less where no beam is stored with all of them.
     """
 
     static: tuple[Cause, ...]
@@ -56,9 +56,11 @@ def stages_of(
     """The design; then with small errors and with the causes among them, or with one cause after
     the other."""
     models: list[tuple[tuple[Cause, ...], tuple[Cause, ...]]] = [((), ())]
+    about: dict[Hypothesis, float] = {}
     if small is not None:
         inner = found.problem
         assert isinstance(inner, Among)
+        about = dict(zip(inner.known.hypotheses, inner.about.tolist(), strict=True))
         for one in (found.before, found.fit)[: 1 + bool(causes)]:
             amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
             models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
@@ -66,22 +68,28 @@ def stages_of(
             models[-1] = (models[-1][0], causes)
     else:
         models += [((), causes[: i + 1]) for i in range(len(causes))]
-    return [_settled(problem, static, own) for static, own in models]
+    return [_settled(problem, static, own, about) for static, own in models]
 
 
-HALVES = 4
-"""How often small errors are halved with which no beam is stored."""
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Of the way to the likeliest small errors, with which a beam may not be stored."""
 
 
-def _settled(problem: Together, static: tuple[Cause, ...], own: tuple[Cause, ...]) -> Stage:
-    share = 1.0
-    for _ in range(HALVES):
-        some = tuple(replace(cause, amount=share * cause.amount) for cause in static)
+def _settled(
+    problem: Together,
+    static: tuple[Cause, ...],
+    own: tuple[Cause, ...],
+    about: Mapping[Hypothesis, float],
+) -> Stage:
+    for share in SHARES:
+        some = tuple(
+            replace(c, amount=start + share * (c.amount - start))
+            for c in static for start in [about[c.effect, c.element]]
+        )  # fmt: skip
         there = replace(problem, fixed=(*problem.fixed, *some))
         point = settled(there, own, problem.first)
         if not point.lost or not static:
             break
-        share /= 2
     if point.lost:
         raise MeasurementError(f"{point.lost}, with what was found: too much to be explained")
     return Stage(some, own, point, share)
@@ -95,7 +103,7 @@ def too_large(stages: Sequence[Stage]) -> list[str]:
         return []
     return [
         f"no beam is stored with all of the small errors that were learnt: the figures of what is "
-        f"left are for {share:.4g} of each"
+        f"left are for {share:.4g} of the last step to them"
     ]
 
 

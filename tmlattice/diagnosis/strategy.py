@@ -31,6 +31,9 @@ CROWDED = 1.5
 """Median misfit between neighbouring monitors, or of monitors, in units of the noise, above which
 faults are not sparse: a few leave most monitors as the design has them."""
 
+MOST_OF_IT = 0.5
+"""Share of the gap that one cause explains, from which on small errors are learnt without it."""
+
 DOUBT = 8.0
 """Statistic of the likeliest fault from which on it is weighed with sizes learnt without it."""
 
@@ -72,6 +75,7 @@ def sought(
     learn: bool,
     noisy: bool = False,
     known: Known | None = None,
+    earlier: Found | None = None,
 ) -> Found:
     """Return what explains the data.
 
@@ -83,6 +87,8 @@ def sought(
             that starts.
         noisy: the noise is a guess, and learnt with them.
         known: of the small errors beforehand, instead of sizes.
+        earlier: what explains the reference alone. Where the small errors that all shots ask for
+            lose the beam, for a fault is no small error, they start at those of the reference.
 
     Raises:
         MeasurementError: the design loses the beam.
@@ -110,19 +116,29 @@ def sought(
         begun = few.fit
     search.progress("small errors")
     first = Known.usual(seen, sizes) if known is None else known
-    about = (strongest(few),) if few is not None and few.named else ()
-    learnt: Learnt | None = None
-    with suppress(UnstableRingError):  # then they are none that anybody learns
-        learnt = small_errors_of(
-            problem, first, begun.nuisances, about, learn=learn and known is None, noisy=noisy
-        )
-    if learnt is None or (learn and known is None and learnt.log_evidence < CLEAR):
+    learn = learn and known is None
+    asides = dict.fromkeys(((), () if few is None else _outstanding(few)))
+    starts: list[tuple[Known, Sequence[Cause], Array | None]]
+    starts = [(first, causes, None) for causes in asides]
+    if earlier is not None and earlier.small is not None:
+        there = earlier.small.problem
+        starts.append((there.known, (), there.estimate(earlier.explanation.fit.clean)))
+    tried: list[Learnt] = []
+    for beforehand, causes, amounts in starts:
+        if amounts is not None and tried:
+            break
+        with suppress(UnstableRingError):  # then they are none that anybody learns
+            tried.append(small_errors_of(
+                problem, beforehand, begun.nuisances, causes, learn=learn, noisy=noisy,
+                about=amounts,
+            ))  # fmt: skip
+    if not tried or (learn and max(small.log_evidence for small in tried) < CLEAR):
         if few is None:  # errors all along the ring: a few names at most
             few = explain(replace(search, most=min(FEW, search.most), unnamed=False), start)
         elif few.full and few.count < search.most:
             few = explain(search, start, few)
         return Found(few)
-    among = Found(*_among(search, learnt, learn and known is None, noisy))
+    among = Found(*_among(search, tried, learn, noisy))
     return Found(few) if few is not None and _likelier(few, among.explanation) else among
 
 
@@ -159,7 +175,7 @@ def sought_since(
     common = _of_ring(alone.explanation.fit.causes)
     for _ in range(ROUNDS):
         own = replace(search, problem=search.problem.standing(common))
-        found = sought(own, everywhere, sizes, learn=learn, noisy=noisy)
+        found = sought(own, everywhere, sizes, learn=learn, noisy=noisy, earlier=alone)
         more = _of_ring(_in_both(found.explanation))
         if not more:
             break
@@ -185,8 +201,11 @@ def _in_both(explanation: Explanation) -> tuple[Cause, ...]:
 
 
 # --- together with distributed errors -----------------------------------------------------------
-def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Explanation, Learnt]:
-    """The small errors, linearised again at what is found where that misleads."""
+def _among(
+    search: Search, tried: Sequence[Learnt], learn: bool, noisy: bool
+) -> tuple[Explanation, Learnt]:
+    """What is found among the small errors of the greatest evidence, which are linearised again at
+    it where that misleads."""
     problem = search.problem
     unnamed = search.unnamed and bool(len(problem.kick_places))
     search = replace(search, unnamed=unnamed)
@@ -194,13 +213,14 @@ def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Exp
     stale = learn  # what is found made sizes too large
     search.progress("scan")
     narrow = replace(search, most=few, names_first=True)
-    explanation = explain(replace(narrow, problem=small.problem), small.before)
+    first = [(explain(replace(narrow, problem=own.problem), own.before), own) for own in tried]
+    explanation, small = max(first, key=lambda one: _log_marginal(one[0]) if len(first) > 1 else 0)
     for _ in range(problem.judgement.retaken):
-        tried = _beside(explanation, small, learn)
-        if tried is None:
+        doubt = _beside(explanation, small, learn)
+        if doubt is None:
             break
         search.progress("small errors with what was found")
-        beside, causes = tried
+        beside, causes = doubt
         granted = narrow.granted
         if not explanation.count and beside is explanation.fit:  # one of the small errors
             granted = frozenset((c.effect, c.element) for c in causes)
@@ -245,7 +265,7 @@ def _linearised(
     causes, amounts = _parted(causes, amounts, known, small.plain)
     again = small_errors_of(
         small.plain, known, found.nuisances, causes, learn=learn, noisy=learn and noisy,
-        about=amounts,
+        about=amounts, stored=small.problem.about,
     )  # fmt: skip
     if not learn:
         again = replace(again, errors=small.errors, log_evidence=small.log_evidence)
@@ -372,6 +392,15 @@ def freedom(problem: Problem, result: Fit) -> int:
     amounts = sum(not find(cause.effect).discrete for cause in result.causes)
     kicks = sum(len(values) for values in result.kicks.values())
     return max(problem.freedom - amounts - kicks, 1)
+
+
+def _outstanding(few: Explanation) -> tuple[Cause, ...]:
+    """A cause that alone makes most of the gap: it would make all small errors too large."""
+    if not few.named:
+        return ()
+    clear = max(named.detection.statistic for named in few.named)
+    gap = few.before.chi2 - few.problem.freedom
+    return (strongest(few),) if clear > MOST_OF_IT * gap else ()
 
 
 def _crowded(found: Explanation) -> bool:

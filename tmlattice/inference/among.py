@@ -266,11 +266,13 @@ class Among(Blurred):
 
     Attributes:
         known: of the small errors beforehand.
+        about: their amounts in the model, [error].
         open: of which family each is, and the covariance of the logarithms of their sizes where
             those were learnt; or None.
     """
 
     known: Known = field(repr=False)
+    about: Array = field(repr=False)
     open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
@@ -344,6 +346,7 @@ def small_errors_of(
     learn: bool = True,
     noisy: bool = False,
     about: Array | None = None,
+    stored: Array | None = None,
 ) -> Learnt:
     """The background of a machine as these data show it, linear about its likeliest amounts.
 
@@ -356,13 +359,15 @@ def small_errors_of(
         noisy: so is the noise, which is a guess.
         about: amounts that it is linearised at, [error]; None: at those that are known, and then at
             the most probable ones.
+        stored: amounts at which a beam is stored: `about` goes so far towards them as it has to.
 
     Raises:
         UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
             causes.
     """
     names, belongs = families_of(known)
-    amounts = stored = known.amounts if about is None else about
+    amounts = known.amounts if about is None else about
+    stored = amounts if stored is None else stored
     evidence, errors, opened = 0.0, dict[str, float](), None
     for turn in range(ROUNDS if about is None else 1):
         inner, alone, amounts = near(problem, known, amounts, stored, causes, nuisances)
@@ -389,7 +394,7 @@ def small_errors_of(
             spread *= found.scale[belongs][:, None]
         among = Among(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
-            judgement=problem.judgement, inner=inner, known=known,
+            judgement=problem.judgement, inner=inner, known=known, about=amounts,
             spread=spread.reshape(-1, *inner.valid.shape),
             shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
@@ -447,7 +452,7 @@ def near(
         UnstableRingError: there is none near enough.
     """
     first = amounts is stored
-    for _ in range(HALVES):
+    for turn in range(HALVES):
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
@@ -456,7 +461,8 @@ def near(
             return inner, alone, amounts
         if first:
             break
-        amounts = (amounts + stored) / 2  # too far for what is linear
+        # too far for what is linear
+        amounts = stored if turn == HALVES - 2 else (amounts + stored) / 2
     raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
 
 
