@@ -47,11 +47,11 @@ def diagnose(
         measurement: of any kind; or several of one machine by name, which are diagnosed together.
         options: for every kind holdout, effects, max_effects, false_alarm, assume, seed, progress
             and reference, a measurement of the same kind and machine from before; for first turns
-            also background, heldout and radiation, see `diagnosis.procedure`; for an orbit
-            response alone missing, see `diagnosis.response.diagnose_response`, and with a reference
+            also background, heldout and radiation; for an orbit response alone missing, see
+            `diagnosis.response.diagnose_response`, and with a reference
             `diagnosis.before_after.diagnose_change`; for several, and for those of a stored beam,
             background, and known, what an earlier diagnosis left known of the ring as it found it
-            (`diagnosis.twin`; first turns take it too), see `diagnosis.procedure.diagnose_together`.
+            (`diagnosis.twin`; first turns take it too). See `diagnosis.procedure`.
 
     Monitors and correctors that the lattice lacks are left out, and told, where they are half of
     the names at most.

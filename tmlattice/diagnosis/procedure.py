@@ -92,7 +92,7 @@ def diagnose_together(
     ring: Ring,
     measured: Mapping[str, Measured],
     *,
-    reference: Mapping[str, Measured] | None = None,
+    reference: Mapping[str, Any] | None = None,
     background: Mapping[str, float | None] | None = None,
     known: Known | None = None,
     holdout: float = 0.33,
@@ -138,9 +138,7 @@ def diagnose_together(
     if kinds == ["trajectory"] and known is None:  # with launches of its own, all can be shared
         (label, one), *_ = measured.items()
         first = next(iter((reference or {}).values()), None)
-        whole = replace(
-            how, effects=effects, radiation=radiation, reference=first, heldout=heldout
-        )
+        whole = replace(how, effects=effects, radiation=radiation, reference=first, heldout=heldout)
         parts, before = [part_of(label, one, whole)], list[Part]()
         hypotheses = list(parts[0].hypotheses or ())
         chosen = list(parts[0].problem.places)
@@ -169,9 +167,8 @@ def diagnose_together(
     if problem.alone:
         sought_out = sought(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
     else:
-        earlier = replace(
-            search, problem=problem.reference(), hypotheses=_seen(ring, modelled(), parts)
-        )
+        first, _ = problem.reference(problem.first)
+        earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
         sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
     progress("report")
     return _told(
@@ -245,7 +242,7 @@ def _told(
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
-    left = found.left if causes or found.kicks and findings else found.first_kicks
+    left = found.left if causes or (found.kicks and findings) else found.first_kicks
     if result.causes and not causes:  # nothing is explained: what is left is what was there
         fitted = Block(fitted.name, found.before.chi2, freedom(found.problem, found.before))
     kept = problem.without(found.dropped)
@@ -264,7 +261,7 @@ def _told(
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
-        told = iter(turns.said)
+        told = (one for one in turns.said)
         left_out = rejected_readings(turns, found)
         outliers = about_rejected(left_out)
         if turns.estimated:
@@ -276,10 +273,12 @@ def _told(
     return Diagnosis(
         verdict=verdict,
         findings=tuple(
-            replace(one, seen_by=seen_by(parts, kept, stages[-1].point, one)) if turns is None else one
+            replace(one, seen_by=seen_by(parts, kept, stages[-1].point, one))
+            if turns is None
+            else one
             for one in with_consequences(ring, findings, causes)
         ),
-        fit_before=misfit_of(pairs_of(parts, kept, stages[0])),
+        fit_before=misfit_of(pairs_of(parts, kept, stages[0 if small is None else 1])),
         fit_after=misfit_of(pairs_of(parts, kept, stages[-1])),
         heldout=heldout,
         heldout_shots=() if turns is None else turns.shots[1],
@@ -289,8 +288,10 @@ def _told(
             found.fit.covariance[: len(causes), : len(causes)],
         ),
         unexplained=unexplained(
-            ring, NO_SCAN if small is not None and verdict == "distributed" else left,
-            combined_p_value(compared), judgement,
+            ring,
+            NO_SCAN if small is not None and verdict == "distributed" else left,
+            combined_p_value(compared),
+            judgement,
         ),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
         next=_next(ring, found, parts, how, problem.fixed),

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.numbers import numbers_read
-from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.prepare import same_monitors
+from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.views import PartView, TrajectoryView
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
@@ -55,7 +55,7 @@ def stages_of(
 ) -> list[Stage]:
     """The design; then with small errors and with the causes among them, or with one cause after
     the other."""
-    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...]]] = [((), ())]
+    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...], Array]] = [((), (), problem.first)]
     about: dict[Hypothesis, float] = {}
     if small is not None:
         inner = found.problem
@@ -63,12 +63,12 @@ def stages_of(
         about = dict(zip(inner.known.hypotheses, inner.about.tolist(), strict=True))
         for one in (found.before, found.fit)[: 1 + bool(causes)]:
             amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
-            models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
+            models.append((tuple(Cause(*h, a) for h, a in amounts), (), one.nuisances))
         if causes:
-            models[-1] = (models[-1][0], causes)
+            models[-1] = (models[-1][0], causes, found.fit.nuisances)
     else:
-        models += [((), causes[: i + 1]) for i in range(len(causes))]
-    return [_settled(problem, static, own, about) for static, own in models]
+        models += [((), causes[: i + 1], problem.first) for i in range(len(causes))]
+    return [_settled(problem, *model, about) for model in models]
 
 
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
@@ -79,6 +79,7 @@ def _settled(
     problem: Together,
     static: tuple[Cause, ...],
     own: tuple[Cause, ...],
+    nuisances: Array,
     about: Mapping[Hypothesis, float],
 ) -> Stage:
     for share in SHARES:
@@ -87,7 +88,7 @@ def _settled(
             for c in static for start in [about[c.effect, c.element]]
         )  # fmt: skip
         there = replace(problem, fixed=(*problem.fixed, *some))
-        point = settled(there, own, problem.first)
+        point = settled(there, own, nuisances)
         if not point.lost or not static:
             break
     if point.lost:
@@ -211,7 +212,8 @@ def held_out_shots(
     judge = part.heldout
     if judge is None:
         return None
-    assert isinstance(judge, FirstTurns) and isinstance(part.problem, FirstTurns)
+    assert isinstance(judge, FirstTurns)
+    assert isinstance(part.problem, FirstTurns)
     dropped = found.dropped.reshape(part.problem.valid.shape)
     judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped), white=None)
     scored = []

@@ -41,6 +41,10 @@ OUTLYING = 5.0
 """Times its usual size from which a small error that outweighs its family is weighed as a fault:
 of machines in good order one in a million has it."""
 
+AMOUNT = 5.0
+"""Log evidence that an amount costs which may be anything: even over four decades, of both signs,
+known to some per cent."""
+
 POOR = 0.01
 """Chance that noise leaves as much as an explanation, below which its small errors are doubted."""
 
@@ -138,7 +142,14 @@ def sought(
         elif few.full and few.count < search.most:
             few = explain(search, start, few)
         return Found(few)
-    among = Found(*_among(search, tried, learn, noisy))
+    several: list[Found] = []
+    for small in tried:
+        several.append(Found(*_among(search, small, learn, noisy)))
+        if several[-1].explanation.count and _left(several[-1].explanation) >= POOR:
+            break
+    among = several[-1]
+    if len(several) > 1:
+        among = max(several, key=lambda one: _log_marginal(one.explanation))
     return Found(few) if few is not None and _likelier(few, among.explanation) else among
 
 
@@ -201,11 +212,8 @@ def _in_both(explanation: Explanation) -> tuple[Cause, ...]:
 
 
 # --- together with distributed errors -----------------------------------------------------------
-def _among(
-    search: Search, tried: Sequence[Learnt], learn: bool, noisy: bool
-) -> tuple[Explanation, Learnt]:
-    """What is found among the small errors of the greatest evidence, which are linearised again at
-    it where that misleads."""
+def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Explanation, Learnt]:
+    """The small errors, linearised again at what is found where that misleads."""
     problem = search.problem
     unnamed = search.unnamed and bool(len(problem.kick_places))
     search = replace(search, unnamed=unnamed)
@@ -213,28 +221,24 @@ def _among(
     stale = learn  # what is found made sizes too large
     search.progress("scan")
     narrow = replace(search, most=few, names_first=True)
-    first = [(explain(replace(narrow, problem=own.problem), own.before), own) for own in tried]
-    explanation, small = max(first, key=lambda one: _log_marginal(one[0]) if len(first) > 1 else 0)
+    explanation = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(problem.judgement.retaken):
         doubt = _beside(explanation, small, learn)
         if doubt is None:
             break
         search.progress("small errors with what was found")
         beside, causes = doubt
-        granted = narrow.granted
-        if not explanation.count and beside is explanation.fit:  # one of the small errors
-            granted = frozenset((c.effect, c.element) for c in causes)
+        weigh = not explanation.count and beside is explanation.fit  # one of the small errors
         try:
-            again, _ = _linearised(small, beside, causes, learn, noisy)
+            again, causes = _linearised(small, beside, causes, learn, noisy, weigh)
         except UnstableRingError:
             break  # what was found is no place from which they can be taken again
-        own = replace(narrow, granted=granted)
-        other = explain(replace(own, problem=again.problem), again.before)
+        if again.apart is not None and again.apart > AMOUNT:
+            narrow = replace(narrow, granted=frozenset((c.effect, c.element) for c in causes))
+        other = explain(replace(narrow, problem=again.problem), again.before)
         if not explanation.count and not other.count:
             break  # it was a small error after all
-        if granted != narrow.granted and _log_marginal(other) < _log_marginal(explanation):
-            break
-        small, explanation, narrow, stale = again, other, own, False
+        small, explanation, stale = again, other, False
     if explanation.full and search.most > few:
         whole = replace(search, problem=small.problem, granted=narrow.granted)
         explanation = explain(whole, small.before)
@@ -252,7 +256,12 @@ def _among(
 
 
 def _linearised(
-    small: Learnt, found: Fit, causes: Sequence[Cause], learn: bool, noisy: bool
+    small: Learnt,
+    found: Fit,
+    causes: Sequence[Cause],
+    learn: bool,
+    noisy: bool,
+    weigh: bool = False,
 ) -> tuple[Learnt, tuple[Cause, ...]]:
     """The small errors again, linearised at the most probable ones given what was found, and the
     causes with their share in them.
@@ -265,7 +274,7 @@ def _linearised(
     causes, amounts = _parted(causes, amounts, known, small.plain)
     again = small_errors_of(
         small.plain, known, found.nuisances, causes, learn=learn, noisy=learn and noisy,
-        about=amounts, stored=small.problem.about,
+        about=amounts, stored=small.problem.about, weigh=weigh,
     )  # fmt: skip
     if not learn:
         again = replace(again, errors=small.errors, log_evidence=small.log_evidence)
@@ -281,16 +290,14 @@ def _parted(
     """
     if not problem.alone:
         return tuple(causes), amounts
-    own = {hypothesis: i for i, hypothesis in enumerate(known.hypotheses)}
-    amounts, whole = amounts.copy(), []
-    for cause in causes:
-        i = own.get((cause.effect, cause.element))
-        if i is not None:
-            beyond = float(amounts[i] - known.amounts[i])
-            cause = replace(cause, amount=find(cause.effect).joined(cause.amount, beyond))
-            amounts[i] = known.amounts[i]
-        whole.append(cause)
-    return tuple(whole), amounts
+    at = {hypothesis: i for i, hypothesis in enumerate(known.hypotheses)}
+    amounts, whole = amounts.copy(), {(cause.effect, cause.element): cause for cause in causes}
+    for own in whole.keys() & at.keys():
+        i, cause = at[own], whole[own]
+        beyond = float(amounts[i] - known.amounts[i])
+        whole[own] = replace(cause, amount=find(cause.effect).joined(cause.amount, beyond))
+        amounts[i] = known.amounts[i]
+    return tuple(whole.values()), amounts
 
 
 def _settled(

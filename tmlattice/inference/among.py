@@ -29,7 +29,7 @@ Flags = NDArray[np.bool_]
 ROUNDS = 2
 """Linearisations: about the design, and about the likeliest errors."""
 
-ROWS = 1600
+ROWS = 1000
 """Rows from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
 
 HALVES = 4
@@ -327,6 +327,8 @@ class Learnt:
         before: nuisances alone.
         sizes, errors: rms by effect; relative error of each.
         log_evidence: over no small errors.
+        apart: log evidence that the cause given which they were taken is none of them, however
+            large its family may be; None: not asked.
     """
 
     problem: Among
@@ -335,6 +337,7 @@ class Learnt:
     sizes: Mapping[str, float]
     errors: Mapping[str, float]
     log_evidence: float
+    apart: float | None = None
 
 
 def small_errors_of(
@@ -347,6 +350,7 @@ def small_errors_of(
     noisy: bool = False,
     about: Array | None = None,
     stored: Array | None = None,
+    weigh: bool = False,
 ) -> Learnt:
     """The background of a machine as these data show it, linear about its likeliest amounts.
 
@@ -359,6 +363,7 @@ def small_errors_of(
         noisy: so is the noise, which is a guess.
         about: amounts that it is linearised at, [error]; None: at those that are known, and then at
             the most probable ones.
+        weigh: whether the one cause is a small error itself is weighed too.
         stored: amounts at which a beam is stored: `about` goes so far towards them as it has to.
 
     Raises:
@@ -368,7 +373,7 @@ def small_errors_of(
     names, belongs = families_of(known)
     amounts = known.amounts if about is None else about
     stored = amounts if stored is None else stored
-    evidence, errors, opened = 0.0, dict[str, float](), None
+    evidence, errors, opened, apart = 0.0, dict[str, float](), None, None
     for turn in range(ROUNDS if about is None else 1):
         inner, alone, amounts = near(problem, known, amounts, stored, causes, nuisances)
         assert alone.projection is not None
@@ -382,9 +387,15 @@ def small_errors_of(
             keep = kept(len(moved))
             rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
             noise = [part[keep] for part in inner.noise_rows()] if noisy else []
-            found = sizes_of(
-                moved[keep], alone.projection.matrix()[keep], rows[:, keep], belongs, noise
-            )
+            directions = alone.projection.matrix()[keep]
+            found = sizes_of(moved[keep], directions, rows[:, keep], belongs, noise)
+            if weigh:  # as one of them
+                i = known.hypotheses.index((causes[0].effect, causes[0].element))
+                some, amount = rows[:, keep], causes[0].amount
+                some[i] *= find(causes[0].effect).chain(amount)
+                whole = moved[keep] + amount / known.rms[i] * some[i]
+                other = sizes_of(whole, directions, some, belongs, noise)
+                apart = found.log_marginal - other.log_marginal
             if noise:
                 problem, inner = (own.noisier(found.noise) for own in (problem, inner))
             evidence = found.log_evidence if turn == 0 else evidence
@@ -406,7 +417,7 @@ def small_errors_of(
     if before.point.lost:
         raise UnstableRingError(f"{before.point.lost} without what was found beside small errors")
     sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
-    return Learnt(among, problem, before, sizes, errors, evidence)
+    return Learnt(among, problem, before, sizes, errors, evidence, apart)
 
 
 def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:

@@ -108,17 +108,17 @@ class Together(Problem):
         """Whether no part is of a reference, nor has shots of one."""
         return all(self.active) and all(part.alone for part in self.parts)
 
-    def reference(self) -> "Together":
+    def reference(self, nuisances: Array) -> "tuple[Together, Array]":
         """Return the measurements, or shots, of the reference alone, as those that are searched."""
-        parts, starts = [], []
-        for part, active, start in zip(self.parts, self.active, self.starts, strict=True):
-            own, first = (part, start) if not active else part.reference(start)
-            if own is not None:
-                parts.append(own)
-                starts.append(first)
-        return replace(
-            self, parts=tuple(parts), starts=tuple(starts), active=(True,) * len(parts)
-        )
+        parts: list[tuple[Problem, Array]] = []
+        for part, active, start in zip(
+            self.parts, self.active, self.of_parts(nuisances), strict=True
+        ):
+            own, first = part.reference(start) if active else (part, start)
+            parts += [] if own is None else [(own, first)]
+        problems, starts = zip(*parts, strict=True)
+        found = replace(self, parts=problems, starts=starts, active=(True,) * len(parts))
+        return found, found.first
 
     # --- nuisances: one flat vector -------------------------------------------------------------
     @property
