@@ -91,8 +91,8 @@ def sought(
             that starts.
         noisy: the noise is a guess, and learnt with them.
         known: of the small errors beforehand, instead of sizes.
-        earlier: what explains the reference alone. Where the small errors that all shots ask for
-            lose the beam, for a fault is no small error, they start at those of the reference.
+        earlier: what explains the reference alone. The small errors start at those of the
+            reference: a fault is none of them.
 
     Raises:
         MeasurementError: the design loses the beam.
@@ -122,18 +122,15 @@ def sought(
     first = Known.usual(seen, sizes) if known is None else known
     learn = learn and known is None
     asides = dict.fromkeys(((), () if few is None else _outstanding(few)))
-    starts: list[tuple[Known, Sequence[Cause], Array | None]]
-    starts = [(first, causes, None) for causes in asides]
+    amounts: Array | None = None
     if earlier is not None and earlier.small is not None:
         there = earlier.small.problem
-        starts.append((there.known, (), there.estimate(earlier.explanation.fit.clean)))
+        first, amounts = there.known, there.estimate(earlier.explanation.fit.clean)
     tried: list[Learnt] = []
-    for beforehand, causes, amounts in starts:
-        if amounts is not None and tried:
-            break
+    for causes in asides:
         with suppress(UnstableRingError):  # then they are none that anybody learns
             tried.append(small_errors_of(
-                problem, beforehand, begun.nuisances, causes, learn=learn, noisy=noisy,
+                problem, first, begun.nuisances, causes, learn=learn, noisy=noisy,
                 about=amounts,
             ))  # fmt: skip
     if not tried or (learn and max(small.log_evidence for small in tried) < CLEAR):
