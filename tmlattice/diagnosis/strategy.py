@@ -92,7 +92,7 @@ def sought(
         noisy: the noise is a guess, and learnt with them.
         known: of the small errors beforehand, instead of sizes.
         earlier: what explains the reference alone. The small errors start at those of the
-            reference: a fault is none of them.
+            reference, and are as large: a fault is none of them.
 
     Raises:
         MeasurementError: the design loses the beam.
@@ -126,6 +126,7 @@ def sought(
     if earlier is not None and earlier.small is not None:
         there = earlier.small.problem
         first, amounts = there.known, there.estimate(earlier.explanation.fit.clean)
+        learn = False
     tried: list[Learnt] = []
     for causes in asides:
         with suppress(UnstableRingError):  # then they are none that anybody learns
