@@ -52,7 +52,7 @@ def where_and_what(result):
     ax, data = above.subplots(), result.trajectories.data
     s = [monitor.s for monitor in result.ring.monitors]
     before = data.readings - design_readings(result)
-    after = data.readings - result.explanation.fit.point.view.readings
+    after = data.readings - result.trajectories.after
     shot = int(np.square(before).sum(axis=(1, 2)).argmax())
     ax.plot(s, 1e3 * before[shot, :, 1], color=BEFORE, linewidth=1, label="the design leaves")
     ax.plot(s, 1e3 * after[shot, :, 1], color=AFTER, linewidth=1, label="the ring as found leaves")

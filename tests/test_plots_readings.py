@@ -29,7 +29,7 @@ def test_gap_of_the_design_begins_at_the_finding(small_ring, weak):
     def rms(model, at):
         return np.sqrt(np.mean((readings - model)[:, at] ** 2))
 
-    own, everywhere = design_readings(weak), weak.explanation.before.point.view.readings
+    own, everywhere = design_readings(weak), weak.trajectories.before
     assert rms(own, before) < 1.2 * 2e-6  # less than the noise by what the launch takes up
     assert rms(everywhere, before) > 2 * 2e-6
     assert rms(own, ~before) > 5 * 2e-6
@@ -53,4 +53,4 @@ def test_launch_is_fitted_everywhere_where_nothing_acts_or_nothing_is_before(sma
     result = found(small_ring, cause)
     assert result.findings
     assert before_findings(result) is None
-    assert (design_readings(result) == result.explanation.before.point.view.readings).all()
+    assert (design_readings(result) == result.trajectories.before).all()

@@ -8,12 +8,11 @@ from numpy.testing import assert_allclose
 
 from tmlattice import Cause, simulate
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.background import background_signatures
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import among
-from tmlattice.inference.among import Among, Known, _signatures, small_errors_of
+from tmlattice.inference.among import Known, small_errors_of
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
 from tmlattice.inference.together import Together
@@ -104,22 +103,22 @@ def test_a_reference_has_what_is_fixed_and_not_what_is_sought(orbit):
     assert np.abs(sought[count:] - fixed[count:]).max() > 1
 
 
-def test_small_errors_among_any_rows_are_those_of_trajectories(turns):
-    """The covariance that first turns have of their own: two ways to the same chi-square."""
+def test_fast_products_among_small_errors_are_those_of_all_signatures(turns):
+    """Two ways to the same scan: sums over readings, and signatures that are whitened."""
     rms = {name: find(name).background for name in ("quadrupole_gradient", "monitor_gain_x")}
+    everywhere = [(name, place) for name in rms for place in find(name).places(turns.model.ring)]
     start = fit(turns, (), turns.first)
-    which, scale, spread = background_signatures(
-        turns.model, start.point.view, start.nuisances, rms
-    )
-    own = fit(replace(turns, spread=spread, white=None), (), start.nuisances)
-    rows = scale[:, None] * _signatures(turns, start.point, which)
-    among = Among(
-        places={}, inner=turns, known=Known.usual(which, rms),
-        spread=rows.reshape(-1, *turns.valid.shape), shift=np.zeros(turns.valid.shape),
-    )  # fmt: skip
-    other = fit(among, (), start.nuisances)
-    assert own.chi2 < 0.9 * start.chi2
-    assert_allclose(other.chi2, own.chi2, rtol=1e-6)
+    among = small_errors_of(turns, Known.usual(everywhere, rms), start.nuisances, learn=False)
+    assert among.before.chi2 < 0.9 * start.chi2
+    problem = among.problem
+    some = [(WEAK.effect, WEAK.element), ("monitor_offset_y", "end_1"), ("energy_spread", None),
+            ("quadrupole_offset_x", "QF::3"), ("monitor_swap", "bpm::4")]  # fmt: skip
+    data = among.before.residual[None]
+    found = problem.metric(among.before.point).products(some, data)
+    out = among.before.projection.out
+    rows = out(problem.white(turns.metric(among.before.point.view).rows(some)))
+    assert_allclose(found.whole - found.inside, np.einsum("hr,hr->h", rows, rows), rtol=1e-6)
+    assert_allclose(found.inner, rows @ out(data).T, rtol=1e-6, atol=1e-6)
 
 
 def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):

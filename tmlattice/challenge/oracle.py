@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.challenge.case import Case, Truth, ring_of
-from tmlattice.diagnosis.background import background_signatures
+from tmlattice.challenge.ruler import background_signatures
 from tmlattice.effects import Cause, RingEffect, find, modelled
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import effective_number, free_threshold

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Model
-from tmlattice.diagnosis.background import background_signatures
+from tmlattice.beam.model import Hypothesis, Model, Paths
 from tmlattice.effects import Cause, Settings
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.lattice import Ring
@@ -77,3 +76,21 @@ class Ruler:
         """Signal to noise of causes by the model: quick, and good for finding amounts."""
         change = self.model.readings(self.launches, causes) - self._base
         return self.size(change[self._reference :])
+
+
+def background_signatures(
+    model: Model, paths: Paths, launches: Array, rms: Mapping[str, float]
+) -> tuple[list[Hypothesis], Array, Array]:
+    """Every small error along these trajectories.
+
+    Args:
+        model, paths, launches: the base.
+        rms: by effect.
+
+    Returns:
+        Which they are; the rms of each, [error]; rms times signature, [error, shot, reading, 2], m.
+    """
+    hypotheses = model.hypotheses(list(rms))
+    scale = np.array([rms[name] for name, _ in hypotheses])
+    signatures = np.nan_to_num(model.signatures(paths, hypotheses, launches))
+    return hypotheses, scale, scale[:, None, None, None] * signatures

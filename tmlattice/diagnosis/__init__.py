@@ -16,13 +16,12 @@ from tmlattice.by_name import by_name
 from tmlattice.diagnosis.absent import in_the_lattice
 from tmlattice.diagnosis.devices import devices_of, with_devices
 from tmlattice.diagnosis.kinds import Measured, kind_of
-from tmlattice.diagnosis.procedure import diagnose as diagnose_trajectories
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, in_words
 
-__all__ = ["Diagnosis", "Finding", "Member", "diagnose", "diagnose_trajectories"]
+__all__ = ["Diagnosis", "Finding", "Member", "diagnose"]
 
 _OPTIONS = {
     "first turns": ("reference", "background", "heldout", "radiation"),
@@ -48,11 +47,11 @@ def diagnose(
         measurement: of any kind; or several of one machine by name, which are diagnosed together.
         options: for every kind holdout, effects, max_effects, false_alarm, assume, seed, progress
             and reference, a measurement of the same kind and machine from before; for first turns
-            also background, heldout and radiation, see `diagnosis.procedure.diagnose`; for an orbit
-            response alone missing, see `diagnosis.response.diagnose_response`, and with a reference
+            also background, heldout and radiation; for an orbit response alone missing, see
+            `diagnosis.response.diagnose_response`, and with a reference
             `diagnosis.before_after.diagnose_change`; for several, and for those of a stored beam,
             background, and known, what an earlier diagnosis left known of the ring as it found it
-            (`diagnosis.twin`; first turns take it too), see `diagnosis.joint.diagnose_together`.
+            (`diagnosis.twin`; first turns take it too). See `diagnosis.procedure`.
 
     Monitors and correctors that the lattice lacks are left out, and told, where they are half of
     the names at most.
@@ -142,8 +141,6 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
                 f"the measurement is {of} and the reference {in_words(before)}: give a reference "
                 "of the same kind"
             )
-    if isinstance(measurement, Measurement):
-        return diagnose_trajectories(ring, measurement, **options)
     if isinstance(measurement, OrbitResponse) and options.get("reference") is not None:
         from tmlattice.diagnosis.response.before_after import diagnose_change
 
@@ -156,7 +153,7 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
 
         options.pop("reference", None)
         return diagnose_response(ring, measurement, **options)
-    from tmlattice.diagnosis.joint import diagnose_together
+    from tmlattice.diagnosis.procedure import diagnose_together
 
     if not isinstance(measurement, Mapping):
         measurement = {kind_of(measurement): measurement}

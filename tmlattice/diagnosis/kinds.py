@@ -16,7 +16,7 @@ from tmlattice.diagnosis.prepare import batch, prepare
 from tmlattice.diagnosis.stored_doctor import refused
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.problem import Problem
+from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
@@ -29,6 +29,7 @@ from tmlattice.measurement import (
 )
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.observe.noise import scatter
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import response_data
@@ -53,6 +54,10 @@ class How:
         holdout: share of shots, or of correctors, that the fit does not see.
         assume: what was written down wrongly everywhere.
         seed: of the split.
+        effects: names of those that may be the cause; None: all usual ones.
+        radiation: the model of first turns radiates as expected.
+        reference: of first turns alone: shots from before, which share the errors of the machine.
+        heldout: of first turns alone: the shots that validate, instead of a share.
     """
 
     ring: Ring
@@ -61,6 +66,10 @@ class How:
     holdout: float = 0.0
     assume: Sequence[str] = ()
     seed: int = 0
+    effects: Sequence[str] | None = None
+    radiation: bool = False
+    reference: Measurement | None = None
+    heldout: Measurement | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,10 @@ class Part:
         estimated: whether its noise comes from the data.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
         said: what a reader should know.
+        hypotheses: what its readings can determine; None: what the problem sees.
+        start: nuisances to start at; None: the problem's own first guess.
+        shots: numbers of those of the fit, those of a reference first (None), and of those that
+            are held out.
     """
 
     label: str
@@ -84,6 +97,9 @@ class Part:
     estimated: bool = False
     dead: tuple[tuple[int, float], ...] = ()
     said: tuple[str, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] | None = None
+    start: Array | None = field(default=None, repr=False)
+    shots: tuple[tuple[int | None, ...], tuple[int, ...]] = ((), ())
 
 
 def part_of(label: str, measured: Measured, how: How) -> Part:
@@ -110,7 +126,12 @@ def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together
         ]
         for some in (parts, before)
     )
-    return replace(Together.of(first, then), places=how.places, judgement=how.judgement)
+    starts = tuple(
+        own.first if part.start is None else part.start
+        for part, own in zip((*parts, *before), (*first, *then), strict=True)
+    )
+    whole = Together.of(first, then)
+    return replace(whole, places=how.places, judgement=how.judgement, starts=starts)
 
 
 def kind_of(measured: Measured) -> str:
@@ -122,18 +143,40 @@ def kind_of(measured: Measured) -> str:
 def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
     ring = how.ring
     measured = mended(ring, measured, how.assume)
-    said = consulted(ring, measured, False)
+    before, held = (mended(ring, own, how.assume) for own in (how.reference, how.heldout))
+    said = consulted(ring, measured, how.radiation, before)
     measured = batch(ring, measured, said)
-    fitted, held = measured.split(how.holdout, how.seed) if how.holdout else (measured, None)
-    ready = prepare(ring, fitted, None, False, None, how.judgement)
+    before, held = (own and batch(ring, own, said) for own in (before, held))
+    if held is None and how.holdout:
+        measured, held = measured.split(how.holdout, how.seed)
+        if held is None and not how.places:
+            said.append("one shot was measured, so none is held out")
+    options = (how.radiation, how.effects, how.judgement)
+    ready = prepare(ring, measured, before, *options)
+    estimated = ready.estimated
+    if before is not None and estimated:  # of the same electronics: from all shots
+        noise = scatter(ready.problem.data, ready.before.point.view)
+        if np.isfinite(noise).all():
+            measured, before = (_with_noise(own, noise) for own in (measured, before))
+            ready = prepare(ring, measured, before, *options)
     other = None
     if held is not None:
         data = of_measurement(ring, held).with_sigma(np.array(ready.noise))
-        model = Model(ring, data.settings, data.turns, active=data.active)
+        model = Model(ring, data.settings, data.turns, ready.known, active=data.active)
         other = FirstTurns(model=model, data=data, places=how.places)
+    earlier: tuple[int | None, ...] = (None,) * (0 if before is None else len(before.shots))
     return Part(
-        label, kind, ready.problem, other, ready.estimated, ready.dead, (*said, *ready.said)
-    )
+        label, kind, ready.problem, other, estimated, ready.dead, (*said, *ready.said),
+        ready.hypotheses, ready.before.nuisances,
+        ((*earlier, *measured.shots), () if held is None else tuple(held.shots)),
+    )  # fmt: skip
+
+
+def _with_noise(measured: Measurement, noise: Array) -> Measurement:
+    """The measurement with this noise, m, [2], where it states none."""
+    stated = np.full((len(measured.monitors), 2), np.nan)
+    stated = stated if measured.noise is None else np.asarray(measured.noise)
+    return replace(measured, noise=np.where(np.isfinite(stated), stated, noise))
 
 
 def _response(label: str, kind: str, measured: Any, how: How) -> Part:

@@ -83,9 +83,8 @@ def prepare(
     radiation: bool,
     effects: Sequence[str] | None,
     judgement: Judgement,
-    common: Sequence[Cause] = (),
 ) -> Prepared:
-    """Data, model and launches; `common` causes are in the reference too.
+    """Data, model and launches.
 
     Raises:
         MeasurementError: data that cannot be used, or that are of another lattice.
@@ -93,7 +92,7 @@ def prepare(
         EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor that the ring does not have, or an effect that does not exist.
     """
-    known = (*(expected_radiation(ring) if radiation else ()), *common)
+    known = tuple(expected_radiation(ring)) if radiation else ()
     data = of_measurement(ring, measurement)
     if reference is not None:
         data = joined(of_measurement(ring, reference, reference=True), data)

@@ -1,25 +1,22 @@
-"""The diagnosis of a measurement: where the gap lies, which effect causes it, how far it shrinks.
+"""The diagnosis of first turns, of what a stored beam shows, and of several measurements together.
 
->>> diagnosis = diagnose(load_ring("petra3"), read_measurement("day_1"))
->>> diagnosis.verdict, diagnosis.findings[0].effect, diagnosis.findings[0].element
->>> diagnosis.gap["closed"]                     # on shots that the fit never saw
+>>> diagnose_together(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
+
+Rows are stacked; causes are shared, nuisances are each measurement's own (see `strategy` for the
+steps). A reference of each kind holds what was there before.
 """
 
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Model
 from tmlattice.diagnosis.assessment import Block, combined_p_value, compared_of
-from tmlattice.diagnosis.background import SmallErrors
-from tmlattice.diagnosis.common import sought_in
 from tmlattice.diagnosis.correlations import correlations_of
-from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.findings import (
     findings_of,
     finished,
@@ -28,38 +25,76 @@ from tmlattice.diagnosis.findings import (
     verdict_of,
     with_consequences,
 )
-from tmlattice.diagnosis.next_kind import leading
+from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
+from tmlattice.diagnosis.left_out import (
+    about_launches,
+    about_rejected,
+    noise_text,
+    rejected_readings,
+    spikes,
+    with_silent,
+)
+from tmlattice.diagnosis.next_kind import leading, next_kind
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.prepare import Prepared, batch, noise_of, same_monitors
-from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.diagnosis.strategy import freedom
+from tmlattice.diagnosis.prepare import noise_of
+from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.stages import (
+    held_out,
+    held_out_shots,
+    misfit_of,
+    pairs_of,
+    seen_by,
+    stages_of,
+    too_large,
+    trajectory_view,
+    views_of,
+)
+from tmlattice.diagnosis.strategy import freedom, sought, sought_since
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.diagnosis.views import TrajectoryView
-from tmlattice.effects import Cause, apply, background_rms
-from tmlattice.errors import BeamLostError, TmlatticeError
-from tmlattice.inference.judge import Gap, held_out_gap, misfit
+from tmlattice.diagnosis.views import JointView
+from tmlattice.effects import (
+    Cause,
+    Effect,
+    LaunchEffect,
+    apply,
+    background_rms,
+    find,
+    modelled,
+    rare,
+)
+from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
+from tmlattice.inference.among import Known, Learnt
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome
-from tmlattice.inference.scan import FreeScan
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
+from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
-from tmlattice.observe.data import of_measurement
-from tmlattice.observe.first_turns import FirstTurns, judged, turns_of
+from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
-from tmlattice.speaks import micrometres
 from tmlattice.version import __version__
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+Array = NDArray[np.float64]
 
-def diagnose(
+MOST_OF_IT = 0.5
+"""Share of the gap that one cause has to make to be put aside before sizes are learnt."""
+
+CROWDED = 1.5
+"""What half of the monitors leave at least of their noise where a few causes with names were tried,
+from which on nothing without a name is: errors are everywhere."""
+
+
+def diagnose_together(
     ring: Ring,
-    measurement: Measurement,
+    measured: Mapping[str, Measured],
     *,
-    reference: Measurement | None = None,
+    reference: Mapping[str, Any] | None = None,
     background: Mapping[str, float | None] | None = None,
+    known: Known | None = None,
     holdout: float = 0.33,
     heldout: Measurement | None = None,
     effects: Sequence[str] | None = None,
@@ -70,292 +105,245 @@ def diagnose(
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Where the gap between a ring and its measurement lies, what causes it, how far it shrinks.
+    """Where the gap between a ring and its measurements lies, what causes it, how far it shrinks.
 
     Args:
         ring: the design.
-        measurement: first turns, or a few turns, of one or more shots.
-        reference: of the same machine before the fault: static errors cancel.
-        background: small errors that the machine has everywhere, rms by effect (None: the
-            catalogue's own; "all": every usual one; empty, or "none": there are none). Not given:
-            whether there are any, and how large they are, the data say.
-        holdout: share of the shots that the fit does not see, for the gap.
-        heldout: those shots themselves, instead of a share.
-        effects: names of those that may be the cause; else all usual ones of the catalogue.
+        measured: by the names that the result calls them.
+        reference: of the same machine before the fault, of any kinds: static errors cancel.
+        background: small errors, as of `diagnose`.
+        known: of the small errors beforehand, from an earlier diagnosis whose ring as found this
+            is: see `twin`. Then no background is asked for.
+        holdout: share of shots, or of correctors, that judge.
+        heldout: of first turns alone: those shots themselves, instead of a share.
+        effects: names of those that may be the cause; else all usual ones.
         max_effects: findings at most.
-        radiation: the model radiates as expected.
+        radiation: of first turns alone: the model radiates as expected.
         false_alarm: share of faultless data sets in which something may be found.
-        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone in
-            all shots first.
-        seed: of the split, the threshold's simulation and the bootstrap.
+        assume: what was written down wrongly everywhere, see `measurement.assume`.
+        seed: of the split and of the threshold's simulation.
         progress: told what is being done.
 
     Raises:
-        MeasurementError: data that cannot be used, that have a wrong sign, unit or order
-            everywhere, or that are of another lattice.
-        BeamLostError: launches that are lost in the design.
+        MeasurementError: data that cannot be used; the sentence says which.
         EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor or an effect that does not exist.
+        UnstableRingError: the design has no stored beam.
     """
     begun = time.perf_counter()
-    options = {
-        "reference": reference is not None,
-        "background": None if background is None else dict(background),
-        "holdout": holdout,
-        "effects": None if effects is None else list(effects),
-        "max_effects": max_effects,
-        "radiation": radiation,
-        "false_alarm": false_alarm,
-        **({"assume": list(assume)} if assume else {}),
-    }
     judgement = Judgement(false_alarm=false_alarm)
+    how = How(ring, {}, judgement, holdout, assume, seed)
     progress("data")
-    measurement = mended(ring, measurement, assume)
-    reference, heldout = (mended(ring, own, assume) for own in (reference, heldout))
-    said = consulted(ring, measurement, radiation, reference)
-    measurement = batch(ring, measurement, said)
-    reference, heldout = (own and batch(ring, own, said) for own in (reference, heldout))
-    if heldout is None:
-        measurement, heldout = measurement.split(holdout, seed)
-        if heldout is None and holdout > 0:
-            said.append("one shot was measured, so none is held out")
-    progress("model")
-    rms = None if background is None else background_rms(background)
-    ready, found = sought_in(
-        ring, measurement, reference, radiation, effects, rms, judgement,
-        lambda ready: Search(
-            ready.problem, ready.hypotheses, max_effects, seed=seed, progress=progress
-        ),
+    kinds = [kind_of(one) for one in measured.values()]
+    if kinds == ["trajectory"] and known is None:  # with launches of its own, all can be shared
+        (label, one), *_ = measured.items()
+        first = next(iter((reference or {}).values()), None)
+        whole = replace(how, effects=effects, radiation=radiation, reference=first, heldout=heldout)
+        parts, before = [part_of(label, one, whole)], list[Part]()
+        hypotheses = list(parts[0].hypotheses or ())
+        chosen = list(parts[0].problem.places)
+        how = replace(whole, places=parts[0].problem.places)
+    else:
+        chosen = _chosen(ring, effects, "turn_by_turn" in kinds)
+        places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
+        how = replace(how, places=places)
+        parts = [with_silent(ring, _named(label, one, how), one) for label, one in measured.items()]
+        plain = replace(how, holdout=0.0)
+        before = [_named(label, one, plain) for label, one in (reference or {}).items()]
+        hypotheses = _seen(ring, chosen, parts)
+    problem = replace(
+        stacked(parts, before, how), rare=rare(ring, chosen),
+        fixed=() if known is None else known.causes,
     )  # fmt: skip
-    small, explanation = found.small, finished(found.explanation)
+    search = Search(
+        problem, hypotheses, max_effects, seed=seed, progress=progress,
+        unnamed=all(part.kind != "orbit_response" for part in parts),
+    )  # fmt: skip
+    usual = background_rms({"all": None})
+    sizes = usual if background is None else background_rms(background)
+    everywhere = [(name, place) for name in sizes for place in find(name).places(ring)]
+    learn = background is None
+    noisy = any(part.estimated for part in parts)
+    if problem.alone:
+        sought_out = sought(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
+    else:
+        first, _ = problem.reference(problem.first)
+        earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
+        sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
     progress("report")
-    told = _told(ring, ready, small, explanation, judgement)
-    gap = _held_out(ring, heldout, ready, told, small, explanation, said)
-    repaired = apply(ring, told.causes)
-    noise = _noise(ready, small)
-    left_out = _left_out(ready.problem, explanation, measurement.shots)
-    compared = compared_of(told.fitted, gap)
-    p_value = combined_p_value(compared)
-    return Diagnosis(
-        verdict=told.verdict,
-        findings=with_consequences(ring, told.findings, told.causes),
-        fit_before=misfit(told.residuals[0], told.problem.data.sigma),
-        fit_after=misfit(told.residuals[-1], told.problem.data.sigma),
-        heldout=gap,
-        heldout_shots=() if heldout is None else heldout.shots,
-        unexplained=unexplained(told.problem.model.ring, told.left, p_value, judgement),
-        compared=compared,
-        correlations=correlations_of(
-            [(cause.effect, cause.element) for cause in told.causes],
-            explanation.fit.covariance[: len(told.causes), : len(told.causes)],
-        ),
-        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
-        next=_next(ring, ready, explanation, seed),
-        sensitivity=sensitivity(explanation.first, judgement),
-        warnings=_said(said, ready, noise, told, left_out),
-        suspects=suspects(ring, explanation, judgement) if told.verdict == "distributed" else (),
-        left_out=left_out,
-        noise=noise,
-        noise_estimated=ready.estimated,
-        provenance={
-            "package": __version__,
-            "lattice": ring.name,
-            "measurement": measurement.lattice,
-            "options": options,
-            "seed": seed,
-            "seconds": time.perf_counter() - begun,
+    return _told(
+        ring, parts, problem, sought_out.explanation, sought_out.small, how,
+        {
+            "seconds": time.perf_counter() - begun, "seed": seed,
+            "options": {
+                "reference": reference is not None,
+                "background": None if background is None else dict(background),
+                "holdout": holdout, "effects": None if effects is None else list(effects),
+                "max_effects": max_effects, "false_alarm": false_alarm, "radiation": radiation,
+                **({"assume": list(assume)} if assume else {}),
+            },
         },
-        ring=ring,
-        repaired=repaired,
-        causes=told.causes,
-        errors=_errors(explanation)[: len(told.causes)],
-        priors={} if small is None else small.sizes,
-        prior_errors={} if small is None else small.open,
-        view=TrajectoryView(explanation, ready.problem.data, told.problem.model),
-    )
+    )  # fmt: skip
+
+
+def _named(label: str, measured: Measured, how: How) -> Part:
+    try:
+        return part_of(label, measured, how)
+    except MeasurementError as error:
+        raise MeasurementError(f"{label}: {error}") from error
+
+
+def _seen(ring: Ring, effects: Sequence[str], parts: Sequence[Part]) -> list[Hypothesis]:
+    """Every effect at every place where any measurement sees it."""
+    return [
+        (name, place) for name in effects for place in find(name).places(ring)
+        if any(part.problem.sees((name, place)) for part in parts)
+    ]  # fmt: skip
+
+
+def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]:
+    chosen = [name for name in modelled(effects, turns) if find(name).places(ring)]
+    chosen = [name for name in chosen if not _of_launches(find(name))]
+    if not chosen:
+        raise EffectError("none of these effects can be looked for here; name another one")
+    return chosen
+
+
+def _of_launches(effect: Effect) -> bool:
+    """Whether it is the launches' alone; what shifts all of them is not the stored beam's, nor seen
+    where each shot has a launch of its own."""
+    return isinstance(effect, LaunchEffect) and (effect.shifts is not None or not effect.responds)
 
 
 # --- what is told ----
-def _errors(explanation: Explanation) -> tuple[float, ...]:
-    """Standard error of the amount of each cause."""
-    return tuple(np.sqrt(np.maximum(np.diag(explanation.fit.covariance), 0.0)).tolist())
-
-
-@dataclass(frozen=True)
-class _Told:
-    """What stands of an explanation.
-
-    Attributes:
-        verdict, findings, causes: that stand.
-        problem: the readings that they are judged on.
-        left: the scan of free kicks about what stands.
-        fitted: the readings of the fit, compared with what stands.
-        estimates: the likeliest small errors before and after, empty without a background.
-        residuals: readings less model before and after, NaN where there is none.
-        said: what a reader should know.
-    """
-
-    verdict: str
-    findings: tuple[Finding, ...]
-    causes: tuple[Cause, ...]
-    problem: FirstTurns
-    left: FreeScan
-    fitted: Block
-    estimates: list[list[Cause]]
-    residuals: list[Array]
-    said: tuple[str, ...]
-
-
 def _told(
     ring: Ring,
-    ready: Prepared,
-    small: SmallErrors | None,
-    explanation: Explanation,
-    judgement: Judgement,
-) -> _Told:
-    result, problem, left = explanation.fit, turns_of(explanation), explanation.left
-    findings = findings_of(ring, explanation, ready.dead, judgement)
-    alone = bool(problem.data.active.all())
-    fitted = Block("fitted readings", result.chi2, freedom(problem, result))
-    verdict, standing, said = verdict_of(
-        explanation, findings, fitted.p_value, ready.estimated, judgement
+    parts: Sequence[Part],
+    problem: Together,
+    found: Explanation,
+    small: Learnt | None,
+    how: How,
+    made: Mapping[str, Any],
+) -> Diagnosis:
+    judgement = how.judgement
+    found = finished(_by_ring(ring, problem, found))
+    result = found.fit
+    # what counts turns late reads nothing in the first ones
+    late = {c.element for c in result.causes if find(c.effect).of_turns}
+    dead = tuple(
+        dict.fromkeys(d for p in parts for d in p.dead if ring.monitors[d[0]].name not in late)
     )
-    learnt = small is not None and small.evidence is not None
-    if verdict == "nothing" and learnt and alone:
-        verdict = "distributed"  # the gap has a cause: many small ones
-    if verdict == "distributed":  # nothing is explained: what was found stands no longer
-        result, left = explanation.before, explanation.first_kicks
-        problem = ready.problem if small is None else small.problem
-        fitted = Block(fitted.name, result.chi2, freedom(problem, result))
-    elif result.outcome is not Outcome.CONVERGED:
+    estimated = any(part.estimated for part in parts)
+    findings = findings_of(ring, found, dead, judgement)
+    fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
+    verdict, findings, said = verdict_of(found, findings, fitted.p_value, estimated, judgement)
+    if verdict == "nothing" and small is not None and small.errors and problem.alone:
+        verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
+    elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
-    fits = [explanation.before, result] if result.causes or result.kicks else [explanation.before]
-    estimates: list[list[Cause]] = [[] for _ in fits]
-    if small is not None:
-        seen_by = (small.problem.whitening, turns_of(explanation).whitening)
-        estimates = [small.estimate(f, w) for f, w in zip(fits, seen_by, strict=False)]
-    there = problem.valid & problem.data.active[:, None, None]
-    residuals = []
-    for one, errors in zip(fits, estimates, strict=True):
-        made = small.made_by(errors) if small else 0.0
-        difference = problem.data.readings - one.point.view.readings - made
-        residuals.append(np.where(there, difference, np.nan))
-    return _Told(
-        verdict, standing, result.causes, problem, left, fitted, estimates, residuals, said
+    causes = () if verdict == "distributed" else result.causes
+    left = found.left if causes or (found.kicks and findings) else found.first_kicks
+    if result.causes and not causes:  # nothing is explained: what is left is what was there
+        fitted = Block(fitted.name, found.before.chi2, freedom(found.problem, found.before))
+    kept = problem.without(found.dropped)
+    stages = stages_of(kept, found, small, causes)
+    views = views_of(parts, kept, stages)
+    aside = {ring.monitors[m].name for m in found.monitors}
+    since = 0 if small is None else max(len(stages) - 2, 0)
+    turns = parts[0] if parts[0].hypotheses is not None and len(parts) == 1 else None
+    left_out: tuple[dict[str, Any], ...] = ()
+    if turns is None:
+        heldout = held_out(parts, problem.fixed, stages, aside, since)
+        # what small errors leave undetermined is not in the errors of held-out readings
+        compared = compared_of(fitted, heldout if small is None else None)
+        told = (f"{part.label}: {one}" for part in parts for one in part.said)
+        outliers = list(spikes(parts, problem, found))
+    else:
+        heldout = held_out_shots(turns, problem, found, small, stages, since)
+        compared = compared_of(fitted, heldout)
+        told = (one for one in turns.said)
+        left_out = rejected_readings(turns, found)
+        outliers = about_rejected(left_out)
+        if turns.estimated:
+            outliers.append(noise_text(_noise(parts)))
+        outliers += about_launches(turns, findings)
+    warnings = [*told, *outliers, *said, *too_large(stages)]
+    repaired = apply(ring, causes)
+    errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
+    return Diagnosis(
+        verdict=verdict,
+        findings=tuple(
+            replace(one, seen_by=seen_by(parts, kept, stages[-1].point, one))
+            if turns is None
+            else one
+            for one in with_consequences(ring, findings, causes)
+        ),
+        fit_before=misfit_of(pairs_of(parts, kept, stages[0 if small is None else 1])),
+        fit_after=misfit_of(pairs_of(parts, kept, stages[-1])),
+        heldout=heldout,
+        heldout_shots=() if turns is None else turns.shots[1],
+        compared=compared,
+        correlations=correlations_of(
+            [(cause.effect, cause.element) for cause in causes],
+            found.fit.covariance[: len(causes), : len(causes)],
+        ),
+        unexplained=unexplained(
+            ring,
+            NO_SCAN if small is not None and verdict == "distributed" else left,
+            combined_p_value(compared),
+            judgement,
+        ),
+        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
+        next=_next(ring, found, parts, how, problem.fixed),
+        sensitivity=sensitivity(found.first, judgement),
+        warnings=tuple(dict.fromkeys(warnings)),
+        suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
+        left_out=left_out,
+        noise=_noise(parts),
+        noise_estimated=estimated,
+        provenance={"package": __version__, "lattice": ring.name, "measurement": None, **made},
+        ring=ring,
+        repaired=repaired,
+        causes=causes,
+        errors=tuple(errors.tolist()),
+        priors={} if small is None else dict(small.sizes),
+        prior_errors={} if small is None else dict(small.errors),
+        view=JointView(found, views) if turns is None else trajectory_view(kept, found, stages),
     )
-
-
-def _noise(ready: Prepared, small: SmallErrors | None) -> tuple[float, float]:
-    """Of a reading: where nobody states it, neighbours take small errors between them for noise."""
-    return ready.noise if small is None else noise_of(small.problem.data)
-
-
-def _held_out(
-    ring: Ring,
-    heldout: Measurement | None,
-    ready: Prepared,
-    told: _Told,
-    small: SmallErrors | None,
-    explanation: Explanation,
-    said: list[str],
-) -> Gap | None:
-    """The gap on shots that the fit did not see: the design's; with the small errors in it, as the
-    fit without causes leaves them; with the findings, one by one where there are no small errors.
-    """
-    if heldout is None:
-        return None
-    other = of_measurement(ring, heldout).with_sigma(np.array(_noise(ready, small)))
-    dropped = ready.problem.valid & ~told.problem.valid
-    other = same_monitors(other, ready.problem.data, dropped)
-
-    def problem(known: Sequence[Cause], causes: tuple[Cause, ...]) -> FirstTurns:
-        model = Model(ring, other.settings, other.turns, [*ready.known, *known])
-        return FirstTurns(model=model, data=other, places={}, fixed=causes)
-
-    if small is None:
-        steps = [told.causes[:i] for i in range(len(told.causes) + 1)]
-        return held_out_gap([judged(problem((), step)) for step in steps])
-    scored = [judged(problem((), ()))]
-    seen_by = (small.problem, turns_of(explanation))
-    fits = (explanation.before, explanation.fit)[: len(told.estimates)]
-    for one, seen, errors in zip(fits, seen_by, told.estimates, strict=False):
-        try:
-            unknown = small.unknown(one, seen, problem(errors, ()), errors)
-        except BeamLostError as error:
-            said.append(f"{error}: the held-out shots do not validate the result")
-            return None
-        scored.append(judged(problem(errors, one.causes), unknown))
-    return held_out_gap(scored, since=max(len(scored) - 2, 0))
-
-
-def _left_out(
-    problem: FirstTurns, explanation: Explanation, shots: Sequence[int]
-) -> tuple[dict[str, Any], ...]:
-    """Single readings that the search left out as spikes, {"shot", "turn", "monitor", "plane"}."""
-    count = len(problem.monitors)
-    first = int((~problem.data.active).sum())  # of a reference, which come first
-    rows: list[dict[str, Any]] = []
-    for shot, reading, plane in explanation.spikes:
-        turn, monitor = divmod(reading, count)
-        of = shots[shot - first] if shot >= first else None
-        rows.append(
-            {"shot": of, "turn": turn, "monitor": problem.monitors[monitor], "plane": "xy"[plane]}
-        )
-    return tuple(rows)
 
 
 def _next(
-    ring: Ring, ready: Prepared, explanation: Explanation, seed: int
+    ring: Ring, found: Explanation, parts: Sequence[Part], how: How, fixed: tuple[Cause, ...]
 ) -> NextMeasurement | None:
-    pair = leading(ring, explanation, ready.problem.judgement.mass)
+    """What to measure next: of first turns one more shot, else another kind."""
+    one = parts[0].problem
+    if len(parts) > 1 or not isinstance(one, FirstTurns):
+        return next_kind(ring, found, [part.kind for part in parts], how, fixed)
+    pair = leading(ring, found, how.judgement.mass)
     if pair is None:
         return None
     try:
-        return next_measurement(ring, ready.problem.data, *pair, ready.known, seed)
+        return next_measurement(ring, one.data, *pair, one.model.assembly.known, how.seed)
     except TmlatticeError:
         log.warning("no next measurement could be found", exc_info=True)
     return None
 
 
-def _said(
-    said: Sequence[str],
-    ready: Prepared,
-    noise: tuple[float, float],
-    told: _Told,
-    left_out: Sequence[Mapping[str, Any]],
-) -> tuple[str, ...]:
-    """What a reader should know, each once."""
-    found = [*said, *ready.said, *told.said]
-    if ready.estimated:
-        both = zip(noise, "xy", strict=True)
-        levels = [f"{micrometres(own)} in {plane}" for own, plane in both if np.isfinite(own)]
-        found.append(f"the noise was estimated from the data: {', '.join(levels)}")
-    read = ready.problem.data.planes
-    if not read.all() and any(finding.effect is None for finding in told.findings):
-        unread, other = ("x", "y") if read[1] else ("y", "x")
-        found.append(
-            f"what is located may begin upstream in {unread}, which sextupoles pass on to {other}"
-        )
-    if ready.problem.data.active.sum() == 1 and told.findings:
-        found.append(
-            "one trajectory gives one kick at each place: it locates, but any single multipole "
-            "explains it; two or more launches name the effect"
-        )
-    return tuple(dict.fromkeys([*found, *_about_spikes(left_out)]))
+def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:
+    """Monitors that were set aside, by their place in the ring."""
+    at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
+    aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
+    return replace(found, monitors=aside)
 
 
-SHOWN = 4
-"""Readings left out that a warning names."""
-
-
-def _about_spikes(left_out: Sequence[Mapping[str, Any]]) -> list[str]:
-    if not left_out:
-        return []
-    some = "; ".join(
-        f"{row['monitor']} {row['plane']}, "
-        + ("the reference" if row["shot"] is None else f"shot {row['shot']}")
-        + (f", turn {row['turn']}" if row["turn"] else "")
-        for row in left_out[:SHOWN]
-    )
-    more = f"; and {len(left_out) - SHOWN} more" if len(left_out) > SHOWN else ""
-    return [f"{len(left_out)} single readings are wrong for once and were left out: {some}{more}"]
+def _noise(parts: Sequence[Part]) -> tuple[float, float]:
+    """rms noise of a reading, m, of the first measurement that has monitors."""
+    for part in parts:
+        if isinstance(part.problem, FirstTurns):
+            return noise_of(part.problem.data)
+        own = part.problem.valid & (part.problem.owner() >= 0)
+        if own.any():
+            rows = part.problem.as_rows(own.astype(float))
+            rms = float(np.sqrt(np.mean(rows[rows > 0] ** -2.0)))
+            return rms, rms
+    return float("nan"), float("nan")

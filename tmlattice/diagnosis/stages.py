@@ -3,7 +3,7 @@
 The models are the design, the design with small errors, and that with what was found.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.numbers import numbers_read
+from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
-from tmlattice.diagnosis.views import PartView
+from tmlattice.diagnosis.views import PartView, TrajectoryView
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.among import Among, Learnt
-from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.among import Among, Learnt, chains, signatures_of
+from tmlattice.inference.judge import Gap, Misfit, held_out_gap
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.newton import settled
-from tmlattice.inference.problem import Point, Problem
+from tmlattice.inference.newton import Fit, settled
+from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.together import Blocks, Together
+from tmlattice.observe.first_turns import FirstTurns, judged
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -38,8 +40,8 @@ class Stage:
         static: small errors, which a reference has too.
         causes: what was found.
         point: what they leave.
-        share: of the likeliest small errors that stands in `static`: 1, or less where no beam is
-            stored with all of them.
+        share: of the way to the likeliest small errors, from those of the fit, that `static` goes:
+            1, or less where no beam is stored with all of them.
     """
 
     static: tuple[Cause, ...]
@@ -53,33 +55,42 @@ def stages_of(
 ) -> list[Stage]:
     """The design; then with small errors and with the causes among them, or with one cause after
     the other."""
-    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...]]] = [((), ())]
+    models: list[tuple[tuple[Cause, ...], tuple[Cause, ...], Array]] = [((), (), problem.first)]
+    about: dict[Hypothesis, float] = {}
     if small is not None:
         inner = found.problem
         assert isinstance(inner, Among)
+        about = dict(zip(inner.known.hypotheses, inner.about.tolist(), strict=True))
         for one in (found.before, found.fit)[: 1 + bool(causes)]:
             amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
-            models.append((tuple(Cause(*h, a) for h, a in amounts), ()))
+            models.append((tuple(Cause(*h, a) for h, a in amounts), (), one.nuisances))
         if causes:
-            models[-1] = (models[-1][0], causes)
+            models[-1] = (models[-1][0], causes, found.fit.nuisances)
     else:
-        models += [((), causes[: i + 1]) for i in range(len(causes))]
-    return [_settled(problem, static, own) for static, own in models]
+        models += [((), causes[: i + 1], problem.first) for i in range(len(causes))]
+    return [_settled(problem, *model, about) for model in models]
 
 
-HALVES = 4
-"""How often small errors are halved with which no beam is stored."""
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Of the way to the likeliest small errors, with which a beam may not be stored."""
 
 
-def _settled(problem: Together, static: tuple[Cause, ...], own: tuple[Cause, ...]) -> Stage:
-    share = 1.0
-    for _ in range(HALVES):
-        some = tuple(replace(cause, amount=share * cause.amount) for cause in static)
+def _settled(
+    problem: Together,
+    static: tuple[Cause, ...],
+    own: tuple[Cause, ...],
+    nuisances: Array,
+    about: Mapping[Hypothesis, float],
+) -> Stage:
+    for share in SHARES:
+        some = tuple(
+            replace(c, amount=start + share * (c.amount - start))
+            for c in static for start in [about[c.effect, c.element]]
+        )  # fmt: skip
         there = replace(problem, fixed=(*problem.fixed, *some))
-        point = settled(there, own, problem.first)
+        point = settled(there, own, nuisances)
         if not point.lost or not static:
             break
-        share /= 2
     if point.lost:
         raise MeasurementError(f"{point.lost}, with what was found: too much to be explained")
     return Stage(some, own, point, share)
@@ -93,7 +104,7 @@ def too_large(stages: Sequence[Stage]) -> list[str]:
         return []
     return [
         f"no beam is stored with all of the small errors that were learnt: the figures of what is "
-        f"left are for {share:.4g} of each"
+        f"left are for {share:.4g} of the last step to them"
     ]
 
 
@@ -183,6 +194,89 @@ def held_out(
     if before > GAP and since < len(misfits) - 1 and gap.significant(DEFAULT.false_alarm):
         return replace(gap, closed=1 - after / before)
     return gap
+
+
+def held_out_shots(
+    part: Part,
+    problem: Together,
+    found: Explanation,
+    small: Learnt | None,
+    stages: Sequence[Stage],
+    since: int,
+) -> Gap | None:
+    """The gap on held-out first turns, in the covariance of their prediction.
+
+    Of the design; with the small errors, as the fit without causes leaves them; with the findings,
+    one by one where there are no small errors.
+    """
+    judge = part.heldout
+    if judge is None:
+        return None
+    assert isinstance(judge, FirstTurns)
+    assert isinstance(part.problem, FirstTurns)
+    dropped = found.dropped.reshape(part.problem.valid.shape)
+    judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped), white=None)
+    scored = []
+    for i, stage in enumerate(stages):
+        model = judge.model
+        if problem.fixed or stage.static:
+            model = model.knowing([*problem.fixed, *stage.static])
+        unknown = None
+        if small is not None and i:
+            explained = found.before if i == since and i < len(stages) - 1 else found.fit
+            explained = explained if stage.causes or found.fit.causes == () else found.before
+            about = replace(judge, model=model)
+            unknown = _unknown(small, explained, about, stage)
+        scored.append(judged(replace(judge, model=model, fixed=stage.causes), unknown))
+    return held_out_gap(scored, since)
+
+
+def _unknown(small: Learnt, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
+    """Covariance of what is not known of other shots, once these have been explained.
+
+    Of the small errors what the readings leave open, and of the amounts of the causes: as in
+    universal kriging (Matheron 1969), whose drift launches and amounts are.
+
+    Args:
+        small: the small errors of the explanation.
+        explained: the fit of these shots.
+        other: of the other shots, with the small errors in its model.
+        stage: the model.
+
+    Returns:
+        [shot * reading * 2] twice, m^2; None where the beam of the other shots is lost.
+    """
+    among = small.problem
+    point = other.at(stage.causes, other.data.launches)
+    if point.lost:
+        return None
+    known = among.known
+    amounts = np.array([cause.amount for cause in stage.static])
+    there = chains(known, amounts)[:, None] * signatures_of(other, point, known.hypotheses)
+    there = known.mixed(known.rms[:, None] * there)
+    here = explained.projection.out(among.white(among.rows))
+    rows = there.T @ here
+    unknown = there.T @ there - rows @ rows.T
+    slopes = [explained.slopes.get((c.effect, c.element)) for c in stage.causes]
+    for_each = [i for i, slope in enumerate(slopes) if slope is not None]
+    if for_each:
+        seen = np.array([slope.row for slope in slopes if slope is not None])
+        drift = np.array([other.metres(other.slope(point, i)) for i in for_each]) - seen @ (
+            here.T @ there
+        )
+        unknown += drift.T @ explained.covariance[np.ix_(for_each, for_each)] @ drift
+    return np.asarray(unknown)
+
+
+def trajectory_view(
+    problem: Together, found: Explanation, stages: Sequence[Stage]
+) -> TrajectoryView:
+    """What plots of first turns need."""
+    (own,) = problem.parts
+    assert isinstance(own, FirstTurns)
+    before, after = (stages[i].point.view[0].view.readings for i in (0, -1))
+    dropped = found.dropped.reshape(own.valid.shape)
+    return TrajectoryView(found, own, before, after, dropped)
 
 
 def seen_by(

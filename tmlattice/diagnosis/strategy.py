@@ -1,9 +1,10 @@
-"""Few causes alone, or a few among small errors everywhere: what the data speak for.
+"""A sparse solution alone, or together with distributed errors: what the data determine.
 
-A machine has small errors everywhere, which is what nobody has to say. Where they are so small that
-the noise hides them, few causes explain the readings alone; that is tried first, unless already
-neighbouring monitors disagree all along the ring. Where it leaves more than noise, the sizes of the
-small errors are learnt from what is left, and their evidence says whether they are there.
+A machine has small errors everywhere. Where the noise hides them, a few causes explain the readings
+alone; that is tried first, unless neighbouring monitors disagree all along the ring. Where it
+leaves more than noise, the variance components of the distributed errors are learnt from what is
+left, and their evidence decides whether they are in the model. The same steps serve every kind of
+measurement, and several together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,38 +14,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.background import SmallErrors, damped, small_errors
-from tmlattice.diagnosis.prepare import Prepared
-from tmlattice.effects import Cause, background_rms, find
-from tmlattice.errors import BeamLostError
+from tmlattice.effects import Cause, LaunchEffect, find
+from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
+from tmlattice.inference.among import MOST, Known, Learnt, small_errors_of
 from tmlattice.inference.newton import Fit, fit
-from tmlattice.inference.problem import Problem
+from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.search import Explanation, Search, explain, on_readings, revised
-from tmlattice.lattice import Ring
-from tmlattice.observe.data import Data
-from tmlattice.observe.first_turns import turns_of
-from tmlattice.observe.noise import local_misfit
 
 Array = NDArray[np.float64]
 
 FEW = 3
 """Causes that are sought alone before anybody asks for small errors."""
 
-SPARSE = 0.05
-"""Excess of the variance between neighbouring monitors, over that of all readings less the orbit
-that a launch makes, below which faults are few: small errors that make up an orbit all along the
-ring have at least 0.08 of it between neighbours, eight faults of the small ring 0.02."""
-
-MEDIAN = 0.674
-"""Of what neighbouring monitors leave of one another, in noise, where there is noise alone."""
-
-ENOUGH = 20
-"""Readings of which a median is taken at least."""
-
 CROWDED = 1.5
-"""Median of what neighbouring monitors leave of one another, in noise, above
-which few causes are not tried: a few leave most gaps between monitors as the design has them."""
+"""Median misfit between neighbouring monitors, or of monitors, in units of the noise, above which
+faults are not sparse: a few leave most monitors as the design has them."""
+
+MOST_OF_IT = 0.5
+"""Share of the gap that one cause explains, from which on small errors are learnt without it."""
 
 DOUBT = 8.0
 """Statistic of the likeliest fault from which on it is weighed with sizes learnt without it."""
@@ -72,7 +60,7 @@ CLEAR = 10.0
 
 @dataclass(frozen=True)
 class Found:
-    """An explanation, and the small errors beside it.
+    """An explanation, and the distributed errors together with it.
 
     Attributes:
         explanation: of the search.
@@ -80,155 +68,168 @@ class Found:
     """
 
     explanation: Explanation
-    small: SmallErrors | None = None
+    small: Learnt | None = None
 
 
 def sought(
-    ring: Ring,
-    ready: Prepared,
     search: Search,
-    told: Mapping[str, float] | None,
+    everywhere: Sequence[Hypothesis],
+    sizes: Mapping[str, float],
+    *,
+    learn: bool,
+    noisy: bool = False,
+    known: Known | None = None,
     earlier: Found | None = None,
 ) -> Found:
-    """What explains the data.
+    """Return what explains the data.
 
     Args:
-        ring: the design.
-        ready: the data.
         search: what is searched.
-        told: rms of small errors by effect; empty: there are none; None: the data say.
-        earlier: what explains a reference by itself. Where the small errors that all shots ask for
-            lose the beam, for a fault is no small error, they start at the reference's.
+        everywhere: the small errors that the machine may have.
+        sizes: rms of them by effect; empty: there are none.
+        learn: whether there are any, and how large they are, the data determine; `sizes` is where
+            that starts.
+        noisy: the noise is a guess, and learnt with them.
+        known: of the small errors beforehand, instead of sizes.
+        earlier: what explains the reference alone. The small errors start at those of the
+            reference, and are as large: a fault is none of them.
+
+    Raises:
+        MeasurementError: the design loses the beam.
     """
-    if told is not None:
-        if not told:
-            search.progress("scan")
-            return Found(explain(search, ready.before))
-        search.progress("background")
-        given = small_errors(ring, ready.problem, ready.known, told, ready.before.nuisances)
-        return Found(*_among(ring, ready, search, given))
-    few = None
-    if not _crowded(ready):
-        search.progress("scan")
-        few = explain(replace(search, most=min(FEW, search.most)), ready.before)
-        alone = explained(few)
+    problem = search.problem
+    seen = [h for h in everywhere if problem.sees(h)]
+    search.progress("scan")
+    start = fit(problem, (), problem.first)
+    if start.point.lost:
+        raise MeasurementError(f"{start.point.lost} in the design: is it this machine's lattice?")
+    if known is None and not sizes:
+        return Found(explain(search, start))
+    few: Explanation | None = None
+    begun = start
+    if known is None and learn and (noisy or problem.disagreement(start.point) <= CROWDED):
+        narrow = replace(search, most=min(FEW, search.most))
+        kicks = bool(len(problem.kick_places))
+        few = explain(replace(narrow, unnamed=search.unnamed and kicks), start)
+        if search.unnamed and not kicks and not explained(few) and not _crowded(few):
+            few = explain(narrow, start)
         more = few.full and few.count < search.most
-        more = more and few.scan.chance < few.problem.judgement.false_alarm
-        if alone and not more:
-            return Found(few)
-        if more and (alone or _sparse(few)):
-            few = explain(search, ready.before, few)
+        more = more and few.scan.chance < problem.judgement.false_alarm
+        if explained(few) or len(start.residual) * len(seen) > MOST:
+            return Found(explain(search, start, few) if more else few)
+        begun = few.fit
     search.progress("small errors")
-    start = ready.before if few is None else few.fit
-    about = [] if few is None or not few.named else [strongest(few)]
-    usual = background_rms({"all": None})
-    starts: list[tuple[Mapping[str, float], list[Cause]]] = [(usual, [])]
+    first = Known.usual(seen, sizes) if known is None else known
+    learn = learn and known is None
+    asides = dict.fromkeys(((), () if few is None else _outstanding(few)))
+    amounts: Array | None = None
     if earlier is not None and earlier.small is not None:
-        starts.append((earlier.small.sizes, _errors(earlier, earlier.small)))
-    small: SmallErrors | None = None
-    for sizes, errors in starts:
-        with suppress(BeamLostError):  # then they are none that anybody learns
-            small = small_errors(
-                ring, ready.problem, ready.known, sizes, start.nuisances, about, errors,
-                learn=True, noisy=ready.estimated,
-            )  # fmt: skip
-            break
-    if small is None or (small.evidence is not None and small.evidence < CLEAR):
-        if few is None:  # errors all along the ring: a few names at most, nothing without one
-            few = explain(replace(search, most=min(FEW, search.most), unnamed=False), ready.before)
+        there = earlier.small.problem
+        first, amounts = there.known, there.estimate(earlier.explanation.fit.clean)
+        learn = False
+    tried: list[Learnt] = []
+    for causes in asides:
+        with suppress(UnstableRingError):  # then they are none that anybody learns
+            tried.append(small_errors_of(
+                problem, first, begun.nuisances, causes, learn=learn, noisy=noisy,
+                about=amounts,
+            ))  # fmt: skip
+    if not tried or (learn and max(small.log_evidence for small in tried) < CLEAR):
+        if few is None:  # errors all along the ring: a few names at most
+            few = explain(replace(search, most=min(FEW, search.most), unnamed=False), start)
         elif few.full and few.count < search.most:
-            few = explain(search, ready.before, few)
+            few = explain(search, start, few)
         return Found(few)
-    among = Found(*_among(ring, ready, search, small))
+    several: list[Found] = []
+    for small in tried:
+        several.append(Found(*_among(search, small, learn, noisy)))
+        if several[-1].explanation.count and _left(several[-1].explanation) >= POOR:
+            break
+    among = several[-1]
+    if len(several) > 1:
+        among = max(several, key=lambda one: _log_marginal(one.explanation))
     return Found(few) if few is not None and _likelier(few, among.explanation) else among
 
 
-def _sparse(found: Explanation) -> bool:
-    """Whether neighbouring monitors agree although the orbit all along the ring does not."""
-    typical, count = _between(turns_of(found).data, found.fit)
-    if count <= ENOUGH:
-        return False
-    excess = (typical / MEDIAN) ** 2 - 1
-    error = 2.3 / count**0.5  # of the square of a median of noise
-    everywhere = found.fit.chi2 / freedom(found.problem, found.fit) - 1
-    return bool(excess - error < SPARSE * everywhere)
+MOST_COMMON = 8
+"""Causes of a reference at most."""
+ROUNDS = 3
+"""How often something that is found in the measurement may turn out to be in its reference too."""
 
 
-def _likelier(few: Explanation, among: Explanation) -> bool:
-    """Whether faults alone explain all, and clearly better than fewer among small errors do, on
-    the readings that both keep."""
-    dropped = few.dropped | among.dropped
-    return explained(few) and _log_marginal(few, dropped) > CLEAR + _log_marginal(among, dropped)
+def sought_since(
+    search: Search,
+    before: Search,
+    everywhere: Sequence[Hypothesis],
+    sizes: Mapping[str, float],
+    *,
+    learn: bool,
+    noisy: bool = False,
+) -> Found:
+    """Return what explains a measurement and is not in its reference.
+
+    What is in both and large is no small error: it has to be in the model, or its every change from
+    launch to launch passes for a fault. So the reference is diagnosed alone first. What it shows
+    too weakly for that is found in the measurement; it is in both where the readings are likelier
+    so.
+
+    Args:
+        search: of the measurement and its reference.
+        before: of the reference alone.
+        everywhere, sizes, learn, noisy: see `sought`.
+    """
+    search.progress("reference")
+    before = replace(before, most=MOST_COMMON)
+    alone = sought(before, everywhere, sizes, learn=learn, noisy=noisy)
+    common = _of_ring(alone.explanation.fit.causes)
+    for _ in range(ROUNDS):
+        own = replace(search, problem=search.problem.standing(common))
+        found = sought(own, everywhere, sizes, learn=learn, noisy=noisy, earlier=alone)
+        more = _of_ring(_in_both(found.explanation))
+        if not more:
+            break
+        common = (*common, *more)
+    return found
 
 
-def _log_marginal(found: Explanation, dropped: NDArray[np.bool_]) -> float:
-    """Log evidence, launches and small errors integrated out, up to a constant of the readings."""
-    problem = turns_of(found).without(dropped)
-    evidence, again = on_readings(problem, found)
-    if not again.good:
-        return -np.inf
-    return evidence + problem.whitening.log_scale + again.projection.log_volume
+def _of_ring(causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Without the launches' own, which are fitted in each measurement anyway."""
+    return tuple(c for c in causes if not isinstance(find(c.effect), LaunchEffect))
 
 
-def _errors(found: Found, small: SmallErrors) -> list[Cause]:
-    """The likeliest small errors beside an explanation."""
-    return small.estimate(found.explanation.fit, turns_of(found.explanation).whitening)
+def _in_both(explanation: Explanation) -> tuple[Cause, ...]:
+    """Of what was found in the measurement, what the reference rather has than lacks."""
+    problem, result = explanation.problem, explanation.fit
+    shared = []
+    for i, cause in enumerate(result.causes):
+        others = (*result.causes[:i], *result.causes[i + 1 :])
+        there = fit(problem.standing([cause]), others, result.nuisances)
+        if there.good and there.chi2 < result.chi2:
+            shared.append(cause)
+    return tuple(shared)
 
 
-def _crowded(ready: Prepared) -> bool:
-    """Whether neighbouring monitors disagree all along the ring; nobody knows without a noise."""
-    data = ready.problem.data
-    if ready.estimated:
-        return False
-    typical, count = _between(data, ready.before)
-    return count > ENOUGH and typical > CROWDED
-
-
-def _between(data: Data, found: Fit) -> tuple[float, int]:
-    """Median of what neighbouring monitors leave of one another, in noise, and of how many."""
-    left = local_misfit(data, found.point.view) / data.sigma
-    left = np.abs(left[np.isfinite(left)])
-    return float(np.median(left)) if len(left) else 0.0, len(left)
-
-
-def explained(found: Explanation) -> bool:
-    """Whether few causes leave nothing but noise."""
-    more, _ = found.problem.judgement.noise
-    return _left(found) >= more
-
-
-def _left(found: Explanation) -> float:
-    """Chance that noise leaves as much."""
-    return float(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)))
-
-
-def _among(
-    ring: Ring, ready: Prepared, search: Search, small: SmallErrors
-) -> tuple[Explanation, SmallErrors]:
-    """The background, taken again along the orbit of what is found where that misleads."""
+# --- together with distributed errors -----------------------------------------------------------
+def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Explanation, Learnt]:
+    """The small errors, linearised again at what is found where that misleads."""
+    problem = search.problem
+    unnamed = search.unnamed and bool(len(problem.kick_places))
+    search = replace(search, unnamed=unnamed)
     few = min(2, search.most)  # two findings say already whether it has to be taken again
-    learn = stale = small.evidence is not None  # stale: what is found made sizes too large
+    stale = learn  # what is found made sizes too large
     search.progress("scan")
     narrow = replace(search, most=few, names_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
-    for _ in range(ready.problem.judgement.retaken):
-        tried = _beside(explanation, small if learn else None)
-        if tried is None:
+    for _ in range(problem.judgement.retaken):
+        doubt = _beside(explanation, small, learn)
+        if doubt is None:
             break
-        search.progress("background with what was found")
-        beside, causes = tried
+        search.progress("small errors with what was found")
+        beside, causes = doubt
         weigh = not explanation.count and beside is explanation.fit  # one of the small errors
-        likeliest = small.estimate(beside, turns_of(explanation).whitening)
-        errors, there = damped(
-            ring, small, ready.known, likeliest, causes, beside.nuisances, explanation.dropped
-        )
-        causes, errors = _parted(causes, errors, small)
         try:
-            again = small_errors(
-                ring, small.plain, ready.known, small.sizes, there.nuisances, causes, errors,
-                learn=learn, noisy=learn and ready.estimated, weigh=weigh,
-            )  # fmt: skip
-        except BeamLostError:
+            again, causes = _linearised(small, beside, causes, learn, noisy, weigh)
+        except UnstableRingError:
             break  # what was found is no place from which they can be taken again
         if again.apart is not None and again.apart > AMOUNT:
             narrow = replace(narrow, granted=frozenset((c.effect, c.element) for c in causes))
@@ -245,11 +246,79 @@ def _among(
         if not explanation.fit.causes or explanation.fit.kicks:
             break
         names = explanation.names
-        explanation, small = _settled(ring, ready, narrow, explanation, small, learn)
+        explanation, small = _settled(narrow, explanation, small, learn, noisy)
         learn, stale = stale and _undecided(explanation), False
         if explanation.names == names and not learn:
             break
     return explanation, small
+
+
+def _linearised(
+    small: Learnt,
+    found: Fit,
+    causes: Sequence[Cause],
+    learn: bool,
+    noisy: bool,
+    weigh: bool = False,
+) -> tuple[Learnt, tuple[Cause, ...]]:
+    """The small errors again, linearised at the most probable ones given what was found, and the
+    causes with their share in them.
+
+    Raises:
+        UnstableRingError: no beam is stored there.
+    """
+    known = small.problem.known
+    amounts = small.problem.estimate(found.clean)
+    causes, amounts = _parted(causes, amounts, known, small.plain)
+    again = small_errors_of(
+        small.plain, known, found.nuisances, causes, learn=learn, noisy=learn and noisy,
+        about=amounts, stored=small.problem.about, weigh=weigh,
+    )  # fmt: skip
+    if not learn:
+        again = replace(again, errors=small.errors, log_evidence=small.log_evidence)
+    return again, causes
+
+
+def _parted(
+    causes: Sequence[Cause], amounts: Array, known: Known, problem: Problem
+) -> tuple[tuple[Cause, ...], Array]:
+    """Causes, and small errors without a share in both: all is the cause's.
+
+    Small errors are in a reference too, and causes are not: there both have their own.
+    """
+    if not problem.alone:
+        return tuple(causes), amounts
+    at = {hypothesis: i for i, hypothesis in enumerate(known.hypotheses)}
+    amounts, whole = amounts.copy(), {(cause.effect, cause.element): cause for cause in causes}
+    for own in whole.keys() & at.keys():
+        i, cause = at[own], whole[own]
+        beyond = float(amounts[i] - known.amounts[i])
+        whole[own] = replace(cause, amount=find(cause.effect).joined(cause.amount, beyond))
+        amounts[i] = known.amounts[i]
+    return tuple(whole.values()), amounts
+
+
+def _settled(
+    search: Search, explanation: Explanation, small: Learnt, learn: bool, noisy: bool
+) -> tuple[Explanation, Learnt]:
+    """Small errors linearised at all that was found, its amounts among them, and its rivals too.
+
+    What they took up of a fault before it was found spoils the slopes at which its rivals were
+    weighed: by ten in the log evidence, for a fault of 50 times the noise.
+    """
+    found = explanation.fit
+    try:
+        about, causes = _linearised(small, found, found.causes, learn, noisy)
+    except UnstableRingError:
+        return explanation, small
+    problem = about.problem.without(explanation.dropped)
+    again = fit(problem, causes, about.before.nuisances)
+    if not again.good:
+        return explanation, small
+    settled = replace(explanation, problem=problem, fit=again, before=about.before)
+    if _left(settled) < POOR:  # so large that they are linear nowhere: slopes as good as any
+        return settled, about
+    return revised(replace(search, problem=about.problem, keep=True), settled), about
 
 
 def _undecided(explanation: Explanation) -> bool:
@@ -263,74 +332,10 @@ def _undecided(explanation: Explanation) -> bool:
     return False
 
 
-def _settled(
-    ring: Ring,
-    ready: Prepared,
-    search: Search,
-    explanation: Explanation,
-    small: SmallErrors,
-    learn: bool,
-) -> tuple[Explanation, SmallErrors]:
-    """Small errors linear about all that was found, its amounts among them, and its rivals too.
-
-    What they took up of a fault before it was found spoils the slopes about which its rivals were
-    weighed: by ten in the log evidence, for a fault of 50 times the noise.
-    """
-    found = explanation.fit
-    likeliest = small.estimate(found, turns_of(explanation).whitening)
-    errors, there = damped(
-        ring, small, ready.known, likeliest, found.causes, found.nuisances, explanation.dropped
-    )
-    causes, errors = _parted(there.causes, errors, small)
-    try:
-        about = small_errors(
-            ring, small.plain, ready.known, small.sizes, there.nuisances, causes, errors,
-            learn=learn, noisy=learn and ready.estimated,
-        )  # fmt: skip
-    except BeamLostError:
-        return explanation, small
-    problem = about.problem.without(explanation.dropped)
-    again = fit(problem, causes, there.nuisances)
-    if not again.good:
-        return explanation, small
-    settled = replace(explanation, problem=problem, fit=again, before=about.before)
-    if _left(settled) < POOR:  # so large that they are linear nowhere: slopes as good as any
-        return settled, replace(about, open=small.open, evidence=small.evidence)
-    settled = revised(replace(search, problem=about.problem, keep=True), settled)
-    known = about.open if learn else small.open
-    return settled, replace(about, open=known, evidence=small.evidence)
-
-
-def _parted(
-    causes: Sequence[Cause], errors: list[Cause], small: SmallErrors
-) -> tuple[tuple[Cause, ...], list[Cause]]:
-    """Causes, and the small errors beside them, without a share in both: all is the cause's.
-
-    Small errors are in a reference too, and causes are not: beside one both have their own.
-    """
-    if not small.plain.data.active.all():
-        return tuple(causes), errors
-    own = {(error.effect, error.element): error.amount for error in errors}
-    whole = {}
-    for cause in causes:
-        where = (cause.effect, cause.element)
-        amount = find(cause.effect).joined(cause.amount, own.get(where, 0.0))
-        whole[where] = replace(cause, amount=amount)
-    kept = [replace(e, amount=0.0) if (e.effect, e.element) in whole else e for e in errors]
-    return tuple(whole.values()), kept
-
-
-def strongest(explanation: Explanation) -> Cause:
-    """The named cause that was seen most clearly."""
-    clear = [named.detection.statistic for named in explanation.named]
-    return explanation.fit.causes[int(np.argmax(clear))]
-
-
 def _beside(
-    explanation: Explanation, learnt: SmallErrors | None
+    explanation: Explanation, small: Learnt, learn: bool
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
-    """Beside which fit, and with which causes, small errors have to be taken again; None: they
-    stand.
+    """Given which fit, and which causes, small errors have to be taken again; None: they stand.
 
     A strong fault's orbit makes small errors look like further faults, so the strongest finding is
     taken along. A monitor that was set aside has errors of its own that took up what they could: it
@@ -338,11 +343,13 @@ def _beside(
     for a small error: where nothing was found the likeliest fault has to be weighed without it.
     """
     if not explanation.count:
-        if learnt is None:
+        if not learn:
             return None
-        estimate = learnt.estimate(explanation.fit, turns_of(explanation).whitening)
-        cause = outlier(estimate, learnt.sizes)
-        if cause is not None and learnt.plain.data.active.all():  # else it is in the reference too
+        known = small.problem.known
+        amounts = small.problem.estimate(explanation.fit.clean).tolist()
+        estimate = [Cause(*h, a) for h, a in zip(known.hypotheses, amounts, strict=True)]
+        cause = outlier(estimate, small.sizes)
+        if cause is not None and small.plain.alone:  # else it is in the reference too
             return explanation.fit, (replace(cause, amount=0.0),)  # so far all is a small error's
         cause = _likeliest(explanation)
         if cause is None:
@@ -355,6 +362,69 @@ def _beside(
         return None
     # the others may be the background's
     return found, (strongest(explanation),) if explanation.named else ()
+
+
+# --- weighing ------------------------------------------------------------------------------------
+def _likelier(few: Explanation, among: Explanation) -> bool:
+    """Whether faults alone explain all, and clearly better than fewer among small errors do, on
+    the readings that both keep."""
+    dropped = few.dropped | among.dropped
+    return explained(few) and _log_marginal(few, dropped) > CLEAR + _log_marginal(among, dropped)
+
+
+def _log_marginal(found: Explanation, dropped: NDArray[np.bool_] | None = None) -> float:
+    """Log evidence, nuisances and small errors integrated out, up to a constant of the readings."""
+    problem = found.problem if dropped is None else found.problem.without(dropped)
+    evidence, again = on_readings(problem, found)
+    if not again.good:
+        return -np.inf
+    return evidence + problem.log_scale + again.projection.log_volume
+
+
+def explained(found: Explanation) -> bool:
+    """Whether few causes leave nothing but noise."""
+    more, _ = found.problem.judgement.noise
+    return _left(found) >= more
+
+
+def _left(found: Explanation) -> float:
+    """Chance that noise leaves as much."""
+    return float(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)))
+
+
+def freedom(problem: Problem, result: Fit) -> int:
+    """Degrees of freedom: readings and priors, less what was fitted."""
+    amounts = sum(not find(cause.effect).discrete for cause in result.causes)
+    kicks = sum(len(values) for values in result.kicks.values())
+    return max(problem.freedom - amounts - kicks, 1)
+
+
+def _outstanding(few: Explanation) -> tuple[Cause, ...]:
+    """A cause that alone makes most of the gap: it would make all small errors too large."""
+    if not few.named:
+        return ()
+    clear = max(named.detection.statistic for named in few.named)
+    gap = few.before.chi2 - few.problem.freedom
+    return (strongest(few),) if clear > MOST_OF_IT * gap else ()
+
+
+def _crowded(found: Explanation) -> bool:
+    """Whether most monitors still read something else."""
+    problem = found.problem
+    left, _ = problem.left(found.fit.point)
+    owner = problem.owner()[problem.valid]
+    own, squares = owner[owner >= 0], left[problem.valid][owner >= 0] ** 2
+    if not len(own):
+        return False
+    count = np.bincount(own, minlength=len(problem.monitors))
+    mean = np.bincount(own, squares, len(problem.monitors)) / np.maximum(count, 1)
+    return float(np.median(np.sqrt(mean[count > 0]))) > CROWDED
+
+
+def strongest(explanation: Explanation) -> Cause:
+    """The named cause that was seen most clearly."""
+    clear = [named.detection.statistic for named in explanation.named]
+    return explanation.fit.causes[int(np.argmax(clear))]
 
 
 def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | None:
@@ -386,12 +456,8 @@ def _likeliest(explanation: Explanation) -> Cause | None:
     if top < 0 or scan.statistic[top] < DOUBT:
         return None
     name, place = scan.hypotheses[top]
-    amount = np.copysign(abs(scan.amount[top]) ** (1 / find(name).power), scan.amount[top])
-    return Cause(name, place, float(amount))
-
-
-def freedom(problem: Problem, result: Fit) -> int:
-    """Degrees of freedom: readings and priors, less what was fitted."""
-    amounts = sum(not find(cause.effect).discrete for cause in result.causes)
-    kicks = sum(len(values) for values in result.kicks.values())
-    return max(problem.freedom - amounts - kicks, 1)
+    effect = find(name)
+    if effect.discrete:
+        return None
+    root = min(abs(scan.amount[top]) ** (1 / effect.power), effect.largest)
+    return Cause(name, place, float(np.copysign(root, scan.amount[top])))

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Model
 from tmlattice.diagnosis.numbers import NumberRead
 from tmlattice.inference.judge import Misfit
 from tmlattice.inference.search import Explanation
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
+from tmlattice.observe.first_turns import FirstTurns
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +19,23 @@ class TrajectoryView:
     """What only trajectories have, for plots.
 
     Attributes:
-        explanation, data, model: the search.
+        explanation: the search.
+        problem: the shots of the fit, without what was rejected.
+        before, after: readings of the design and of the result, launches fitted,
+            [shot, reading, 2], m.
+        dropped: readings that the search left out, [shot, reading, 2].
     """
 
     explanation: Explanation
-    data: Data
-    model: Model
+    problem: FirstTurns
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    dropped: NDArray[np.bool_]
+
+    @property
+    def data(self) -> Data:
+        """The readings."""
+        return self.problem.data
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.data import Data, first_turn
-from tmlattice.observe.first_turns import FirstTurns, turns_of
+from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import RingTunes, short_way
 
 Array = NDArray[np.float64]
@@ -106,7 +106,8 @@ def fit_sparse(
     )
     warn_of_launches(ring, data, network.dimension, found)
     best = _settled(found)
-    turn = RingTunes(turns_of(found).model.assembly)
+    assert isinstance(found.problem, FirstTurns)
+    turn = RingTunes(found.problem.model.assembly)
     tunes = turn.of(best.causes)
     errors = np.sqrt(np.diag(best.covariance))
     chi2 = [found.before.chi2, best.chi2][: 1 + bool(best.causes)]

@@ -29,7 +29,7 @@ Flags = NDArray[np.bool_]
 ROUNDS = 2
 """Linearisations: about the design, and about the likeliest errors."""
 
-ROWS = 1600
+ROWS = 1000
 """Rows from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
 
 HALVES = 4
@@ -45,8 +45,8 @@ LEAST = 0.02
 MOST = 10**8
 """Rows times small errors: 0.8 GB, of which some are held at a time (8 GB at most)."""
 
-AT_ONCE = 256
-"""Small errors whose rows are taken at a time."""
+AT_ONCE = 2**24
+"""Numbers of the rows of small errors that are taken at a time."""
 
 
 @dataclass(frozen=True)
@@ -187,12 +187,34 @@ class Blurred(Problem):
         return self.inner.moved(nuisances, change)
 
     def metric(self, point: Point) -> Metric:
-        """Signatures made and whitened."""
-        return _BlurredMetric(self, point)
+        """As the kind has it, or signatures made and whitened."""
+        assert point.projection is not None
+        fast = self.inner.metric_among(point.view, self._root, point.projection)
+        return _BlurredMetric(self, point) if fast is None else fast
+
+    @property
+    def kick_places(self) -> Sequence[str]:
+        """Of the inner one."""
+        return self.inner.kick_places
+
+    def kick_rows(self, point: Point, place: int) -> Array:
+        """Whitened."""
+        return self.white(self.inner.kick_rows(point.view, place))
 
     def everywhere(self) -> Self:
         """As the inner one."""
         return replace(self, inner=self.inner.everywhere())
+
+    @property
+    def alone(self) -> bool:
+        """As the inner one."""
+        return self.inner.alone
+
+    def standing(self, causes: Sequence[Cause]) -> Self:
+        """The same errors of size 1 beside further fixed causes."""
+        other = replace(self, inner=self.inner.standing(causes))
+        vars(other)["_root"] = self._root
+        return other
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """As the inner one."""
@@ -218,8 +240,14 @@ class Blurred(Problem):
         return self.white(self.inner.as_rows(readings))
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """Among small errors single readings are not looked at: nothing is left of any."""
-        return np.zeros(self.valid.shape), np.ones(self.valid.shape)
+        """What is left of each reading given those before it, where the kind has single ones."""
+        assert point.projection is not None
+        alone, size = self.inner.left(point.view)
+        clean = point.projection.out(point.residual)
+        clean = clean[self.inner.as_rows(np.ones(self.valid.shape)) > 0]
+        left = np.zeros(self.valid.shape)
+        left[self.valid] = clean
+        return np.where(alone == 0, 0.0, left), np.ones_like(size)
 
     def without(self, dropped: Flags) -> Self:
         """The covariance is worked out anew."""
@@ -238,11 +266,13 @@ class Among(Blurred):
 
     Attributes:
         known: of the small errors beforehand.
+        about: their amounts in the model, [error].
         open: of which family each is, and the covariance of the logarithms of their sizes where
             those were learnt; or None.
     """
 
     known: Known = field(repr=False)
+    about: Array = field(repr=False)
     open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
@@ -293,16 +323,21 @@ class Learnt:
 
     Attributes:
         problem: among them.
+        plain: without them, with the noise as learnt.
         before: nuisances alone.
         sizes, errors: rms by effect; relative error of each.
         log_evidence: over no small errors.
+        apart: log evidence that the cause given which they were taken is none of them, however
+            large its family may be; None: not asked.
     """
 
     problem: Among
+    plain: Problem
     before: Fit
     sizes: Mapping[str, float]
     errors: Mapping[str, float]
     log_evidence: float
+    apart: float | None = None
 
 
 def small_errors_of(
@@ -312,7 +347,10 @@ def small_errors_of(
     causes: Sequence[Cause] = (),
     *,
     learn: bool = True,
+    noisy: bool = False,
     about: Array | None = None,
+    stored: Array | None = None,
+    weigh: bool = False,
 ) -> Learnt:
     """The background of a machine as these data show it, linear about its likeliest amounts.
 
@@ -322,20 +360,25 @@ def small_errors_of(
         nuisances: first guess.
         causes: what was found already: small errors are taken beside it.
         learn: the sizes are learnt; else they are as known.
-        about: amounts from which on it is linear at first, [error]; None: those that are known.
+        noisy: so is the noise, which is a guess.
+        about: amounts that it is linearised at, [error]; None: at those that are known, and then at
+            the most probable ones.
+        weigh: whether the one cause is a small error itself is weighed too.
+        stored: amounts at which a beam is stored: `about` goes so far towards them as it has to.
 
     Raises:
         UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
             causes.
     """
     names, belongs = families_of(known)
-    amounts = stored = known.amounts if about is None else about
-    evidence, errors, opened = 0.0, dict[str, float](), None
-    for turn in range(ROUNDS):
+    amounts = known.amounts if about is None else about
+    stored = amounts if stored is None else stored
+    evidence, errors, opened, apart = 0.0, dict[str, float](), None, None
+    for turn in range(ROUNDS if about is None else 1):
         inner, alone, amounts = near(problem, known, amounts, stored, causes, nuisances)
         assert alone.projection is not None
         stored = amounts
-        slopes = _signatures(inner, alone, known.hypotheses)
+        slopes = signatures_of(inner, alone, known.hypotheses)
         slopes *= chains(known, amounts)[:, None]
         shift = (amounts - known.amounts) @ slopes
         spread = known.mixed(known.rms[:, None] * slopes)
@@ -343,7 +386,18 @@ def small_errors_of(
             moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
             keep = kept(len(moved))
             rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
-            found = sizes_of(moved[keep], alone.projection.matrix()[keep], rows[:, keep], belongs)
+            noise = [part[keep] for part in inner.noise_rows()] if noisy else []
+            directions = alone.projection.matrix()[keep]
+            found = sizes_of(moved[keep], directions, rows[:, keep], belongs, noise)
+            if weigh:  # as one of them
+                i = known.hypotheses.index((causes[0].effect, causes[0].element))
+                some, amount = rows[:, keep], causes[0].amount
+                some[i] *= find(causes[0].effect).chain(amount)
+                whole = moved[keep] + amount / known.rms[i] * some[i]
+                other = sizes_of(whole, directions, some, belongs, noise)
+                apart = found.log_marginal - other.log_marginal
+            if noise:
+                problem, inner = (own.noisier(found.noise) for own in (problem, inner))
             evidence = found.log_evidence if turn == 0 else evidence
             errors = dict(zip(names, found.error.tolist(), strict=True))
             opened = (belongs, found.covariance)
@@ -351,7 +405,7 @@ def small_errors_of(
             spread *= found.scale[belongs][:, None]
         among = Among(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
-            judgement=problem.judgement, inner=inner, known=known,
+            judgement=problem.judgement, inner=inner, known=known, about=amounts,
             spread=spread.reshape(-1, *inner.valid.shape),
             shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
@@ -363,10 +417,10 @@ def small_errors_of(
     if before.point.lost:
         raise UnstableRingError(f"{before.point.lost} without what was found beside small errors")
     sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
-    return Learnt(among, before, sizes, errors, evidence)
+    return Learnt(among, problem, before, sizes, errors, evidence, apart)
 
 
-def _signatures(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
+def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
     """d reading / d amount in units of the readings' noise, [error, flat]; 0 where there is none.
 
     Rows are what a kind gives; the readings' own noise is put back so that readings can be left
@@ -375,8 +429,9 @@ def _signatures(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]
     unit = problem.as_rows(np.ones(problem.valid.shape))
     about, there = problem.everywhere().metric(point), unit > 0
     out = np.zeros((len(hypotheses), problem.valid.size))
-    for start in range(0, len(hypotheses), AT_ONCE):
-        some = slice(start, start + AT_ONCE)
+    count = max(AT_ONCE // len(unit), 1)
+    for start in range(0, len(hypotheses), count):
+        some = slice(start, start + count)
         rows = about.rows(hypotheses[some])
         out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
     return out
@@ -408,7 +463,7 @@ def near(
         UnstableRingError: there is none near enough.
     """
     first = amounts is stored
-    for _ in range(HALVES):
+    for turn in range(HALVES):
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
@@ -417,7 +472,8 @@ def near(
             return inner, alone, amounts
         if first:
             break
-        amounts = (amounts + stored) / 2  # too far for what is linear
+        # too far for what is linear
+        amounts = stored if turn == HALVES - 2 else (amounts + stored) / 2
     raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
 
 
@@ -435,7 +491,13 @@ def kept(count: int) -> NDArray[np.int64]:
     return np.sort(np.random.default_rng(0).choice(count, ROWS, replace=False))
 
 
-def sizes_of(residual: Array, directions: Array, rows: Array, belongs: NDArray[np.int64]) -> Sizes:
+def sizes_of(
+    residual: Array,
+    directions: Array,
+    rows: Array,
+    belongs: NDArray[np.int64],
+    noise: Sequence[Flags] = (),
+) -> Sizes:
     """Sizes from some rows.
 
     Args:
@@ -443,8 +505,10 @@ def sizes_of(residual: Array, directions: Array, rows: Array, belongs: NDArray[n
         directions: of the nuisances, [row, coordinate].
         rows: what errors of size 1 make, [error, row].
         belongs: family of each error, [error].
+        noise: parts of the rows whose noise is learnt too, [row] each.
     """
     launch = directions[:, np.abs(directions).max(axis=0) > 0]
     size = np.linalg.norm(launch, axis=0)
     basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(residual), 0))
-    return learn_sizes(residual, basis, [rows[belongs == k] for k in range(belongs.max() + 1)])
+    families = [rows[belongs == k] for k in range(belongs.max() + 1)]
+    return learn_sizes(residual, basis, families, noise)

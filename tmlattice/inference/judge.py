@@ -160,15 +160,6 @@ def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
     return Gap(misfits, residuals, closed, interval, since, readings)
 
 
-def misfit(residual: Array, sigma: Array) -> Misfit:
-    """rms and chi-square per reading of what is not NaN."""
-    valid = np.isfinite(residual)
-    if not valid.any():
-        return Misfit(np.nan, np.nan)
-    r, s = residual[valid], sigma[valid]
-    return Misfit(float(np.sqrt((r**2).mean())), float(((r / s) ** 2).mean()))
-
-
 def _misfit(parts: Sequence[Left]) -> Misfit:
     count = sum(len(part.residual) for part in parts)
     if not count:

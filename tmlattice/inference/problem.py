@@ -17,6 +17,7 @@ from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.metric import Metric
 from tmlattice.inference.priors import EVEN, AmountPrior
+from tmlattice.inference.root import Root
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
@@ -102,6 +103,20 @@ class Problem(ABC):
         """Readings, and what is known of nuisances, less the nuisances."""
         return int(self.valid.sum()) - self.free
 
+    @property
+    def alone(self) -> bool:
+        """Whether what is sought acts on all readings: there is no reference among them."""
+        return True
+
+    def reference(self, nuisances: Array) -> "tuple[Problem | None, Array]":
+        """Return the part without what is sought, and its nuisances; None: there is none."""
+        return None, nuisances
+
+    @property
+    def log_scale(self) -> float:
+        """Log density of the rows at their peak, over that of the readings' noise alone."""
+        return 0.0
+
     def sees(self, hypothesis: Hypothesis) -> bool:
         """Whether the kind knows what such a cause would do: of another one it reads nothing."""
         return True
@@ -134,6 +149,16 @@ class Problem(ABC):
         """Degrees of freedom with which the variance of readings along a hypothesis is known;
         infinite where nothing of it was learnt from them."""
         return np.inf
+
+    def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
+        """Return the products among distributed errors, if the kind has a fast way to form them.
+
+        Args:
+            point: of this problem.
+            root: whitens its rows.
+            projection: of the nuisances, in white rows.
+        """
+        return None
 
     @abstractmethod
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -168,6 +193,19 @@ class Problem(ABC):
     @abstractmethod
     def as_rows(self, readings: Array) -> Array:
         """Readings, or changes of them, [..., *shape of `valid`], as whitened rows [..., row]."""
+
+    def noise_rows(self) -> list[Flags]:
+        """Return which rows share a noise that may be a guess, [row] each; empty: it is known."""
+        return []
+
+    def noisier(self, factors: Array) -> Self:
+        """Return the same problem with the noise of each such part multiplied."""
+        return self
+
+    def disagreement(self, point: Point) -> float:
+        """Return the median misfit between neighbouring monitors in units of the noise; 0 where the
+        kind cannot tell."""
+        return 0.0
 
     @abstractmethod
     def left(self, point: Point) -> tuple[Array, Array]:

@@ -35,6 +35,11 @@ class Root(ABC):
 
     @property
     @abstractmethod
+    def matrix(self) -> Array:
+        """W itself, [row, row]."""
+
+    @property
+    @abstractmethod
     def log_scale(self) -> float:
         """Logarithm of the determinant of W."""
 
@@ -48,6 +53,10 @@ class _Triangle(Root):
 
     def back(self, rows: Array) -> Array:
         return np.asarray(rows @ self.inverse)
+
+    @property
+    def matrix(self) -> Array:
+        return self.inverse
 
     @property
     def log_scale(self) -> float:
@@ -65,6 +74,10 @@ class _Symmetric(Root):
 
     def back(self, rows: Array) -> Array:
         return self.white(rows)
+
+    @property
+    def matrix(self) -> Array:
+        return self.white(np.eye(self.directions.shape[1]))
 
     @property
     def log_scale(self) -> float:

@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 from tmlattice.effects import Cause
 from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
+from tmlattice.inference.root import Root
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
@@ -45,6 +46,11 @@ class Blocks(Projection):
         """Rows less what nuisances explain."""
         own = zip(self.parts, self.split(rows), strict=True)
         return np.concatenate([part.out(np.ascontiguousarray(mine)) for part, mine in own], axis=-1)
+
+    @property
+    def log_volume(self) -> float:
+        """Of all parts."""
+        return sum(part.log_volume for part in self.parts)
 
     def matrix(self) -> Array:
         """The directions of all parts, [row, coordinate]."""
@@ -97,6 +103,23 @@ class Together(Problem):
             starts=tuple(part.first for part in parts), active=active,
         )  # fmt: skip
 
+    @property
+    def alone(self) -> bool:
+        """Whether no part is of a reference, nor has shots of one."""
+        return all(self.active) and all(part.alone for part in self.parts)
+
+    def reference(self, nuisances: Array) -> "tuple[Together, Array]":
+        """Return the measurements, or shots, of the reference alone, as those that are searched."""
+        parts: list[tuple[Problem, Array]] = []
+        for part, active, start in zip(
+            self.parts, self.active, self.of_parts(nuisances), strict=True
+        ):
+            own, first = part.reference(start) if active else (part, start)
+            parts += [] if own is None else [(own, first)]
+        problems, starts = zip(*parts, strict=True)
+        found = replace(self, parts=problems, starts=starts, active=(True,) * len(parts))
+        return found, found.first
+
     # --- nuisances: one flat vector -------------------------------------------------------------
     @property
     def first(self) -> Array:
@@ -131,7 +154,8 @@ class Together(Problem):
 
     def everywhere(self) -> "Together":
         """Active in all parts."""
-        return replace(self, active=(True,) * len(self.parts))
+        parts = tuple(part.everywhere() for part in self.parts)
+        return replace(self, parts=parts, active=(True,) * len(parts))
 
     @cached_property
     def standing_parts(self) -> tuple[Problem, ...]:
@@ -149,7 +173,7 @@ class Together(Problem):
         ):
             there = causes if active else ()
             seen = [c for c in there if part.sees((c.effect, c.element))]
-            points.append(part.at(seen, own))
+            points.append(part.at(seen, own, kicks))
             if points[-1].lost:  # the others would not be asked any more
                 rest = np.full(1, np.nan)
                 return Point(
@@ -176,7 +200,25 @@ class Together(Problem):
 
     def metric(self, point: Point) -> Metric:
         """Of the parts, added up."""
+        if len(self.parts) == 1:
+            return self.standing_parts[0].metric(point.view[0])
         return _TogetherMetric(self, point)
+
+    def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
+        """Of a single measurement, as its kind has it."""
+        if len(self.parts) > 1:
+            return None
+        return self.standing_parts[0].metric_among(point.view[0], root, projection)
+
+    # --- free kicks: of a single measurement ----------------------------------------------------
+    @property
+    def kick_places(self) -> Sequence[str]:
+        """Several measurements have no kick in common."""
+        return self.parts[0].kick_places if len(self.parts) == 1 else ()
+
+    def kick_rows(self, point: Point, place: int) -> Array:
+        """As its kind has it."""
+        return self.standing_parts[0].kick_rows(point.view[0], place)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Of any part."""
@@ -210,6 +252,18 @@ class Together(Problem):
             for part, own in zip(self.parts, self._split(readings), strict=True)
         ]
         return np.concatenate(rows, axis=-1)
+
+    def noise_rows(self) -> list[Flags]:
+        """Of a single measurement, as its kind has it."""
+        return self.parts[0].noise_rows() if len(self.parts) == 1 else []
+
+    def noisier(self, factors: Array) -> Self:
+        """Of a single measurement, as its kind has it."""
+        return replace(self, parts=tuple(part.noisier(factors) for part in self.parts))
+
+    def disagreement(self, point: Point) -> float:
+        """Of a single measurement, as its kind has it."""
+        return self.parts[0].disagreement(point.view[0]) if len(self.parts) == 1 else 0.0
 
     def left(self, point: Point) -> tuple[Array, Array]:
         """Of each part."""

@@ -6,13 +6,15 @@ parameters: their directions are projected out of data and signatures alike. Wha
 launch stands in further rows: rows are [shot, 2 readings + 5 coordinates], flattened.
 """
 
+from copy import copy
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cholesky
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg import block_diag
+
+from tmlattice.inference.root import inverse_root
 
 Array = NDArray[np.float64]
 
@@ -67,18 +69,20 @@ class Whitening:
         self._inverse: Array | None = None  # of the Cholesky factor: products beat solutions
         if background is not None and len(background):
             B = (self.weight * background).reshape(len(background), -1)
-            B = B[B.any(axis=1)]  # correctors that nobody sets, say, do nothing
-            covariance = B.T @ B
-            covariance[np.diag_indices(len(covariance))] += 1.0
-            factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
-            self._inverse, failed = dtrtri(factor, lower=1, overwrite_c=1)
-            assert failed == 0
+            # correctors that nobody sets, say, do nothing
+            self._inverse = inverse_root(B[B.any(axis=1)]).matrix
 
-    @property
-    def log_scale(self) -> float:
-        """Log density at their peak of readings in units of their own noise, over that of noise
-        alone: what it costs the likelihood that small errors might be anywhere."""
-        return 0.0 if self._inverse is None else float(np.log(np.diag(self._inverse)).sum())
+    def correlated(self, root: Array) -> "Whitening":
+        """Return the whitening of readings that distributed errors correlate.
+
+        Args:
+            root: W of `inference.root` over all rows, those of the launches too, [row, row].
+        """
+        other = copy(self)
+        readings = np.arange(self.rows).reshape(self.shots, -1)[:, :-5].ravel()
+        other.__dict__.pop("precision", None)
+        other._inverse = root[np.ix_(readings, readings)]
+        return other
 
     @property
     def dense(self) -> bool:

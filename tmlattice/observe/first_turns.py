@@ -19,10 +19,11 @@ from tmlattice.inference.judge import Half, Judged, other_half
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
-from tmlattice.inference.search import State
+from tmlattice.inference.root import Root
 from tmlattice.inference.whitening import EXACT, Projection, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import TurnMetric, metric
+from tmlattice.observe.noise import local_misfit
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -31,6 +32,8 @@ COORDINATES = 2
 """Of a launch in one plane."""
 MANY = 10
 """Fixed causes that are worth a model of their own."""
+ENOUGH = 20
+"""Readings of which a median is taken at least."""
 STEPS = 24
 """Of a fit of launches, at most: in a plane without readings they act by their squares."""
 
@@ -42,27 +45,21 @@ class FirstTurns(Problem):
     Attributes:
         model: the ring as these shots saw it.
         data: readings.
-        spread: rms times signature of small errors everywhere, [error, shot, reading, 2], m, or
-            None.
-        open: of which family each small error is, [error], and the covariance of the logarithms of
-            their sizes, [family, family], where those were learnt from these data; or None.
-        white: the whitening where it is known already: a dense one costs a factorisation.
+        white: the whitening where it is known already.
     """
 
     model: Model = field(repr=False)
     data: Data = field(repr=False)
-    spread: Array | None = field(default=None, repr=False)
-    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
     white: Whitening | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", _bounded(self.data, self.model))
         if self.white is None:
-            object.__setattr__(self, "white", Whitening(self.data, self.spread))
+            object.__setattr__(self, "white", Whitening(self.data))
 
     @property
     def whitening(self) -> Whitening:
-        """By the noise of the readings, and by the small errors."""
+        """By the noise of the readings."""
         assert self.white is not None
         return self.white
 
@@ -91,7 +88,7 @@ class FirstTurns(Problem):
         for cause in causes:
             of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
             (built if of_model else rest).append(cause)
-        if len(built) < MANY:
+        if len(built) < MANY and self.alone:
             return super().standing(causes)
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
@@ -141,18 +138,33 @@ class FirstTurns(Problem):
             self.data.active,
         )  # fmt: skip
 
-    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
-        """By how the variance along it changes with the sizes of small errors."""
-        if self.open is None or self.spread is None or point.projection is None:
-            return np.inf
-        family, covariance = self.open
-        active = self.data.active[:, None, None]
-        seen = self.model.signatures(point.view, [hypothesis], point.nuisances)[0]
-        row = point.projection.out(self.whitening.signature(np.nan_to_num(seen) * active))
-        back = self.whitening.back(row.reshape(self.data.shots, -1)[None, :, :-5])[0]
-        squares = np.einsum("esrp,srp->e", self.spread, back, optimize=True) ** 2
-        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
-        return 2 / max(float(slope @ covariance @ slope), 1e-9)
+    def metric_among(self, point: Point, root: Root, projection: Projection) -> TurnMetric:
+        """Sums over the readings behind each monitor give most products, see `DenseMetric`."""
+        whitening = self.whitening.correlated(root.matrix)
+        return metric(
+            self.model, point.view, point.nuisances, whitening, projection, self.data.active
+        )
+
+    @property
+    def alone(self) -> bool:
+        """Whether no shot is of a reference."""
+        return bool(self.data.active.all())
+
+    def reference(self, nuisances: Array) -> "tuple[FirstTurns | None, Array]":
+        """Shots of a reference."""
+        if self.alone:
+            return None, nuisances
+        shots = np.flatnonzero(~self.data.active)
+        data = self.data.of_shots(shots)
+        data = replace(data, active=np.ones(len(shots), dtype=bool))
+        known = self.model.assembly.known
+        model = Model(self.model.design, data.settings, data.turns, known, active=data.active)
+        return replace(self, model=model, data=data, white=None), nuisances[shots]
+
+    def everywhere(self) -> "FirstTurns":
+        """With causes that act in all shots."""
+        every = np.ones(self.data.shots, dtype=bool)
+        return replace(self, data=replace(self.data, active=every))
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those that sit between the same monitors as a magnet."""
@@ -218,15 +230,30 @@ class FirstTurns(Problem):
         """With rows of zeros for what is known of the launches."""
         return self.whitening.signature(readings)
 
+    def noise_rows(self) -> list[Flags]:
+        """Of x, and of y, where there are readings."""
+        planes = np.zeros((2, *self.valid.shape))
+        planes[0, ..., 0], planes[1, ..., 1] = self.valid[..., 0], self.valid[..., 1]
+        return [own > 0 for own in self.whitening.signature(planes)]
+
+    def noisier(self, factors: Array) -> "FirstTurns":
+        """By plane."""
+        data = replace(self.data, sigma=self.data.sigma * factors)
+        return replace(self, data=data, white=None)
+
+    def disagreement(self, point: Point) -> float:
+        """Of what each monitor reads less what the two before it predict."""
+        left = local_misfit(self.data, point.view) / self.data.sigma
+        left = np.abs(left[np.isfinite(left)])
+        return float(np.median(left)) if len(left) > ENOUGH else 0.0
+
     def left(self, point: Point) -> tuple[Array, Array]:
-        """The launch takes some of a reading; among small errors that is not looked at."""
+        """The launch takes some of a reading."""
         assert point.projection is not None
         shots = self.data.shots
         clean = point.projection.out(point.residual).reshape(shots, -1)[:, :-5]
-        size = np.ones_like(clean)
-        if not self.whitening.dense:
-            Q = point.projection.Q[:, :-5]
-            size = 1 - np.einsum("bri,bri->br", Q, Q)
+        Q = point.projection.Q[:, :-5]
+        size = 1 - np.einsum("bri,bri->br", Q, Q)
         return clean.reshape(self.valid.shape), size.reshape(self.valid.shape)
 
     def without(self, dropped: Flags) -> "FirstTurns":
@@ -239,12 +266,6 @@ class FirstTurns(Problem):
     def _residual(self, readings: Array, launches: Array) -> Array:
         difference = np.where(self.data.valid, self.data.readings - readings, 0.0)
         return self.whitening.residual(difference, launches)
-
-
-def turns_of(found: State) -> FirstTurns:
-    """The problem of a search among first turns, as its last fit was of it."""
-    assert isinstance(found.problem, FirstTurns)
-    return found.problem
 
 
 def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.newton import fit
-from tmlattice.observe.first_turns import turns_of
 from tmlattice.plots.strip import lattice_strip
 
 Array = NDArray[np.float64]
@@ -56,17 +55,14 @@ def readings_caption(diagnosis: Diagnosis) -> str:
 def design_readings(diagnosis: Diagnosis) -> Array:
     """What the design predicts of the shots of the fit, its launches fitted to the monitors before
     the first finding, else to all, [shot, reading, 2], m."""
-    found = diagnosis.explanation
+    view = diagnosis.trajectories
     before = before_findings(diagnosis)
     if before is None:
-        return np.asarray(found.before.point.view.readings)
-    problem = turns_of(found)
-    behind = np.ones(problem.valid.shape, dtype=bool)
+        return view.before
+    behind = np.ones(view.dropped.shape, dtype=bool)
     behind[:, : len(before)] = ~before[:, None]  # later turns are behind all of it
-    alone = fit(problem.without(behind), (), found.before.nuisances)
-    if alone.point.projection is None:  # lost
-        return np.asarray(found.before.point.view.readings)
-    return np.asarray(alone.point.view.readings)
+    alone = fit(view.problem.without(behind), (), view.problem.first)
+    return view.before if alone.point.lost else np.asarray(alone.point.view.readings)
 
 
 def plot_readings(
@@ -80,11 +76,12 @@ def plot_readings(
         shot: its place among those of the fit; else the one with the largest residual.
     """
     figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
-    data, found = diagnosis.trajectories.data, diagnosis.explanation
+    view = diagnosis.trajectories
+    data = view.data
     explained = diagnosis.verdict != "distributed"
     models, before = [design_readings(diagnosis)], before_findings(diagnosis)
     if explained:
-        models.append(found.fit.point.view.readings)
+        models.append(view.after)
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
     if shot is None:
@@ -92,7 +89,7 @@ def plot_readings(
         shot = int(left.sum(axis=(1, 2)).argmax())
     first = slice(0, len(monitors))
     s = np.array([monitor.s for monitor in monitors])
-    read, dropped = readings[shot, first], found.dropped[shot, first]
+    read, dropped = readings[shot, first], view.dropped[shot, first]
     grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
     names = (diagnosis.ring.model, "with the findings")
     styles = ((BEFORE, "-"), (AFTER, "-"))

@@ -226,13 +226,14 @@ def _s_text(s: float | None, where: tuple[float, float] | None) -> str:
 # --- trajectories ---------------------------------------------------------------------------------
 def readings(diagnosis: Diagnosis) -> Figure:
     """What each model leaves of the shot that the design explains worst, monitor by monitor."""
-    data, found = diagnosis.trajectories.data, diagnosis.explanation
+    view = diagnosis.trajectories
+    data = view.data
     monitors = diagnosis.ring.monitors
     first = slice(0, len(monitors))
     read = np.where(data.valid, data.readings, np.nan)
     models = {diagnosis.ring.model: (design_readings(diagnosis), BEFORE)}
     if diagnosis.verdict != "distributed":
-        models["with the findings"] = (np.asarray(found.fit.point.view.readings), AFTER)
+        models["with the findings"] = (view.after, AFTER)
     left = np.nan_to_num(read - models[diagnosis.ring.model][0]) ** 2 * data.active[:, None, None]
     shot = int(left.sum(axis=(1, 2)).argmax())
     s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
