@@ -57,6 +57,7 @@ from tmlattice.version import __version__
 
 if TYPE_CHECKING:
     from tmlattice import challenge as challenge
+    from tmlattice import correction as correction
     from tmlattice import diagnosis as diagnosis
     from tmlattice import effects as effects
     from tmlattice import errors as errors
@@ -72,6 +73,8 @@ if TYPE_CHECKING:
     from tmlattice import plots as plots
     from tmlattice import report as report
     from tmlattice import systems as systems
+    from tmlattice.correction import Correction as Correction
+    from tmlattice.correction import correct as correct
     from tmlattice.diagnosis import Diagnosis as Diagnosis
     from tmlattice.diagnosis import diagnose as diagnose
     from tmlattice.effects import CATALOGUE as CATALOGUE
@@ -103,6 +106,7 @@ if TYPE_CHECKING:
     from tmlattice.optics import twiss as twiss
 
 _HOME = {
+    "correction": ["Correction", "correct"],
     "diagnosis": ["Diagnosis", "diagnose"],
     "effects": ["CATALOGUE", "Cause"],
     "errors": ["TmlatticeError"],
@@ -120,8 +124,8 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 _ROOMS = (
     "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
-    "inference", "observe", "diagnosis", "importers", "fitting", "machine", "challenge", "systems",
-    "plots", "report", "errors",
+    "inference", "observe", "diagnosis", "correction", "importers", "fitting", "machine",
+    "challenge", "systems", "plots", "report", "errors",
 )  # fmt: skip
 
 __all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604  (they are strings)

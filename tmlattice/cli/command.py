@@ -15,6 +15,7 @@ import click
 from tmlattice import __version__
 from tmlattice.cli.challenge import challenge
 from tmlattice.cli.check import check
+from tmlattice.cli.correct import correct
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
@@ -55,7 +56,7 @@ class Sections(click.Group):
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
     "Measure": (info, simulate, import_files, check),
     "Fit": (tune_fit, predict),
-    "Diagnose": (diagnose, effects),
+    "Diagnose": (diagnose, correct, effects),
     "Study": (study, challenge, reproduce),
 }
 

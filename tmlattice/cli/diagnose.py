@@ -27,6 +27,7 @@ from tmlattice.cli.options import (
 from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
+    from tmlattice.correction import Correction
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
@@ -56,6 +57,14 @@ log = logging.getLogger(__name__)
     multiple=True,
     help="A measurement of the same machine and kind before the fault: static errors cancel, and "
     "what changed is told. Repeat it where several are diagnosed together.",
+)
+@click.option(
+    "--settings",
+    "settings_file",
+    type=FILE,
+    metavar="FILE",
+    help="settings.csv of `tmlattice correct`, applied between the reference and the measurement: "
+    "the calibration of each device, measured over asked change, is printed.",
 )
 @background_option("Small errors everywhere (not given: the data say)")
 @assume_option
@@ -122,6 +131,7 @@ def diagnose(
     sequence: str | None,
     energy: float | None,
     references: tuple[Path, ...],
+    settings_file: Path | None,
     background: tuple[tuple[str, float | None], ...],
     effects: tuple[str, ...] | None,
     network: Path | None,
@@ -153,11 +163,16 @@ def diagnose(
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
+        from tmlattice.correction.applied import applied, read_settings
+        from tmlattice.correction.applied import sentence as of_device
         from tmlattice.effects import background_rms, names
 
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
+        if settings_file and not references:
+            raise click.UsageError("--settings needs the measurement from before: --reference")
+        asked = read_settings(settings_file) if settings_file else {}
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice, sequence, energy)
@@ -206,12 +221,26 @@ def diagnose(
         source: dict[str, Any] = {"measurement": " ".join(map(str, measurements))}
         if said:
             source["assumed_of_files"] = said
-        _write(result, source, folder, extra)
-        written = _write_rings(result, lattice_out, repaired_out)
+        if lattice_out:
+            source["lattice_out"] = str(lattice_out.absolute())
+        known = None
+        if lattice_out:
+            tell("what is left known")  # minutes, of a large response
+            from tmlattice.diagnosis.twin import known_of
+
+            known = known_of(result)
+        correction = _correction(result, known)
+        calibrations = applied(result, asked) if asked else []
+        if calibrations:
+            source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]
+        _write(result, source, folder, extra, correction)
+        written = _write_rings(result, known, lattice_out, repaired_out)
         if folder and reading:
             _write_weights(reading, folder)
     if not quiet:
-        _print(result, out, json_file, written)
+        _print(result, correction, out, json_file, written)
+        for own in calibrations:
+            console().print(of_device(own), soft_wrap=True)
         if reading:
             _print_weights(ring, reading)
 
@@ -272,6 +301,7 @@ def _write(
     source: dict[str, Any],
     folder: Path | None,
     extra: Path | None,
+    correction: "Correction | None",
 ) -> None:
     """What was asked for."""
     from tmlattice.files import write_json
@@ -280,18 +310,37 @@ def _write(
     document["provenance"] = {**document["provenance"], **source}
     if folder:
         tell("figures")
-        _write_folder(result, folder, document)
+        _write_folder(result, folder, document, correction)
     if extra:
         write_json(extra, document)
 
 
+def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | None":
+    """Settings of supplies that bring the estimated ring to the design, where the covariance of its
+    errors is known and they have an expected gain."""
+    from tmlattice.correction import correct
+    from tmlattice.correction.estimate import estimate_of
+    from tmlattice.errors import TmlatticeError
+
+    if known is None:
+        return None
+    tell("correction")
+    try:
+        found = correct(estimate_of(result, known))
+    except TmlatticeError:  # no supply acts, or the ring stores no beam
+        log.info("no correction", exc_info=True)
+        return None
+    return None if found.refused else found
+
+
 def _write_rings(
     result: "Diagnosis",
+    known: "Known | None",
     lattice_out: Path | None,
     repaired_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
-    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document, known_of
+    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
@@ -299,8 +348,6 @@ def _write_rings(
 
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
-        tell("what is left known")  # minutes, of a large response
-        known = known_of(result)
         ring = result.as_found
         ring = ring if known is None else replace(ring, model=ESTIMATED)
         written[str(lattice_out)] = write_ring(ring, lattice_out)
@@ -399,22 +446,30 @@ def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
         raise MeasurementError(f"{where}: {no_numbers(error)}") from error
 
 
-def _write_folder(result: "Diagnosis", folder: Path, document: dict[str, Any]) -> None:
+def _write_folder(
+    result: "Diagnosis", folder: Path, document: dict[str, Any], correction: "Correction | None"
+) -> None:
     from tmlattice.report.speaking import write_files
 
-    write_files(result, folder, document)
+    write_files(result, folder, document, correction)
 
 
 def _print(
     result: "Diagnosis",
+    correction: "Correction | None",
     out: Path | None,
     json_file: Path | None,
     rings: dict[str, tuple[str, ...]],
 ) -> None:
     from tmlattice.report.plain import report_text
+    from tmlattice.report.text import wrapped
 
     screen = console()
-    screen.print(report_text(result, min(screen.width, 120)), soft_wrap=True)
+    width = min(screen.width, 120)
+    screen.print(report_text(result, width), soft_wrap=True)
+    if correction is not None:
+        text = "\n".join(wrapped(f"Correction: {correction.words}", "", width))
+        screen.print(f"\n{text}", soft_wrap=True)
     if result.parts:
         what = ", ".join(f"{part.label} ({part.readings} readings)" for part in result.parts)
     elif result.kind == "trajectory":

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from tmlattice.correction import Correction
 from tmlattice.diagnosis import Diagnosis
-from tmlattice.report import response_text, tables
+from tmlattice.report import correction_texts, response_text, tables
 from tmlattice.report import text as report
 from tmlattice.report.interactive import figures, strip
 
@@ -99,15 +100,46 @@ def shrink(path: Path) -> None:
     few.save(path, optimize=True)
 
 
-def draw(diagnosis: Diagnosis, folder: Path) -> list[Picture]:
-    """Every figure of a diagnosis as a PNG file in the folder."""
+def draw(diagnosis: Diagnosis, folder: Path, correction: Correction | None = None) -> list[Picture]:
+    """Every figure of a diagnosis, and of its correction, as a PNG file in the folder."""
     from tmlattice.plots import diagnosis as drawn
 
-    return save(drawn.figures(diagnosis), folder)
+    return [*save(drawn.figures(diagnosis), folder), *draw_correction(correction, folder)]
+
+
+def draw_correction(correction: Correction | None, folder: Path) -> list[Picture]:
+    """The figure of a correction as a PNG file in the folder."""
+    from tmlattice.plots.correction import CAPTION, plot_correction
+
+    if correction is None:
+        return []
+    return save([("correction", CAPTION, plot_correction(correction))], folder)
+
+
+def correction_page(correction: Correction, folder: Path) -> str:
+    """The report of a correction as HTML; its figure goes into the folder."""
+    from tmlattice import __version__
+
+    (picture,) = draw_correction(correction, folder)
+    stated = {"lattice": correction.ring.name, "package": __version__, **correction.provenance}
+    return render(
+        "correction.html",
+        stated,
+        correction=correction,
+        texts=correction_texts,
+        picture=picture,
+        interactive={},
+        strip=_inlined(strip(correction.ring)),
+        library="",
+        script="",
+    )
 
 
 def page(
-    diagnosis: Diagnosis, pictures: Sequence[Picture], provenance: dict[str, Any] | None = None
+    diagnosis: Diagnosis,
+    pictures: Sequence[Picture],
+    provenance: dict[str, Any] | None = None,
+    correction: Correction | None = None,
 ) -> str:
     """The report as HTML.
 
@@ -115,6 +147,7 @@ def page(
         diagnosis: of `diagnose`.
         pictures: of `draw`.
         provenance: where it should state more than the diagnosis' own.
+        correction: of the diagnosis, where there is one.
     """
     parts = files("tmlattice.report")
     stated = diagnosis.provenance if provenance is None else provenance
@@ -122,6 +155,8 @@ def page(
         "diagnosis.html",
         stated,
         diagnosis=diagnosis,
+        correction=correction,
+        texts=correction_texts,
         told=list(tables.notes(diagnosis, stated)),
         report=report,
         dense=response_text,

@@ -4,9 +4,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from tmlattice.correction import Correction
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.files import output_folder, write_json
-from tmlattice.report.page import draw, page
+from tmlattice.report.correction_texts import correction_text
+from tmlattice.report.page import correction_page, draw, page
 from tmlattice.report.plain import WIDTH, report_text
 
 
@@ -34,9 +36,53 @@ def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:
     return place / "report.html"
 
 
-def write_files(diagnosis: Diagnosis, folder: Path, document: dict[str, Any]) -> None:
-    """The files of `save`, of a document that may state more than the diagnosis' own."""
-    html = page(diagnosis, draw(diagnosis, folder), document["provenance"])
+def write_files(
+    diagnosis: Diagnosis,
+    folder: Path,
+    document: dict[str, Any],
+    correction: Correction | None = None,
+) -> None:
+    """The files of `save`, of a document that may state more than the diagnosis' own; and of a
+    correction the settings."""
+    pictures = draw(diagnosis, folder, correction)
+    html = page(diagnosis, pictures, document["provenance"], correction)
+    if correction is not None:
+        write_settings(correction, folder)
     (folder / "report.html").write_text(html, encoding="utf-8")
     (folder / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
     write_json(folder / "diagnosis.json", document)
+
+
+def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path:
+    """Write `settings.csv`, statements of MAD-X, AT and elegant, `correction.json` and `.txt`, and
+    `report.html`.
+
+    Args:
+        correction: of `correct`.
+        folder: made where it is not there; files of these names are replaced, all or none.
+
+    Returns:
+        The report's path, `report.html`.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    place = Path(folder)
+    with output_folder(place) as temporary:
+        write_correction(correction, temporary)
+    return place / "report.html"
+
+
+def write_correction(correction: Correction, folder: Path) -> None:
+    """The files of `save_correction`, into a folder that is there."""
+    write_settings(correction, folder)
+    (folder / "report.html").write_text(correction_page(correction, folder), encoding="utf-8")
+
+
+def write_settings(correction: Correction, folder: Path) -> None:
+    """The settings and what is expected of them."""
+    (folder / "settings.csv").write_text(correction.table(), encoding="utf-8")
+    (folder / "correction.txt").write_text(correction_text(correction) + "\n", encoding="utf-8")
+    for name, suffix in (("madx", "madx"), ("at", "at.py"), ("elegant", "ele")):
+        (folder / f"settings.{suffix}").write_text(correction.snippet(name), encoding="utf-8")
+    write_json(folder / "correction.json", correction.as_json())

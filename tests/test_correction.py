@@ -1,0 +1,417 @@
+"""Settings of power supplies: AT is the machine that they are put into."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import at
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from tmlattice import correct, diagnose, write_measurement
+from tmlattice.cli.command import tmlattice
+from tmlattice.correction import Knob, default_knobs, read_knobs
+from tmlattice.correction.applied import applied, read_settings
+from tmlattice.correction.estimate import estimate_with
+from tmlattice.correction.knobs import write_knobs
+from tmlattice.diagnosis.twin import known_document
+from tmlattice.effects import Cause, apply, find
+from tmlattice.errors import ChoiceError, MeasurementError, TmlatticeError, UnknownNameError
+from tmlattice.files import write_json
+from tmlattice.inference.among import Known
+from tmlattice.lattice import save_ring, write_ring
+from tmlattice.lattice.at_file import quiet_at
+from tmlattice.machine.at_engine import AtEngine
+from tmlattice.machine.response import simulate_response
+
+NO_ORBIT = ("beta_beating", "phase_advance", "dispersion", "tunes")
+
+
+def optics(ring, causes=()):
+    """By AT: beta [BPM, 2], m; dispersion [BPM, 2], m; tunes [2]."""
+    lattice = AtEngine(ring, causes).lattice()
+    monitors = [i for i, e in enumerate(lattice) if isinstance(e, at.Monitor)]
+    _, data, found = at.get_optics(lattice, monitors, get_chrom=False, XYStep=3e-6, DPStep=1e-3)
+    return found.beta, found.dispersion[:, [0, 2]], data.tune
+
+
+def beating(ring, design):
+    return np.sqrt(np.mean((optics(ring)[0] / optics(design)[0] - 1) ** 2, axis=0))
+
+
+def set_to(ring, correction):
+    """The machine with new settings: its errors stay."""
+    causes = [c for s in correction.settings for c in s.knob.causes(s.amount)]
+    return apply(ring, causes)
+
+
+@pytest.fixture(scope="module")
+def quadrupoles(small_ring):
+    return [e.name for e in small_ring.elements if e.kind == "quadrupole"]
+
+
+@pytest.fixture(scope="module")
+def wrong(small_ring, quadrupoles):
+    """Errors of four magnets, so that AT's beta beating is some ten percent."""
+    amounts = (0.02, -0.015, 0.01, -0.02)
+    return [Cause("quadrupole_gradient", quadrupoles[3 + 7 * i], a) for i, a in enumerate(amounts)]
+
+
+def test_single_quadrupoles_undo_their_own_errors(small_ring, wrong):
+    machine = apply(small_ring, wrong)
+    found = correct(machine, goal=small_ring, knobs=["quadrupoles"], targets=NO_ORBIT)
+    assert {s.knob.name for s in found.settings[:4]} == {cause.element for cause in wrong}
+    by_name = {s.knob.name: s for s in found.settings}
+    for cause in wrong:
+        expected = 1 / (1 + cause.amount) - 1
+        assert by_name[cause.element].amount == pytest.approx(expected, rel=0.02)
+        k1 = small_ring[cause.element].k1
+        assert by_name[cause.element].new == pytest.approx(k1 / (1 + cause.amount), rel=5e-4)
+    before, after = beating(machine, small_ring), beating(set_to(machine, found), small_ring)
+    assert (before > 0.01).all()
+    assert (after < 0.05 * before).all()
+    predicted = [interval[0] for interval in found.before["beta_beating"]]
+    np.testing.assert_allclose(predicted, before, rtol=0.01)
+
+
+def test_supplies_gain_what_at_says(small_ring, wrong, quadrupoles):
+    """Two supplies that are wrong by themselves, and errors of magnets that they cannot undo."""
+    supplies = [Cause("family_gradient", "QF", 0.01), Cause("family_gradient", "QD", -0.006)]
+    machine = apply(small_ring, [*wrong, *supplies])
+    found = correct(machine, goal=small_ring, targets=["tunes"])
+    assert {s.knob.name for s in found.settings} == {"QF", "QD"}
+    tunes = optics(set_to(machine, found))[2]
+    np.testing.assert_allclose(tunes, optics(small_ring)[2], atol=2e-4)
+    np.testing.assert_allclose(found.tunes["expected"], tunes, atol=2e-4)
+    reached, _ = found.stays["beta_beating"]
+    after = beating(set_to(machine, found), small_ring)
+    np.testing.assert_allclose(reached, after, rtol=0.02)
+
+
+def test_orbit_and_coupling_in_their_units_and_signs(small_ring, quadrupoles):
+    """Kicks by displaced magnets, and a skew field: by correctors and a skew quadrupole."""
+    causes = [Cause("quadrupole_offset_y", quadrupoles[5], 4e-4),
+              Cause("quadrupole_offset_y", quadrupoles[12], -2e-4),
+              Cause("skew_gradient", "sf::4", 4e-3)]  # fmt: skip
+    machine = apply(small_ring, causes)
+    skew = Knob("skew", "skew_quadrupole", ("sf::4",), "A", 0.0, curve=((-10, -0.02), (10, 0.02)))
+    knobs = [*default_knobs(small_ring, ["correctors"]), skew]
+    found = correct(machine, goal=small_ring, knobs=knobs, targets=["closed_orbit", "coupling"])
+    own = next(s for s in found.settings if s.knob.name == "skew")
+    assert own.new == pytest.approx(-2.0, rel=0.05)  # A: 0.002 1/m each
+    orbits = [AtEngine(r).closed_orbits([{}])[0] for r in (machine, set_to(machine, found))]
+    before, after = (np.sqrt(np.mean(orbit[:, 1] ** 2)) for orbit in orbits)
+    assert before > 2e-4
+    assert after < 0.35 * before
+    assert found.stays["closed_orbit"][0][1] == pytest.approx(after, rel=0.05)
+
+
+def test_limits_steps_and_excitation_curves(small_ring, wrong):
+    machine = apply(small_ring, wrong)
+    name = wrong[0].element
+    k1 = small_ring[name].k1
+    # 100 A make the design's strength, and half as much per ampere beyond
+    curve = ((0.0, 0.0), (100.0, k1), (200.0, 1.5 * k1))
+    knob = Knob(name, "quadrupole", (name,), "A", 100.0, 98.5, 120.0, 0.25, curve)
+    free = replace(knob, low=-np.inf, high=np.inf, step=0.0)
+    (own,) = correct(machine, goal=small_ring, knobs=[free], targets=NO_ORBIT).settings
+    assert own.new < 100
+    assert own.new == pytest.approx(100 * (1 + own.amount), abs=1e-9)
+    (held,) = correct(machine, goal=small_ring, knobs=[knob], targets=NO_ORBIT).settings
+    assert held.at_limit == (own.new <= 98.5)
+    assert 98.5 <= held.new <= 120
+    assert (held.new - 100) / 0.25 == pytest.approx(round((held.new - 100) / 0.25), abs=1e-6)
+    tight = replace(knob, low=99.5)
+    (stopped,) = correct(machine, goal=small_ring, knobs=[tight], targets=NO_ORBIT).settings
+    assert stopped.new == 99.5
+    assert stopped.at_limit
+    rising = replace(knob, curve=((0.0, 0.0), (100.0, -k1), (200.0, -1.5 * k1)))
+    assert rising.amount(rising.setting(0.2)) == pytest.approx(0.2)
+    assert rising.setting(0.2) == pytest.approx(140.0)
+
+
+def test_the_rf_frequency_moves_the_energy(small_ring):
+    """An orbit of another energy: the RF brings it back."""
+    shifted = estimate_with(small_ring, small_ring, None)
+    found = correct(replace(shifted, energy=2e-4), knobs=["rf"], targets=["closed_orbit"])
+    (rf,) = found.settings
+    assert rf.knob.unit == "Hz"
+    back = AtEngine(small_ring).closed_orbits([{"rf": {"frequency_relative": -rf.amount}}])[0]
+    dispersion = optics(small_ring)[1][:, 0]
+    np.testing.assert_allclose(back[:, 0], 2e-4 * dispersion, atol=0.02 * np.ptp(back[:, 0]))
+
+
+# --- uncertain rings ------------------------------------------------------------------------------
+def posterior(names, rms, mean=None):
+    amounts = np.zeros(len(names)) if mean is None else np.asarray(mean)
+    known = Known.usual([("quadrupole_gradient", n) for n in names], {"quadrupole_gradient": rms})
+    return replace(known, amounts=amounts)
+
+
+def test_intervals_hold_what_they_state(small_ring, quadrupoles):
+    """Machines drawn from the posterior, corrected alike: 68 % of their beta beating within."""
+    rng = np.random.default_rng(7)
+    mean = 0.01 * rng.standard_normal(len(quadrupoles))
+    known = posterior(quadrupoles, 2e-3, mean)
+    estimate = estimate_with(small_ring, small_ring, known)
+    found = correct(estimate, knobs=["quadrupoles"], targets=NO_ORBIT)
+    inside = []
+    for _ in range(60):
+        true = mean + 2e-3 * rng.standard_normal(len(mean))
+        causes = [
+            Cause("quadrupole_gradient", n, a) for n, a in zip(quadrupoles, true, strict=True)
+        ]
+        after = beating(set_to(apply(small_ring, causes), found), small_ring)
+        for (_, low, high), own in zip(found.after["beta_beating"], after, strict=True):
+            inside.append(low <= own <= high)
+    assert 0.55 < np.mean(inside) < 0.8
+    reach, data = found.stays["beta_beating"]
+    assert (np.array(data) > np.array(reach)).all()
+
+
+def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupoles):
+    """No error is known, all are possible: nothing is gained, and nothing is set."""
+    found = correct(
+        estimate_with(small_ring, small_ring, posterior(quadrupoles, 5e-3)),
+        knobs=["quadrupoles"], targets=NO_ORBIT,
+    )  # fmt: skip
+    assert found.settings == ()
+    assert "No setting is changed" in found.refused
+    assert found.table().splitlines() == ["device,present,new,change,unit,low,high,gain"]
+    assert found.before == found.after
+    rng = np.random.default_rng(3)
+    small = posterior(quadrupoles, 5e-3, 1e-4 * rng.standard_normal(len(quadrupoles)))
+    hardly = correct(estimate_with(small_ring, small_ring, small), targets=["beta_beating"])
+    assert not hardly.settings or hardly.gain > hardly.gain_error
+
+
+def test_few_knobs_where_few_are_enough(small_ring, wrong):
+    machine = apply(small_ring, wrong[:1])
+    found = correct(machine, goal=small_ring, knobs=["quadrupoles"], targets=NO_ORBIT)
+    assert [s.knob.name for s in found.settings] == [wrong[0].element]
+    assert [n for n, _ in found.gains] == [1]
+
+
+def test_a_calibration_of_a_corrector_is_in_its_change(small_ring, quadrupoles):
+    known = replace(
+        posterior([], 1.0),
+        hypotheses=(("corrector_calibration", "v3"),), amounts=np.array([0.25]),
+        rms=np.array([0.01]), seen=np.zeros((0, 1)),
+    )  # fmt: skip
+    ring = apply(small_ring, [Cause("corrector_kick_y", "v3", 1e-4)])
+    knobs = [k for k in default_knobs(small_ring, ["correctors"]) if k.name == "v3"]
+    found = correct(estimate_with(ring, small_ring, known), knobs=knobs, targets=["closed_orbit"])
+    (own,) = found.settings
+    assert own.new == pytest.approx(-1e-4 / 1.25, rel=0.01)
+
+
+# --- tables and files -----------------------------------------------------------------------------
+def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
+    path = tmp_path / "knobs.csv"
+    knobs = default_knobs(small_ring, ["supplies", "correctors", "sextupoles", "rf"])
+    write_knobs(path, knobs)
+    assert read_knobs(path, small_ring) == [
+        replace(k, present=pytest.approx(k.present), error=pytest.approx(k.error)) for k in knobs
+    ]
+    assert find("family_gradient").places(small_ring) == ["QF", "QD"]
+    yaml = tmp_path / "knobs.yaml"
+    yaml.write_text(
+        "- {knob: QF, unit: A, present: 50, low: 45, high: 55, curve: '0:0 100:1.8'}\n"
+        "- {knob: pair, kind: quadrupole, members: [QF::1, QF::3]}\n"
+    )
+    first, second = read_knobs(yaml, small_ring)
+    assert (first.low, first.high, first.unit) == (45.0, 55.0, "A")
+    assert len(first.members) == 16
+    assert second.members == ("QF::1", "QF::3")
+    assert first.bounds == pytest.approx((-0.1, 0.1))
+
+
+@pytest.mark.parametrize(("row", "said"), [
+    ("- {knob: nothing}", "state its members"),
+    ("- {knob: QF, present: 0}", "present strength is 0"),
+    ("- {knob: QF, low: 2, high: 1}", "limits are 2 and 1"),
+    ("- {knob: QF, curve: '0:0 1:1 2:0.5', unit: A, present: 1}", "has to rise, or fall"),
+    ("- {knob: QF, unit: A}", "state its present setting"),
+    ("- {knob: QF, step: much}", "no number"),
+    ("- {knob: QF, colour: red}", "unknown column"),
+    ("- {knob: QF}\n- {knob: QF}", "stands twice"),
+    ("- {knob: q, members: QF::1, kind: pump}", "no kind 'pump'"),
+    ("knob: QF", "no list of knobs"),
+])  # fmt: skip
+def test_tables_that_cannot_be_used(small_ring, tmp_path, row, said):
+    path = tmp_path / "knobs.yaml"
+    path.write_text(row)
+    with pytest.raises(MeasurementError, match=said):
+        read_knobs(path, small_ring)
+
+
+def test_names_that_do_not_exist(small_ring, tmp_path):
+    path = tmp_path / "knobs.yaml"
+    path.write_text("- {knob: q, members: QF::99}")
+    with pytest.raises(UnknownNameError, match="QF::99"):
+        read_knobs(path, small_ring)
+    with pytest.raises(ChoiceError, match="no target 'beta'"):
+        correct(small_ring, goal=small_ring, targets=["beta"])
+    with pytest.raises(ChoiceError, match="no kind of knobs 'pumps'"):
+        default_knobs(small_ring, ["pumps"])
+    with pytest.raises(TmlatticeError, match="has no goal"):
+        correct(small_ring)
+
+
+def test_statements_set_the_strengths(small_ring, wrong, tmp_path):
+    """AT's are run on the design: the optics are those of the new settings."""
+    machine = apply(small_ring, [*wrong, Cause("family_gradient", "QF", 0.01)])
+    every = default_knobs(small_ring, ["supplies"]) + [
+        k for k in default_knobs(small_ring, ["quadrupoles"]) if k.name == wrong[0].element
+    ]
+    found = correct(machine, goal=small_ring, knobs=every[:1] + every[2:], targets=NO_ORBIT)
+    alone = replace(found, settings=tuple(s for s in found.settings if s.knob.name != "QF"))
+    family = replace(found, settings=tuple(s for s in found.settings if s.knob.name == "QF"))
+    write_ring(small_ring, tmp_path / "design.at.json")
+    for own in (alone, family):
+        with quiet_at():
+            ring = at.load_lattice(tmp_path / "design.at.json")
+        exec(own.snippet("at"), {"ring": ring})
+        expected = [e.k1 for e in set_to(small_ring, own).elements if e.kind == "quadrupole"]
+        set_k1 = [e.PolynomB[1] for e in ring if isinstance(e, at.Quadrupole)]
+        np.testing.assert_allclose(set_k1, expected, rtol=1e-9)
+        assert set_k1 != pytest.approx([e.k1 for e in small_ring.elements
+                                        if e.kind == "quadrupole"], rel=1e-6)  # fmt: skip
+    assert re.fullmatch(r"qf->k1 = [\d.]+;\n", family.snippet("madx"))
+    place = wrong[0].element.split("::")[1]
+    assert re.match(rf"q[fd]\.\.{place}->k1 = ", alone.snippet("madx"))
+    assert f"start_occurence={int(place) + 1}" in alone.snippet("elegant")
+
+
+def test_on_the_command_line(small_ring, wrong, quadrupoles, tmp_path):
+    save_ring(small_ring, tmp_path / "design.json")
+    estimated = tmp_path / "estimated.json"
+    save_ring(apply(small_ring, wrong), estimated)
+    known = posterior(quadrupoles, 1e-4)
+    write_json(tmp_path / "estimated.json.known.json", known_document(known, estimated))
+    run = CliRunner().invoke
+    design = ["--design", str(tmp_path / "design.json")]
+    example = tmp_path / "knobs.csv"
+    made = run(tmlattice, ["correct", str(estimated), *design, "--knobs", "quadrupoles",
+                           "--example", str(example)])  # fmt: skip
+    assert made.exit_code == 0, made.output
+    assert len(list(csv.DictReader(example.open()))) == len(quadrupoles)
+    done = run(tmlattice, ["correct", str(estimated), *design, "--knobs", str(example), "--target",
+                           "beta_beating=0.02", "--target", "tunes", "--out",
+                           str(tmp_path / "out")])  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "the beta beating in" in done.output
+    document = json.loads((tmp_path / "out" / "correction.json").read_text())
+    assert document["targets"]["beta_beating"] == 0.02
+    rows = list(csv.DictReader((tmp_path / "out" / "settings.csv").open()))
+    first = {row["device"]: row for row in rows}[wrong[0].element]
+    assert float(first["new"]) == pytest.approx(
+        small_ring[wrong[0].element].k1 / (1 + wrong[0].amount), rel=2e-3
+    )
+    assert document["after"]["beta_beating"][0][1] < document["after"]["beta_beating"][0][2]
+    bare = run(tmlattice, ["correct", str(estimated)])
+    assert bare.exit_code != 0
+    assert "--design" in bare.output
+
+
+def test_the_written_table_is_that_of_the_result(small_ring, wrong, tmp_path):
+    found = correct(apply(small_ring, wrong), goal=small_ring, knobs=["quadrupoles"])
+    found.save(tmp_path / "out")
+    rows = list(csv.DictReader((tmp_path / "out" / "settings.csv").open()))
+    assert [row["device"] for row in rows] == [s.knob.name for s in found.settings]
+    shares = [float(row["gain"]) for row in rows]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(shares) == pytest.approx(1.0, abs=0.05)
+    for row in rows:
+        assert float(row["new"]) - float(row["present"]) == pytest.approx(
+            float(row["change"]), abs=1e-8
+        )
+
+
+# --- a beam that is not stored --------------------------------------------------------------------
+def turns_of_at(ring, turns=20):
+    """Share of the readings that a beam launched on the axis reaches, and its rms, m."""
+    readings = AtEngine(ring).track(np.zeros((1, 6)), turns)[0]
+    alive = np.isfinite(readings).all(axis=-1)
+    return float(np.mean(np.cumsum(~alive.ravel()) == 0)), float(np.sqrt(np.nanmean(readings**2)))
+
+
+def test_threading_brings_a_lost_beam_round(ring_kicking_x):
+    """Displaced quadrupoles lose the first turn; steered, AT's beam stays for twenty turns."""
+    ring = ring_kicking_x("i % 2")
+    rng = np.random.default_rng(2)
+    quadrupoles = [e.name for e in ring.elements if e.kind == "quadrupole"]
+    causes = [
+        Cause(f"quadrupole_offset_{plane}", name, 3e-3 * rng.standard_normal())
+        for name in quadrupoles for plane in "xy"
+    ]  # fmt: skip
+    machine = apply(ring, causes)
+    reached, _ = turns_of_at(machine)
+    assert reached < 0.1
+    found = correct(machine, goal=ring, targets=["first_turn"])
+    assert {s.knob.kind for s in found.settings} == {"hcorrector", "vcorrector"}
+    reached, rms = turns_of_at(set_to(machine, found))
+    assert reached == 1.0
+    assert rms < 1e-2
+    assert "trajectory" in found.words
+    with pytest.raises(TmlatticeError, match="give it alone"):
+        correct(ring, goal=ring, targets=["first_turn", "tunes"])
+
+
+def test_diagnose_states_the_correction(small_ring, tmp_path):
+    """A wrong supply: the terminal, the page and the table say how to set it."""
+    save_ring(small_ring, tmp_path / "design.json")
+    data = simulate_response(
+        small_ring, [Cause("family_gradient", "QD", 0.01)], engine="ocelot", progress=False,
+        noise=1e-7,
+    ).measured  # fmt: skip
+    write_measurement(tmp_path / "day_1", data)
+    done = CliRunner().invoke(tmlattice, [
+        "diagnose", str(tmp_path / "design.json"), str(tmp_path / "day_1"), "--effects",
+        "quadrupole_gradient", "--lattice-out", str(tmp_path / "found.json"), "--out",
+        str(tmp_path / "out"),
+    ])  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "Correction: The " in done.output
+    assert '<h2 id="correction">' in (tmp_path / "out" / "report.html").read_text()
+    rows = {r["device"]: r for r in csv.DictReader((tmp_path / "out" / "settings.csv").open())}
+    k1 = small_ring["QD::0"].k1
+    assert float(rows["QD"]["new"]) == pytest.approx(k1 / 1.01, rel=1e-3)
+    again = CliRunner().invoke(tmlattice, ["correct", str(tmp_path / "out"), "--design",
+                                           str(tmp_path / "design.json")])  # fmt: skip
+    assert again.exit_code == 0, again.output
+    assert "QD" in again.output
+
+
+def test_applied_settings_have_a_calibration(small_ring, tmp_path):
+    """A supply that makes four fifths of what it is asked for."""
+    path = tmp_path / "settings.csv"
+    path.write_text("device,present,new,change,unit,low,high,gain\nQF,0.9,0.909,0.009,1/m2,,,1\n")
+    made = [simulate_response(small_ring, [Cause("family_gradient", "QF", amount)] * (amount != 0),
+                              engine="ocelot", progress=False, noise=1e-7).measured
+            for amount in (0.0, 0.008)]  # fmt: skip
+    found = diagnose(small_ring, made[1], reference=made[0])
+    (own,) = applied(found, read_settings(path))
+    assert own.asked == pytest.approx(0.01)
+    assert own.ratio == pytest.approx(0.8, abs=max(0.01, 3 * own.ratio_error))
+    assert own.ratio_error < 0.05
+    with pytest.raises(MeasurementError, match="--reference"):
+        applied(diagnose(small_ring, made[1], effects=["quadrupole_gradient"]), {"QF": (1.0, 2.0)})
+    path.write_text("device,new\nQF,1\n")
+    with pytest.raises(MeasurementError, match="no device, present or new"):
+        read_settings(path)
+
+
+def test_a_table_is_not_written_over(small_ring, tmp_path):
+    save_ring(small_ring, tmp_path / "design.json")
+    knobs = tmp_path / "knobs.yaml"
+    knobs.write_text("- {knob: QF}\n")
+    done = CliRunner().invoke(tmlattice, [
+        "correct", str(tmp_path / "design.json"), "--design", str(tmp_path / "design.json"),
+        "--knobs", str(knobs), "--json", str(knobs),
+    ])  # fmt: skip
+    assert done.exit_code != 0
+    assert "is read, and would be written over" in str(done.exception)
+    assert knobs.read_text() == "- {knob: QF}\n"

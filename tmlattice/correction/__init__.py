@@ -1,0 +1,260 @@
+"""Settings of power supplies that bring a diagnosed ring to its goal, with the expected gain.
+
+>>> correction = correct(diagnosis)                  # or of the files of `diagnose --lattice-out`
+>>> print(correction.report())
+"""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
+from tmlattice.correction.first_turn import Threading
+from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
+from tmlattice.correction.result import Correction, Setting, with_gains
+from tmlattice.correction.solve import (
+    ENOUGH,
+    Point,
+    Problem,
+    by_gain,
+    drawn,
+    fewest,
+    rounded,
+    settled,
+)
+from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
+from tmlattice.diagnosis import Diagnosis
+from tmlattice.errors import TmlatticeError, UnstableRingError
+from tmlattice.lattice import Ring
+
+__all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_knobs"]
+
+Array = np.ndarray
+
+DRAWS = 200
+"""From the posterior: the ends of an interval scatter by a tenth of its half width."""
+COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+"""Of knobs, for which the gain is told."""
+INTERVAL = (50.0, 15.87, 84.13)
+"""Percentiles: the median and the central 68.27 %."""
+SIGMAS = 3.0
+"""By how many standard deviations tunes stay clear of integers and half integers."""
+
+
+def correct(
+    diagnosis: Diagnosis | Estimate | Ring,
+    *,
+    goal: Ring | None = None,
+    knobs: Sequence[Knob] | Iterable[str] | str | Path | None = None,
+    targets: Iterable[str] | Mapping[str, float | None] | None = None,
+    seed: int = 0,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> Correction:
+    """Settings of knobs that bring the ring, as the data have it, closest to a goal.
+
+    Args:
+        diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain.
+        goal: the ring whose optics are wanted, and whose strengths are the present settings of a
+            ring that is given as one; None: the diagnosis's design.
+        knobs: devices; kinds of `default_knobs`; or the path of a table. None: quadrupole supplies
+            and skew quadrupoles, and correctors where the closed orbit is a target.
+        targets: names of `TARGETS`, with tolerances where a mapping gives them. None: the optics,
+            and the closed orbit where it was measured.
+        seed: of the draws from the posterior.
+        progress: called with the name of each stage.
+
+    Raises:
+        TmlatticeError: a ring without a goal, or no knob that acts.
+        ChoiceError, MeasurementError, UnknownNameError: targets or knobs that cannot be used.
+        UnstableRingError: the estimated ring, or the goal, stores no beam.
+    """
+    begun = time.perf_counter()
+    chosen = targets
+    if chosen is None:
+        orbit = isinstance(diagnosis, Diagnosis) and "closed_orbit" in diagnosis.measured
+        chosen = (*OPTICS, "closed_orbit") if orbit else OPTICS
+    progress("posterior")
+    estimate = _estimate(diagnosis, goal)
+    wanted = estimate.settings if goal is None else goal
+    judged: Targets | Threading
+    if [*chosen] == [THREADING]:
+        judged = Threading(wanted, dict(chosen)[THREADING] if isinstance(chosen, Mapping) else None)
+    else:
+        judged = Targets(wanted, chosen)
+    devices = _knobs(knobs, estimate.settings, judged.names)
+    progress("correction")
+    problem = drawn(estimate, devices, judged, DRAWS, seed)
+    try:
+        begin = problem.at(np.zeros(len(devices)))
+    except UnstableRingError as error:
+        raise UnstableRingError(f"the estimated ring stores no beam: {error}") from error
+    if not begin.slopes.any():
+        raise TmlatticeError("no knob changes a target; name others (--knobs, --target)")
+    end, order = _corrected(problem, begin)
+    found = _told(begin, end, order)
+    seconds = time.perf_counter() - begun
+    made = {"seed": seed, "draws": DRAWS, "knobs": len(devices), "seconds": seconds}
+    return Correction(**found, ring=estimate.settings, provenance=made)
+
+
+def _estimate(diagnosis: Diagnosis | Estimate | Ring, goal: Ring | None) -> Estimate:
+    if isinstance(diagnosis, Estimate):
+        return diagnosis
+    if isinstance(diagnosis, Diagnosis):
+        return estimate_of(diagnosis)
+    if goal is None:
+        raise TmlatticeError("a lattice alone has no goal; give the design (goal=, --design)")
+    return estimate_with(diagnosis, goal, None)
+
+
+def _knobs(
+    knobs: Sequence[Knob] | Iterable[str] | str | Path | None,
+    settings: Ring,
+    names: Sequence[str],
+) -> list[Knob]:
+    if knobs is None:
+        return default_knobs(settings, kinds_for(names))
+    if isinstance(knobs, str | Path):
+        return read_knobs(Path(knobs), settings)
+    some = list(knobs)
+    devices = [own for own in some if isinstance(own, Knob)]
+    kinds = [own for own in some if isinstance(own, str)]
+    return devices + (default_knobs(settings, kinds) if kinds else [])
+
+
+def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
+    """Where the correction ends, and its knobs by falling gain."""
+    every = np.arange(len(problem.knobs))
+    whole = settled(problem, begin, every)
+    order = by_gain(whole)
+    counts = [n for n in COUNTS if n < len(order)] + [len(order)]
+    number, _ = fewest(whole, order, counts)
+    chosen = np.array(order[:number], dtype=np.int64)
+    goal, _ = whole.step(chosen)
+    start = problem.better(goal, begin.square) or begin
+    end = settled(problem, start, chosen)
+    if end.square > (1 + 2 * ENOUGH) * whole.square:  # not as linear as that
+        end, number = whole, len(order)
+    return rounded(problem, end), order[:number]
+
+
+def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
+    """What the result says."""
+    problem, targets = end.problem, end.problem.targets
+    rows = targets.rows(begin.open)
+    change = 2 * rows @ (begin.rows - end.rows)
+    gained = begin.square - end.square
+    error = float(np.std(change))
+    whole = max(begin.square + float(np.mean(np.sum(rows**2, axis=1))), 1e-30)
+    refused = _refusal(begin, gained, error)
+    if refused:
+        end = begin
+    before, after = (_intervals(point) for point in (begin, end))
+    squares, gains = [], []
+    for n in range(1, len(order) + 1 if not refused else 1):
+        amounts, square = end.step(np.array(order[:n], dtype=np.int64))
+        squares.append(square)
+        if n in COUNTS or n == len(order):
+            gains.append((n, _expected(amounts, end)))
+    shares = -np.diff([begin.square, *squares]) / max(
+        begin.square - min(squares, default=0.0), 1e-30
+    )
+    settings = [
+        Setting(problem.knobs[k], float(end.amounts[k]),
+                problem.knobs[k].setting(float(end.amounts[k])), 0.0)
+        for k in order if end.amounts[k]
+    ]  # fmt: skip
+    by_knob = dict(zip(order, shares.tolist(), strict=False))
+    rows_of = with_gains(settings, [by_knob[k] for k in order if end.amounts[k]])
+    stays = {
+        name: (_pair(rms_of(end.errors)[name]), _pair(np.median(own, axis=0)))
+        for name, own in rms_of(end.open).items()
+    }
+    shown = targets.names[0] if "beta_beating" not in end.errors else "beta_beating"
+    profile = tuple(
+        np.moveaxis(np.percentile(p.errors[shown] + p.open[shown], INTERVAL, axis=0), 0, -1)
+        for p in (begin, end)
+    )
+    tunes = {}
+    if isinstance(targets, Targets):
+        tunes = {"goal": targets.goal.tunes, "now": begin.look.values.tunes,
+                 "expected": end.look.values.tunes}  # fmt: skip
+    return {
+        "settings": rows_of,
+        "refused": refused,
+        "before": before,
+        "after": after,
+        "stays": stays,
+        "gains": tuple(gains),
+        "gain": gained / whole,
+        "gain_error": error / whole,
+        "tunes": {name: _pair(value % 1.0) for name, value in tunes.items()},
+        "shown": shown,
+        "profile": profile,
+        "s": targets.s,
+        "counted": targets.tolerance,
+        "iterations": _iterations(end),
+        "warnings": tuple(_warnings(end, rows_of)),
+    }
+
+
+def _refusal(begin: Point, gained: float, error: float) -> str:
+    """Why nothing is changed."""
+    if gained > error:
+        return ""
+    if gained <= 0:
+        return "No setting is changed: these knobs do not bring the ring closer to the goal."
+    return (
+        f"No setting is changed: the expected gain, {gained:.2g} of {begin.square:.2g} in units of "
+        f"the tolerances, is below its error of {error:.2g}."
+    )
+
+
+def _intervals(point: Point) -> dict[str, Any]:
+    """Of the rms of each target over the draws."""
+    open_, errors = point.open, point.errors
+    found = {}
+    for name in errors:
+        rms = rms_of({name: errors[name] + open_[name]})[name]
+        ends = np.percentile(rms, INTERVAL, axis=0)
+        found[name] = tuple(tuple(ends[:, p].tolist()) for p in (0, 1))
+    return found
+
+
+def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
+    """Median rms of the targets with these amounts, linear about the end."""
+    found = {}
+    for name in end.problem.targets.names:
+        change = np.tensordot(amounts - end.amounts, end.by_knobs[name], 1)
+        errors = end.errors[name] + change + end.open[name]
+        found[name] = _pair(np.median(rms_of({name: errors})[name], axis=0))
+    return found
+
+
+def _iterations(end: Point) -> int:
+    """One, and another one where most of what stays comes from errors of the knobs' changes, which
+    a second measurement shows."""
+    return 2 if float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
+
+
+def _warnings(end: Point, settings: Sequence[Setting]) -> Iterable[str]:
+    held = [setting.knob.name for setting in settings if setting.at_limit]
+    if held:
+        yield f"held by their limits: {', '.join(held)}"
+    if "tunes" not in end.errors:
+        return
+    tunes = end.look.values.tunes + end.open["tunes"][:, 0]
+    mean, sigma = tunes.mean(axis=0), tunes.std(axis=0)
+    for plane, (q, s) in enumerate(zip(mean, sigma, strict=True)):
+        near = abs(2 * q - round(2 * q)) / 2
+        if near < SIGMAS * s:
+            kind = "an integer" if round(2 * q) % 2 == 0 else "a half integer"
+            yield f"the expected tune in {'xy'[plane]}, {q % 1:.4f} ± {s:.1g}, may be {kind}"
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    x, y = np.asarray(values, dtype=float).tolist()
+    return x, y

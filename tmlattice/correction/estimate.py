@@ -1,0 +1,164 @@
+"""The estimated ring with its posterior: what a correction starts from.
+
+>>> estimate = estimate_of(diagnosis)
+>>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
+"""
+
+import logging
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis import Diagnosis
+from tmlattice.diagnosis.twin import known_beside, known_of, read_known
+from tmlattice.effects import Cause, RingEffect, apply, find
+from tmlattice.errors import LatticeError
+from tmlattice.inference.among import Known
+from tmlattice.lattice import Ring
+from tmlattice.observe.calibration import (
+    Dispersion,
+    offset_of,
+    read_calibration,
+    read_dispersion,
+)
+
+Array = NDArray[np.float64]
+Hypothesis = tuple[str, str | None]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A ring as the data have it, and what they leave open.
+
+    Attributes:
+        ring: the posterior mean.
+        settings: the ring whose strengths are the present settings.
+        hypotheses: errors that are not certain, (effect, place), of the ring.
+        known: their posterior about the mean; None: nothing is left open.
+        kept: which of the errors of `known` these are.
+        calibrations: of correctors, kick over setting, by name.
+        dispersion: what the data show beside the ring's, m, [BPM, plane], or 0.
+        energy, energy_error: of the stored beam beside the ring's at its RF frequency, relative.
+    """
+
+    ring: Ring
+    settings: Ring
+    hypotheses: tuple[Hypothesis, ...] = ()
+    known: Known | None = field(default=None, repr=False)
+    kept: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
+    calibrations: dict[str, float] = field(default_factory=dict, repr=False)
+    dispersion: Array | float = field(default=0.0, repr=False)
+    energy: float = 0.0
+    energy_error: float = 0.0
+
+    def beside(
+        self, dispersion: Dispersion, energy: float = 0.0, energy_error: float = 0.0
+    ) -> "Estimate":
+        """With the dispersion and the energy that were found beside the ring's."""
+        names = [monitor.name for monitor in self.ring.monitors]
+        more = np.array([dispersion.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
+        return replace(self, dispersion=more, energy=energy, energy_error=energy_error)
+
+    def draw(self, count: int, random: np.random.Generator) -> Array:
+        """Errors drawn from the posterior, less their mean, [draw, error]."""
+        if self.known is None:
+            return np.zeros((count, 0))
+        known = self.known
+        drawn = known.mixed(random.standard_normal((len(known.rms), count)))
+        return np.asarray((known.rms[:, None] * drawn)[self.kept].T)
+
+
+def estimate_with(ring: Ring, settings: Ring, known: Known | None) -> Estimate:
+    """The estimate of a ring beside which stands what is known of its errors.
+
+    Args:
+        ring: the estimated ring, as `diagnose --lattice-out` writes it.
+        settings: the ring whose strengths are the present settings.
+        known: of its small errors; None: the ring is taken as certain.
+    """
+    if known is None:
+        return Estimate(ring, settings)
+    kept = [i for i, (name, _) in enumerate(known.hypotheses) if _of_ring(name)]
+    kept = [i for i in kept if known.rms[i] > 0]
+    mean = [Cause(*known.hypotheses[i], float(known.amounts[i])) for i in kept]
+    mean = [cause for cause in mean if cause.amount]
+    every = [*known.causes]
+    every += [Cause(*h, a) for h, a in zip(known.hypotheses, known.amounts.tolist(), strict=True)]
+    scales: dict[str, float] = {}
+    for cause in every:
+        if cause.effect == "corrector_calibration" and cause.element is not None:
+            scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
+    return Estimate(
+        apply(ring, mean) if mean else ring,
+        settings,
+        tuple(known.hypotheses[i] for i in kept),
+        known,
+        np.array(kept, dtype=np.int64),
+        scales,
+    )
+
+
+def estimate_of(diagnosis: Diagnosis, known: Known | None = None) -> Estimate:
+    """The estimate of a diagnosis: the ring with what was found, and its posterior.
+
+    Args:
+        diagnosis: of any measurement.
+        known: its `known_of`, where that is at hand.
+
+    Of a change since a reference, and where no covariance of the small errors is known, each
+    amount has its own standard deviation.
+    """
+    known = known_of(diagnosis) if known is None else known
+    if known is None:
+        known = _each_alone(diagnosis)
+    found = estimate_with(diagnosis.as_found, diagnosis.ring, known)
+    if not diagnosis.by_steps or diagnosis.since_reference:
+        return found  # in first turns the energy is the injected beam's
+    pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
+    energies = [(c.amount, s) for c, s in pairs if c.effect == "energy_offset"]
+    return found.beside(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))
+
+
+def _each_alone(diagnosis: Diagnosis) -> Known:
+    sigma = {(c.effect, c.element): s for c, s, _ in diagnosis.supported if np.isfinite(s)}
+    known = Known.usual(list(sigma), {name: 1.0 for name, _ in sigma})
+    beside = tuple(c for c in diagnosis.causes if not _of_ring(c.effect))
+    return replace(known, rms=np.array(list(sigma.values())), causes=beside)
+
+
+def _of_ring(name: str) -> bool:
+    """Whether an effect changes the stored beam of a ring with these settings."""
+    effect = find(name)
+    return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)
+
+
+def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tuple[str, ...]]:
+    """The estimate that `diagnose --lattice-out` wrote, and what a reader should know of it.
+
+    Args:
+        path: of the lattice file; beside it are what is known of its errors and its calibration.
+        settings: the ring whose strengths are the present settings.
+        ring: of that file.
+
+    Raises:
+        MeasurementError: a file beside it that is damaged, or of another ring.
+        LatticeError: the two rings do not have the same elements.
+    """
+    if [e.name for e in ring.elements] != [e.name for e in settings.elements]:
+        raise LatticeError(
+            f"'{path}' and '{settings.name}' do not have the same elements; give the lattice that "
+            "the diagnosis started from"
+        )
+    beside, calibration = known_beside(path), path.with_name(f"{path.name}.calibration.json")
+    said: tuple[str, ...] = ()
+    if not beside.is_file():
+        said = (f"'{beside.name}' is not there: the estimated ring is taken as certain",)
+    found = estimate_with(ring, settings, read_known(beside, ring) if not said else None)
+    if calibration.is_file():
+        energy = offset_of(read_calibration(calibration, ring))
+        found = found.beside(read_dispersion(calibration, ring), energy)
+    return found, said

@@ -1,0 +1,348 @@
+"""Knobs of a correction: power supplies, magnets and the RF, with their settings and limits.
+
+A knob moves an effect of the catalogue at all of its members alike. Its setting is in the unit of
+its supply; an excitation curve says what strength a setting makes.
+
+>>> knobs = default_knobs(ring)
+>>> knobs = read_knobs(Path("knobs.yaml"), ring)
+"""
+
+import csv
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmlattice.beam.rf import rf_of
+from tmlattice.effects import Cause, find
+from tmlattice.errors import MeasurementError, plain, unknown_choice
+from tmlattice.input_files import text_of, yaml_of
+from tmlattice.lattice import Ring
+from tmlattice.lattice.supplies import magnets, supplied_alike
+
+Curve = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of knob.
+
+    Attributes:
+        effect: of the catalogue that it moves at each member; None: the RF frequency.
+        strength: OCELOT's attribute that it sets, as snippets write it.
+        unit: of the strength.
+        relative: the effect's amount is the relative change of the strength, not the change.
+        error: relative error of a change, where the table has none: calibration and hysteresis of
+            quadrupoles are known to a percent, a corrector's to the usual size of its error.
+    """
+
+    effect: str | None
+    strength: str
+    unit: str
+    relative: bool
+    error: float = 0.01
+
+
+KINDS: dict[str, Kind] = {
+    "quadrupole": Kind("quadrupole_gradient", "k1", "1/m2", True),
+    "skew_quadrupole": Kind("skew_gradient", "k1sl", "1/m", False),
+    "sextupole": Kind("sextupole_strength", "k2", "1/m3", True),
+    "hcorrector": Kind(
+        "corrector_kick_x", "kick", "rad", False, find("corrector_calibration").background or 0.0
+    ),
+    "vcorrector": Kind(
+        "corrector_kick_y", "kick", "rad", False, find("corrector_calibration").background or 0.0
+    ),
+    "rf": Kind(None, "frequency", "Hz", True, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One device that can be set.
+
+    Attributes:
+        name: of the supply or device.
+        kind: of `KINDS`.
+        members: names of the elements that it powers; none of the RF.
+        unit: of its setting.
+        present: setting.
+        low, high: limits of the setting.
+        step: smallest change of the setting; 0: none.
+        curve: points (setting, strength) in rising settings; none: the strength is proportional to
+            the setting (of an effect that adds, equal to it).
+        error: relative error of a change.
+        scale: strength over what the curve says: a corrector's calibration.
+    """
+
+    name: str
+    kind: str
+    members: tuple[str, ...]
+    unit: str
+    present: float
+    low: float = -math.inf
+    high: float = math.inf
+    step: float = 0.0
+    curve: Curve = ()
+    error: float = 0.0
+    scale: float = 1.0
+
+    def strength(self, setting: float) -> float:
+        """By the excitation curve, beyond its ends as along its last piece."""
+        if not self.curve:
+            return setting
+        x, y = np.array(self.curve).T
+        i = int(np.clip(np.searchsorted(x, setting) - 1, 0, len(x) - 2))
+        return float(y[i] + (setting - x[i]) * (y[i + 1] - y[i]) / (x[i + 1] - x[i]))
+
+    def setting(self, amount: float) -> float:
+        """That makes this amount of the effect."""
+        now = self.strength(self.present)
+        wanted = now * (1 + amount) if KINDS[self.kind].relative else now + amount / self.scale
+        if not self.curve:
+            return wanted
+        inverse = replace(self, curve=tuple(sorted((y, x) for x, y in self.curve)))
+        return inverse.strength(wanted)
+
+    def amount(self, setting: float) -> float:
+        """Of the effect, at this setting."""
+        now, then = self.strength(self.present), self.strength(setting)
+        return then / now - 1 if KINDS[self.kind].relative else self.scale * (then - now)
+
+    def rounded(self, amount: float) -> float:
+        """The amount at the nearest setting that the limits and the step allow."""
+        setting = self.setting(amount)
+        if self.step:
+            setting = self.present + self.step * round((setting - self.present) / self.step)
+            if setting > self.high:
+                setting -= self.step
+            if setting < self.low:
+                setting += self.step
+        return self.amount(setting)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Of the amount; a present setting beyond its limits may stay."""
+        rises = math.copysign(1.0, self.amount(self.present + 1.0))
+        ends = (min(self.low, self.present), max(self.high, self.present))
+        low, high = sorted(self.amount(e) if math.isfinite(e) else rises * e for e in ends)
+        return low, high
+
+    def causes(self, amount: float) -> list[Cause]:
+        """What it changes in the ring."""
+        effect = KINDS[self.kind].effect
+        if effect is None or not amount:
+            return []
+        return [Cause(effect, member, amount) for member in self.members]
+
+
+def kinds_for(targets: Collection[str]) -> list[str]:
+    """The kinds of knobs that some targets are corrected with, where nobody names any."""
+    orbit = {"closed_orbit", "first_turn"} & set(targets)
+    kinds = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
+    return kinds + ["correctors"] * bool(orbit)
+
+
+def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
+    """The knobs that a lattice shows: quadrupole supplies, skew quadrupoles, correctors.
+
+    Args:
+        ring: whose strengths are the present settings.
+        kinds: instead, any of "supplies", "quadrupoles" (each magnet alone), "skew_quadrupoles",
+            "correctors", "sextupoles" (by families), "rf".
+
+    Raises:
+        ChoiceError: another kind.
+    """
+    made = {
+        "supplies": lambda: _supplies(ring),
+        "quadrupoles": lambda: _each(ring, "quadrupole"),
+        "skew_quadrupoles": lambda: _skew(ring),
+        "correctors": lambda: _correctors(ring),
+        "sextupoles": lambda: _sextupoles(ring),
+        "rf": lambda: [_knob("rf", "rf", (), rf_of(ring).frequency(ring))],
+    }
+    chosen = list(("supplies", "skew_quadrupoles", "correctors") if kinds is None else kinds)
+    for kind in chosen:
+        if kind not in made:
+            raise unknown_choice("kind of knobs", kind, made)
+    return [knob for kind in chosen for knob in made[kind]()]
+
+
+def _knob(name: str, kind: str, members: tuple[str, ...], present: float) -> Knob:
+    own = KINDS[kind]
+    return Knob(name, kind, members, own.unit, present, error=own.error)
+
+
+def _upright(ring: Ring, name: str) -> bool:
+    return abs(abs(ring[name].tilt) - math.pi / 4) > 0.1
+
+
+def _supplies(ring: Ring) -> list[Knob]:
+    """By family or likeness in the design; quadrupoles of no family each alone."""
+    names = [pieces[0].name for pieces in magnets(ring, ("quadrupole",), powered=True)]
+    kinds, belongs = supplied_alike(ring)
+    knobs, taken = [], set()
+    for kind, column in zip(kinds, belongs.T, strict=True):
+        own = [names[i] for i in np.flatnonzero(column) if _upright(ring, names[i])]
+        taken |= set(own)
+        members = tuple(piece for name in own for piece in ring.pieces(name) if ring[piece].k1)
+        families = {ring[member].family for member in members}
+        if members:
+            name = families.pop() if len(families) == 1 else kind
+            knobs.append(_knob(name, "quadrupole", members, ring[members[0]].k1))
+    return knobs + [knob for knob in _each(ring, "quadrupole") if knob.name not in taken]
+
+
+def _each(ring: Ring, kind: str) -> list[Knob]:
+    strength = KINDS[kind].strength
+    found = []
+    for own in magnets(ring, (kind,)):
+        members = tuple(piece.name for piece in own if getattr(piece, strength))
+        if members and (kind != "quadrupole" or _upright(ring, members[0])):
+            found.append(_knob(own[0].name, kind, members, getattr(ring[members[0]], strength)))
+    return found
+
+
+def _skew(ring: Ring) -> list[Knob]:
+    """Quadrupoles that are turned by 45 degrees."""
+    return [
+        _knob(own[0].name, "skew_quadrupole", (own[0].name,),
+              sum(p.errors.k1sl + p.k1 * p.length * -math.sin(2 * p.tilt) for p in own))
+        for own in magnets(ring, ("quadrupole",)) if not _upright(ring, own[0].name)
+    ]  # fmt: skip
+
+
+def _correctors(ring: Ring) -> list[Knob]:
+    return [
+        _knob(e.name, e.kind, (e.name,), e.angle)
+        for e in ring.elements
+        if e.kind in ("hcorrector", "vcorrector")
+    ]
+
+
+def _sextupoles(ring: Ring) -> list[Knob]:
+    families: dict[str, list[Knob]] = {}
+    for knob in _each(ring, "sextupole"):
+        families.setdefault(ring[knob.name].family, []).append(knob)
+    return [
+        replace(own[0], name=family, members=tuple(m for knob in own for m in knob.members))
+        for family, own in families.items()
+    ]
+
+
+# --- tables ---------------------------------------------------------------------------------------
+COLUMNS = (
+    "knob", "kind", "members", "unit", "present", "low", "high", "step", "error", "curve",
+)  # fmt: skip
+"""Of a table of knobs; `members` are names separated by spaces, `curve` is points
+`setting:strength` separated by spaces. All but the knob may be empty."""
+
+
+def read_knobs(path: Path, ring: Ring) -> list[Knob]:
+    """Knobs of a table: .csv with the header `COLUMNS`, or .yaml with a list of such mappings.
+
+    A knob that the lattice shows too takes from there what the table leaves out.
+
+    Args:
+        path: of the table.
+        ring: whose strengths are the present settings.
+
+    Raises:
+        MeasurementError: a table that cannot be read, with the knob.
+        UnknownNameError: a member that the ring does not have.
+    """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        rows = yaml_of(path, MeasurementError)
+    else:
+        rows = list(csv.DictReader(text_of(path, MeasurementError).splitlines()))
+    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows) or not rows:
+        raise MeasurementError(f"{path}: it holds no list of knobs; `--example` writes one")
+    every = ("supplies", "quadrupoles", "skew_quadrupoles", "correctors", "sextupoles", "rf")
+    shown = {knob.name.casefold(): knob for knob in reversed(default_knobs(ring, every))}
+    knobs = [_read(path, row, ring, shown) for row in rows]
+    names = [knob.name for knob in knobs]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise MeasurementError(f"{path}: the knob '{plain(twice, 40)}' stands twice")
+    return knobs
+
+
+def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Knob]) -> Knob:
+    given = {key: value for key, value in row.items() if value not in (None, "", [])}
+    name = str(given.pop("knob", "")).strip()
+    where = f"{path}: knob '{plain(name, 40)}'"
+    if not name or (strange := set(given) - set(COLUMNS)):
+        what = (
+            "a row without a knob"
+            if not name
+            else f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
+        )
+        raise MeasurementError(f"{what}; the columns are {', '.join(COLUMNS)}")
+    members = given.pop("members", ())
+    names = members.split() if isinstance(members, str) else [str(m) for m in members]
+    kind = str(given.pop("kind", "")).strip()
+    known = shown.get(name.casefold())
+    if kind and kind not in KINDS:
+        raise MeasurementError(f"{where}: no kind '{plain(kind, 40)}'; {', '.join(KINDS)}")
+    if names:
+        first = ring[names[0]]
+        kind = kind or (first.kind if first.kind in KINDS else "")
+        if not kind:
+            raise MeasurementError(f"{where}: state its kind: {', '.join(KINDS)}")
+        pieces = tuple(piece for member in names for piece in ring.pieces(ring[member].name))
+        attribute = {"kick": "angle"}.get(KINDS[kind].strength, KINDS[kind].strength)
+        known = _knob(name, kind, pieces, float(getattr(first, attribute, 0.0)))
+    if known is None or (kind and kind != known.kind):
+        raise MeasurementError(f"{where}: the lattice shows none of this name; state its members")
+    curve = given.pop("curve", ())
+    unit = str(given.pop("unit", known.unit))
+    try:
+        numbers: dict[str, Any] = {key: float(value) for key, value in given.items()}
+        points = curve.split() if isinstance(curve, str) else list(curve)
+        pairs = [p.split(":") if isinstance(p, str) else p for p in points]
+        read = tuple(sorted((float(x), float(y)) for x, y in pairs))
+    except (TypeError, ValueError):
+        raise MeasurementError(
+            f"{where}: a value is no number; a curve is 'setting:strength setting:strength'"
+        ) from None
+    if unit != known.unit and "present" not in numbers:
+        raise MeasurementError(f"{where}: its unit is {plain(unit, 20)}; state its present setting")
+    knob = replace(known, name=name, unit=unit, curve=read, **numbers)
+    _check(where, knob)
+    return knob
+
+
+def _check(where: str, knob: Knob) -> None:
+    numbers = [knob.present, knob.step, knob.error, *(v for pair in knob.curve for v in pair)]
+    if not all(map(math.isfinite, numbers)) or knob.step < 0 or knob.error < 0:
+        raise MeasurementError(f"{where}: settings are finite; step and error are not negative")
+    if not knob.low < knob.high:
+        raise MeasurementError(f"{where}: its limits are {knob.low:g} and {knob.high:g}")
+    x, y = (np.array(v) for v in zip(*knob.curve, strict=True)) if knob.curve else (None, None)
+    if x is not None and y is not None:
+        falls = np.diff(y) * (y[-1] - y[0])
+        if len(x) < 2 or (np.diff(x) <= 0).any() or (falls <= 0).any():
+            raise MeasurementError(f"{where}: its curve has to rise, or fall, from point to point")
+    if KINDS[knob.kind].relative and knob.strength(knob.present) == 0:
+        raise MeasurementError(
+            f"{where}: its present strength is 0, of which no change is a share; state its present "
+            "setting"
+        )
+
+
+def write_knobs(path: Path, knobs: Iterable[Knob]) -> None:
+    """A table of knobs as `read_knobs` reads it, .csv."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for knob in knobs:
+            limits = ["" if math.isinf(end) else f"{end:.9g}" for end in (knob.low, knob.high)]
+            curve = " ".join(f"{x:.9g}:{y:.9g}" for x, y in knob.curve)
+            writer.writerow(
+                [knob.name, knob.kind, " ".join(knob.members), knob.unit, f"{knob.present:.9g}",
+                 *limits, f"{knob.step:.9g}" if knob.step else "", f"{knob.error:g}", curve]
+            )  # fmt: skip

@@ -1,0 +1,209 @@
+"""A correction: settings of knobs, what they are expected to gain, and what stays.
+
+>>> correction = correct(diagnosis)
+>>> print(correction.report())
+>>> correction.save("settings")
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from tmlattice.correction.knobs import Knob
+from tmlattice.correction.snippets import snippet
+from tmlattice.correction.targets import TARGETS
+from tmlattice.late import Method
+from tmlattice.lattice import Ring
+from tmlattice.speaks import Speaks
+
+Interval = tuple[float, float, float]
+"""Median and the ends of the central 68 %."""
+FORMAT = "tmlattice-correction"
+HEAD = ("device", "present", "new", "change", "unit", "low", "high", "gain")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Of one device.
+
+    Attributes:
+        knob: the device.
+        amount: relative change of its strength, or the change (rad, 1/m) of one that adds.
+        new: setting.
+        gain: share of the whole gain by which this device lowers the expected square after those
+            that stand before it.
+    """
+
+    knob: Knob
+    amount: float
+    new: float
+    gain: float
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether a limit holds it back."""
+        near = max(self.knob.step, 1e-6 * abs(self.new - self.knob.present))
+        return any(
+            math.isfinite(end) and abs(self.new - end) <= near
+            for end in (self.knob.low, self.knob.high)
+        )
+
+    def row(self) -> list[Any]:
+        """In the order of `HEAD`."""
+        knob = self.knob
+        return [knob.name, knob.present, self.new, self.new - knob.present, knob.unit,
+                *(None if math.isinf(end) else end for end in (knob.low, knob.high)),
+                self.gain]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Correction(Speaks):
+    """Settings and what they are expected to do.
+
+    Attributes:
+        settings: of the devices that change, the one that gains most first; none where refused.
+        refused: why nothing is changed; empty where something is.
+        before, after: expected rms of each target's errors, by target, (x, y).
+        stays: rms of each target's errors after the correction in the estimated ring, which these
+            knobs do not reach, and the median of what the data leave undetermined, (x, y) each.
+        gains: of the first 1, 2, 5, 10, ... devices: their number, and the expected rms by target.
+        gain, gain_error: share of the expected square, in units of the tolerances, that the
+            correction takes away, and its standard deviation.
+        tunes: fractions, of the goal, now and expected.
+        shown: the target that figures show: beta beating, or the trajectory.
+        profile: its errors at the readings now and expected, each [reading, plane, 3] (`Interval`).
+        s: of the readings, m.
+        counted: the targets, with their tolerances.
+        iterations: of measurement and correction that a ring like this needs.
+        warnings: what a reader should know.
+        ring: whose settings are the present ones.
+        provenance: versions, options, seconds.
+    """
+
+    settings: tuple[Setting, ...]
+    refused: str
+    before: Mapping[str, tuple[Interval, Interval]]
+    after: Mapping[str, tuple[Interval, Interval]]
+    stays: Mapping[str, tuple[tuple[float, float], tuple[float, float]]]
+    gains: tuple[tuple[int, Mapping[str, tuple[float, float]]], ...]
+    gain: float
+    gain_error: float
+    tunes: Mapping[str, tuple[float, float]]
+    shown: str
+    profile: tuple[np.ndarray, np.ndarray] = field(repr=False)
+    s: np.ndarray = field(repr=False)
+    counted: Mapping[str, float]
+    iterations: int
+    warnings: tuple[str, ...]
+    ring: Ring = field(repr=False)
+    provenance: Mapping[str, Any] = field(repr=False)
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        return "", {"devices": str(len(self.settings)), "expected": self.words}
+
+    @property
+    def words(self) -> str:
+        """The result in a sentence."""
+        if self.refused:
+            return self.refused
+        first = [setting.knob.name for setting in self.settings[:3]]
+        count = len(self.settings)
+        names = ", ".join(first) + (f" and {count - 3} more" if count > 3 else "")
+        parts = [_change(name, self.before[name], self.after[name]) for name in self.counted]
+        most = sorted((part for part in parts if part), key=lambda part: -part[0])[:3]
+        devices = f"The device {names} takes" if count == 1 else f"The {count} devices {names} take"
+        return f"{devices} {'; '.join(text for _, text in most)}."
+
+    report = Method(
+        "tmlattice.report.correction_texts", "correction_text", "The whole as plain text."
+    )
+    save = Method(
+        "tmlattice.report.speaking",
+        "save_correction",
+        "Write settings.csv, correction.json and .txt, snippets and report.html into a folder.",
+    )
+    plot = Method(
+        "tmlattice.plots.correction", "plot_correction", "Draw the beta beating now and expected."
+    )
+
+    def as_json(self) -> dict[str, Any]:
+        """The result in the format `tmlattice-correction`, version 1."""
+        from tmlattice import __version__
+
+        def of(parts: Mapping[str, Any]) -> dict[str, Any]:
+            return {
+                name: [list(np.atleast_1d(own)) for own in pair] for name, pair in parts.items()
+            }
+
+        settings = [
+            dict(zip(HEAD, setting.row(), strict=True))
+            | {"kind": setting.knob.kind, "members": list(setting.knob.members),
+               "strength_change": setting.amount, "at_limit": setting.at_limit}
+            for setting in self.settings
+        ]  # fmt: skip
+        return {
+            "format": FORMAT,
+            "version": 1,
+            "package": __version__,
+            "settings": settings,
+            "refused": self.refused,
+            "words": self.words,
+            "targets": dict(self.counted),
+            "before": of(self.before),
+            "after": of(self.after),
+            "stays": {
+                name: {"not_reachable": list(reach), "not_determined": list(data)}
+                for name, (reach, data) in self.stays.items()
+            },
+            "gains": [{"devices": n, **{k: list(v) for k, v in own.items()}}
+                      for n, own in self.gains],
+            "gain": self.gain,
+            "gain_sigma": self.gain_error,
+            "tunes": {name: list(pair) for name, pair in self.tunes.items()},
+            "profile": {"target": self.shown, "s": self.s.tolist(),
+                        "before": self.profile[0].tolist(), "after": self.profile[1].tolist()},
+            "iterations": self.iterations,
+            "warnings": list(self.warnings),
+            "provenance": dict(self.provenance),
+        }  # fmt: skip
+
+    def table(self) -> str:
+        """The settings as CSV."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(HEAD)
+        for setting in self.settings:
+            writer.writerow(
+                ["" if v is None else f"{v:.9g}" if isinstance(v, float) else v
+                 for v in setting.row()]
+            )  # fmt: skip
+        return text.getvalue()
+
+    def snippet(self, code: str) -> str:
+        """The settings as statements of "madx", "at" (Python) or "elegant"."""
+        return snippet(self.ring, [(s.knob, s.amount) for s in self.settings], code)
+
+
+def _change(
+    name: str, before: tuple[Interval, Interval], after: tuple[Interval, Interval]
+) -> tuple[float, str] | None:
+    """By what factor a target's worse plane shrinks, and that in words; None: it does not."""
+    p = max((0, 1), key=lambda plane: before[plane][0])
+    (now, *_), (then, low, high) = before[p], after[p]
+    if not then < now:
+        return None
+    target = TARGETS[name]
+    factor, unit = (100.0, "%") if target.unit == "relative" else (1.0, target.unit)
+    scale = f"{factor * now:.3g} to {factor * then:.3g} ± {factor * (high - low) / 2:.2g} {unit}"
+    return now / max(then, 1e-30), f"the {target.words} in {target.planes[p]} from {scale.rstrip()}"
+
+
+def with_gains(settings: list[Setting], shares: list[float]) -> tuple[Setting, ...]:
+    """The settings with their shares of the gain, the largest first."""
+    rows = [replace(s, gain=share) for s, share in zip(settings, shares, strict=True)]
+    return tuple(sorted(rows, key=lambda row: -row.gain))

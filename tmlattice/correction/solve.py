@@ -1,0 +1,303 @@
+"""Settings that make the expected square of the target errors least.
+
+With the errors e of the estimated ring in units of their tolerances, J their derivatives by the
+knobs and G those by its uncertain errors, the expected square after a change x is, to first order,
+
+    |e + J x|^2 + sum_k (sigma_k |J_k| x_k)^2 + E |G delta|^2.
+
+The first term is what the knobs can reach. The second is a ridge that no one has to choose: a
+knob's change has a relative error sigma_k, so that large changes which cancel one another cost more
+than they gain. The third is what the data do not determine: no knob lowers it.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from tmlattice.correction.estimate import Estimate
+from tmlattice.correction.first_turn import Threading
+from tmlattice.correction.knobs import KINDS, Knob
+from tmlattice.correction.targets import Targets
+from tmlattice.effects import apply
+from tmlattice.errors import UnstableRingError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Look = Any
+"""What a ring shows, as its targets see it: `StoredOptics` or `Trajectory`."""
+
+log = logging.getLogger(__name__)
+
+ROUNDS = 30
+"""Linearisations at most: a beam that is threaded gets further with each of them."""
+SETTLED = 1e-3
+"""Relative fall of the expected square at which a linearisation was the last."""
+HALVES = 6
+"""How often a step that does not lower the expected square is halved."""
+ENOUGH = 0.02
+"""Relative excess over the least expected square (1 % in rms) that fewer knobs may leave."""
+AT_ONCE = 500
+"""Uncertain errors whose derivatives are held at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is corrected with what.
+
+    Attributes:
+        estimate: the ring and its posterior.
+        knobs: the devices.
+        targets: the goal.
+        draws: errors drawn from the posterior, less their mean, [draw, error].
+        noise: errors of the knobs' changes, in units of their own, [draw, knob].
+        energies: errors of the beam's relative energy, [draw].
+    """
+
+    estimate: Estimate
+    knobs: tuple[Knob, ...]
+    targets: Targets | Threading
+    draws: Array
+    noise: Array
+    energies: Array
+
+    @cached_property
+    def begin(self) -> Look:
+        """What the estimated ring shows.
+
+        Raises:
+            UnstableRingError: it stores no beam.
+        """
+        return self.targets.begin(self.estimate.ring, self.estimate.energy)
+
+    @cached_property
+    def sigma(self) -> Array:
+        """Relative error of each knob's change, [knob]."""
+        return np.array([knob.error for knob in self.knobs])
+
+    @cached_property
+    def sizes(self) -> Array:
+        """Norm of the rows' derivatives by each knob in the estimated ring, [knob]; 1 where it
+        changes nothing."""
+        size = np.linalg.norm(Point(self, np.zeros(len(self.knobs)), self.begin).slopes, axis=0)
+        return np.asarray(np.where(size > 0, size, 1.0))
+
+    @cached_property
+    def bounds(self) -> Array:
+        """Of the amounts, [2, knob]."""
+        return np.array([knob.bounds for knob in self.knobs]).reshape(-1, 2).T
+
+    def at(self, amounts: Array) -> "Point":
+        """The estimated ring with changes of the knobs.
+
+        Raises:
+            UnstableRingError: it stores no beam.
+        """
+        causes = [c for k, a in zip(self.knobs, amounts.tolist(), strict=True) for c in k.causes(a)]
+        shift = sum(a for k, a in zip(self.knobs, amounts, strict=True) if k.kind == "rf")
+        ring = self.estimate.ring
+        look = self.begin.moved(apply(ring, causes), shift) if causes or shift else self.begin
+        return Point(self, amounts, look)
+
+    def better(self, amounts: Array, least: float) -> "Point | None":
+        """The point, if it stores a beam and its expected square is below."""
+        try:
+            point = self.at(amounts)
+        except UnstableRingError:
+            return None
+        return point if point.square < least else None
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """The estimated ring with some changes of the knobs.
+
+    Attributes:
+        problem, amounts: what it was made from, [knob].
+        look: what the ring shows.
+    """
+
+    problem: Problem
+    amounts: Array
+    look: Look
+
+    @cached_property
+    def errors(self) -> dict[str, Array]:
+        """Of all targets, see `Targets.errors`."""
+        errors = self.problem.targets.errors(self.look.values)
+        if "dispersion" in errors:
+            errors["dispersion"] = errors["dispersion"] + self.problem.estimate.dispersion
+        return errors
+
+    @cached_property
+    def rows(self) -> Array:
+        """Those that count, in units of their tolerances, [row]."""
+        return self.problem.targets.rows(self.errors)
+
+    @cached_property
+    def by_frequency(self) -> dict[str, Array]:
+        """d errors / d relative RF frequency, [1, reading, plane] each."""
+        return self.problem.targets.changes(self.look.by_frequency())
+
+    @cached_property
+    def by_knobs(self) -> dict[str, Array]:
+        """d errors / d amount of each knob, [knob, reading, plane] each."""
+        targets = self.problem.targets
+        hypotheses, owner, rf = [], [], []
+        for k, knob in enumerate(self.problem.knobs):
+            effect = KINDS[knob.kind].effect
+            if effect is None:
+                rf.append(k)
+                continue
+            hypotheses += [(effect, member) for member in knob.members]
+            owner += [k] * len(knob.members)
+        changes = targets.changes(self.look.derivatives(hypotheses))
+        found = {}
+        for name, errors in self.errors.items():
+            found[name] = np.zeros((len(self.problem.knobs), *errors.shape))
+            np.add.at(found[name], owner, changes[name])
+            if rf:
+                found[name][rf] = self.by_frequency[name]
+        return found
+
+    @cached_property
+    def slopes(self) -> Array:
+        """d rows / d amount of each knob, [row, knob]."""
+        return self.problem.targets.rows(self.by_knobs).T
+
+    @cached_property
+    def open(self) -> dict[str, Array]:
+        """What the draws from the posterior, and the errors of the knobs' changes, add to the
+        errors, to first order, [draw, reading, plane] each."""
+        problem, estimate = self.problem, self.problem.estimate
+        noise = problem.noise * problem.sigma * self.amounts
+        total = {name: np.tensordot(noise, part, 1) for name, part in self.by_knobs.items()}
+        if estimate.energy_error:
+            shift = problem.energies * self.look.per_energy
+            for name, part in self.by_frequency.items():
+                total[name] += shift[:, None, None] * part
+        for first in range(0, len(estimate.hypotheses), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            changes = self.look.derivatives(estimate.hypotheses[some])
+            for name, part in problem.targets.changes(changes).items():
+                total[name] += np.tensordot(problem.draws[:, some], part, 1)
+        return total
+
+    @property
+    def unsure(self) -> Array:
+        """Errors of the knobs' changes in the rows, rms of each, [knob]."""
+        return self.problem.sigma * self.problem.sizes * self.amounts
+
+    @property
+    def square(self) -> float:
+        """Expected square of the rows, without what the data do not determine."""
+        return float(self.rows @ self.rows + self.unsure @ self.unsure)
+
+    @cached_property
+    def _triangle(self) -> tuple[Array, Array, float]:
+        """Of the slopes in units of the knobs' sizes: the triangle R, and in its coordinates what
+        stays without any change, [knob]; and the square of what no knob moves."""
+        q, r = np.linalg.qr(self.slopes / self.problem.sizes)
+        start = self.rows - self.slopes @ self.amounts
+        inside = q.T @ start
+        return r, inside, float(start @ start - inside @ inside)
+
+    def step(self, knobs: Indices) -> tuple[Array, float]:
+        """The amounts of some knobs, the others at zero, that make the expected square least as it
+        is about here, within the limits; and that square."""
+        r, start, fixed = self._triangle
+        matrix = np.vstack([r[:, knobs], np.diag(self.problem.sigma[knobs])])
+        right = np.concatenate([-start, np.zeros(len(knobs))])
+        low, high = self.problem.bounds[:, knobs] * self.problem.sizes[knobs]
+        if np.isfinite([low, high]).any():
+            found = lsq_linear(matrix, right, (low, np.maximum(high, low + 1e-300))).x
+        else:
+            found = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        left = matrix @ found - right
+        amounts = np.zeros(len(self.amounts))
+        amounts[knobs] = found / self.problem.sizes[knobs]
+        return amounts, fixed + float(left @ left)
+
+
+def settled(problem: Problem, begin: Point, knobs: Indices) -> Point:
+    """The point of least expected square that some knobs reach, linearised anew as it moves.
+
+    Args:
+        problem: what is corrected.
+        begin: where it starts.
+        knobs: those that may change; the others are at zero.
+    """
+    now = begin
+    for _ in range(ROUNDS):
+        goal, _ = now.step(knobs)
+        found = None
+        for half in range(HALVES):
+            found = problem.better(now.amounts + (goal - now.amounts) / 2**half, now.square)
+            if found is not None:
+                break
+        if found is None:
+            return now
+        log.info("expected square %.4g -> %.4g", now.square, found.square)
+        done = now.square - found.square < SETTLED * now.square
+        now = found
+        if done:
+            break
+    return now
+
+
+def by_gain(point: Point) -> list[int]:
+    """The knobs in the order in which each next one lowers the expected square most, with the
+    others adjusted to it (orthogonal matching pursuit, as MICADO)."""
+    r, start, _ = point._triangle
+    count = len(point.amounts)
+    left_over = [k for k in range(count) if r[:, k].any()]
+    J = np.vstack([r, np.diag(point.problem.sigma)])
+    left = np.concatenate([start, np.zeros(count)])
+    order: list[int] = []
+    while left_over:
+        inner, norm = left @ J[:, left_over], np.linalg.norm(J[:, left_over], axis=0)
+        share = np.where(norm > 1e-9, inner / np.maximum(norm, 1e-9), 0.0)
+        chosen = left_over.pop(int(np.argmax(np.abs(share))))
+        order.append(chosen)
+        direction = J[:, chosen] / max(float(np.sqrt(J[:, chosen] @ J[:, chosen])), 1e-9)
+        left -= direction * (direction @ left)
+        if left_over:
+            J[:, left_over] -= np.outer(direction, direction @ J[:, left_over])
+    return order
+
+
+def fewest(point: Point, order: Sequence[int], counts: Sequence[int]) -> tuple[int, Array]:
+    """How many of the first knobs leave hardly more than all, and the expected square that each
+    number leaves, linear about a point, [count]."""
+    squares = np.array([point.step(np.array(order[:n], dtype=np.int64))[1] for n in counts])
+    enough = np.flatnonzero(squares <= (1 + ENOUGH) * squares.min())
+    return counts[int(enough[0])], squares
+
+
+def rounded(problem: Problem, point: Point) -> Point:
+    """With settings that the devices' steps allow; the errors' derivatives stay."""
+    pairs = zip(problem.knobs, point.amounts.tolist(), strict=True)
+    amounts = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
+    return point if np.array_equal(amounts, point.amounts) else problem.at(amounts)
+
+
+def drawn(
+    estimate: Estimate, knobs: Sequence[Knob], targets: Targets | Threading, count: int, seed: int
+) -> Problem:
+    """The problem with draws from the posterior."""
+    random = np.random.default_rng(seed)
+    scaled = [
+        replace(knob, scale=estimate.calibrations.get(knob.members[0], 1.0))
+        if knob.kind in ("hcorrector", "vcorrector") and knob.members else knob
+        for knob in knobs
+    ]  # fmt: skip
+    return Problem(
+        estimate, tuple(scaled), targets, estimate.draw(count, random),
+        random.standard_normal((count, len(knobs))),
+        estimate.energy_error * random.standard_normal(count),
+    )  # fmt: skip

@@ -1,0 +1,285 @@
+"""What a correction is judged by: errors of the stored beam's optics from a goal, and derivatives.
+
+Everything comes from the stored beam at two RF frequencies, half a step above and below: orbit,
+betas, phases, tunes and coupling are their means; dispersion and chromaticity their differences,
+per the relative energy that the step makes in the design, as a control room measures them.
+
+>>> targets = Targets(design, {"beta_beating": 0.01})
+>>> errors = targets.errors(optics_of(model, targets.step))
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import Moved, StoredBeam
+from tmlattice.errors import TmlatticeError, unknown_choice
+from tmlattice.lattice import Ring
+from tmlattice.optics import short_way
+
+Array = NDArray[np.float64]
+Hypothesis = tuple[str, str | None]
+
+ENERGY = 1e-4
+"""Relative energy of the two stored beams: third orders are 1e-8 of the first."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One quantity that should be as in the goal.
+
+    Attributes:
+        words: what it is, with its plane where it has two.
+        unit: of its errors.
+        tolerance: rms error that counts as one; of the dispersion a share of the design's rms.
+        planes: what its last axis is: of its two columns each is reported.
+    """
+
+    words: str
+    unit: str
+    tolerance: float
+    planes: tuple[str, str]
+
+
+TARGETS: dict[str, Target] = {
+    "beta_beating": Target("beta beating", "relative", 0.01, ("x", "y")),
+    "phase_advance": Target("phase advance between BPMs", "2 pi", 1e-3, ("x", "y")),
+    "dispersion": Target("dispersion error", "m", 0.01, ("x", "y")),
+    "tunes": Target("tune error", "", 1e-3, ("x", "y")),
+    "chromaticity": Target("chromaticity error", "", 0.1, ("x", "y")),
+    "coupling": Target(
+        "coupling (amplitude in the other plane)", "relative", 0.01, ("x to y", "y to x")
+    ),
+    "closed_orbit": Target("closed orbit", "m", 1e-4, ("x", "y")),
+    "first_turn": Target("trajectory on the first two turns", "m", 1e-3, ("x", "y")),
+}
+"""The usual targets. One percent of beta beating comes with 1e-3 of phase advance; an amplitude of
+one percent in the other plane is an emittance ratio of 1e-4."""
+
+
+OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
+"""Targets that every estimated ring has."""
+THREADING = "first_turn"
+"""The target of a beam that is not stored: it is corrected alone."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Of a stored beam at the BPMs; or its derivatives, with an axis of hypotheses before.
+
+    Attributes:
+        orbit, beta, dispersion: m, [BPM, plane].
+        phase: at the BPMs, in turns, [BPM, plane].
+        tunes, chromaticity: [plane].
+        coupling: of each mode the amplitude in the other plane over that in its own, complex,
+            [BPM, mode].
+    """
+
+    orbit: Array
+    beta: Array
+    phase: Array
+    dispersion: Array
+    tunes: Array
+    chromaticity: Array
+    coupling: NDArray[np.complex128]
+
+
+class StoredOptics:
+    """Optics of a ring and their derivatives.
+
+    Args:
+        model: of the ring at its RF frequency, six coordinates.
+        step: relative change of the RF frequency for `ENERGY`, see `Targets.step`.
+
+    Raises:
+        UnstableRingError: no stored beam.
+    """
+
+    def __init__(self, model: ResponseModel, step: float) -> None:
+        self._beams = [
+            StoredBeam(model.at_frequency(model.frequency + side * step)) for side in (1, -1)
+        ]
+        self.values = _means([_shown(beam.shown, beam.shown) for beam in self._beams], value=True)
+        self.model, self.step = model, step
+
+    def moved(self, ring: Ring, frequency: float) -> "StoredOptics":
+        """Of a ring with other elements, at an RF frequency that differs by so much, relative."""
+        model = self.model.changed_to(ring)
+        if frequency:
+            model = model.at_frequency(model.frequency + frequency)
+        return StoredOptics(model, self.step)
+
+    @property
+    def per_energy(self) -> float:
+        """Relative change of the RF frequency for one of the energy."""
+        return 1 / float(self.model.rf_start[5])
+
+    def by_frequency(self) -> Optics:
+        """Change per relative change of the RF frequency, with an axis of one hypothesis."""
+        up, down = (
+            StoredOptics(
+                self.model.at_frequency(self.model.frequency + side * self.step), self.step
+            )
+            for side in (0.5, -0.5)
+        )
+        change = {f.name: getattr(up.values, f.name) - getattr(down.values, f.name)
+                  for f in fields(Optics)}  # fmt: skip
+        change["tunes"] = short_way(change["tunes"])
+        change["phase"] -= np.round(change["phase"])
+        return Optics(**{name: value[None] / self.step for name, value in change.items()})
+
+    def derivatives(self, hypotheses: Sequence[Hypothesis]) -> Optics:
+        """Change per unit of effects on the ring, [hypothesis, ...]."""
+        return _means(
+            [_shown(beam.moved(hypotheses), beam.shown, slope=True) for beam in self._beams]
+        )
+
+
+def _shown(moved: Moved, about: Moved, slope: bool = False) -> dict[str, np.ndarray]:
+    """Orbit, tunes, beta, phase and coupling of modes; of their change, about modes."""
+    own = about.modes[:, [0, 1], [0, 1]]  # [BPM, mode]
+    other = about.modes[:, [1, 0], [0, 1]]
+    found = {"orbit": moved.orbit, "tunes": moved.tunes}
+    if not slope:
+        phase = np.unwrap(np.angle(own), axis=0) / (2 * np.pi)
+        return found | {"beta": np.abs(own) ** 2, "phase": phase, "coupling": other / own}
+    d_own = moved.modes[..., [0, 1], [0, 1]]
+    ratio = d_own / own
+    return found | {
+        "beta": 2 * np.abs(own) ** 2 * ratio.real,
+        "phase": ratio.imag / (2 * np.pi),
+        "coupling": moved.modes[..., [1, 0], [0, 1]] / own - other / own * ratio,
+    }
+
+
+def _means(sides: Sequence[dict[str, np.ndarray]], value: bool = False) -> Optics:
+    above, below = sides
+    tunes = above["tunes"] - below["tunes"]
+    mean = {name: (above[name] + below[name]) / 2 for name in ("orbit", "beta", "coupling")}
+    if value:
+        tunes = short_way(tunes)
+        turned = above["phase"] - below["phase"]
+        phase = below["phase"] + (turned - np.round(turned)) / 2
+    else:
+        phase = (above["phase"] + below["phase"]) / 2
+    return Optics(
+        **mean,
+        phase=phase,
+        tunes=below["tunes"] + tunes / 2,
+        dispersion=(above["orbit"] - below["orbit"]) / (2 * ENERGY),
+        chromaticity=tunes / (2 * ENERGY),
+    )
+
+
+class Weighted:
+    """Targets that count, each in units of its tolerance.
+
+    Attributes:
+        names: of the targets, in the order of `TARGETS`.
+        tolerance: of these, in their units.
+        s: of their readings, m.
+    """
+
+    names: tuple[str, ...]
+    tolerance: dict[str, float]
+    s: Array
+
+    def rows(self, parts: Mapping[str, Array]) -> Array:
+        """Errors or changes of the targets that count, in units of their tolerances, so that the
+        square of all rows is the sum of mean squares, [..., row]."""
+        own = []
+        for name in self.names:
+            part = parts[name].reshape(*parts[name].shape[:-2], -1)
+            own.append(part / (self.tolerance[name] * np.sqrt(part.shape[-1])))
+        return np.concatenate(own, axis=-1)
+
+
+class Targets(Weighted):
+    """Errors of the optics from a goal, those that count in units of their tolerances.
+
+    Args:
+        goal: the ring whose optics are wanted.
+        wanted: names of `TARGETS`, with another tolerance where a mapping gives one.
+
+    Attributes:
+        names: of the targets that count, in the order of `TARGETS`.
+        tolerance: of these, in their units.
+        step: relative change of the RF frequency that changes the goal's energy by `ENERGY`.
+        goal: its optics.
+        s: of the BPMs, m.
+
+    Raises:
+        TmlatticeError: threading beside other targets.
+        ChoiceError: no such target.
+        UnstableRingError: the goal stores no beam.
+    """
+
+    def __init__(self, goal: Ring, wanted: Iterable[str] | Mapping[str, float | None]) -> None:
+        given = wanted if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
+        for name in given:
+            if name not in TARGETS:
+                raise unknown_choice("target", name, TARGETS)
+        if THREADING in given:
+            raise TmlatticeError(
+                f"'{THREADING}' is the target of a beam that is not stored; give it alone"
+            )
+        model = ResponseModel(goal)
+        self.s = np.array([monitor.s for monitor in goal.monitors])
+        self.step = ENERGY / float(model.rf_start[5])
+        self.goal = StoredOptics(model, self.step).values
+        self.names = tuple(name for name in TARGETS if name in given)
+        rms = float(np.sqrt(np.mean(self.goal.dispersion[:, 0] ** 2))) or 1.0
+        self.tolerance = {
+            name: given[name] or TARGETS[name].tolerance * (rms if name == "dispersion" else 1.0)
+            for name in self.names
+        }
+
+    def begin(self, ring: Ring, energy: float) -> StoredOptics:
+        """Optics of a ring whose beam has this energy beside the ring's, relative.
+
+        Raises:
+            UnstableRingError: it stores no beam.
+        """
+        model = ResponseModel(ring)
+        return StoredOptics(model.at_energy(energy) if energy else model, self.step)
+
+    def errors(self, optics: Optics) -> dict[str, Array]:
+        """Errors of all targets of a stored beam, [reading, plane] each, in their units."""
+        goal = self.goal
+        change = Optics(*(getattr(optics, f.name) - getattr(goal, f.name) for f in fields(goal)))
+        found = self._parts(change)
+        advance = found["phase_advance"]
+        found["phase_advance"] = advance - np.round(advance)
+        found["tunes"] = short_way(found["tunes"])
+        return found
+
+    def changes(self, derivatives: Optics) -> dict[str, Array]:
+        """The derivatives of `errors`, [hypothesis, reading, plane] each."""
+        return self._parts(derivatives)
+
+    def _parts(self, change: Optics) -> dict[str, Array]:
+        """Linear in a change of the optics."""
+        beta = self.goal.beta
+        across = np.sqrt(beta / beta[:, ::-1]) * change.coupling
+        return {
+            "beta_beating": change.beta / beta,
+            "phase_advance": np.diff(change.phase, axis=-2),
+            "dispersion": change.dispersion,
+            "tunes": change.tunes[..., None, :],
+            "chromaticity": change.chromaticity[..., None, :],
+            "coupling": np.concatenate([across.real, across.imag], axis=-2),
+            "closed_orbit": change.orbit,
+        }
+
+
+def rms_of(parts: Mapping[str, Array]) -> dict[str, Array]:
+    """Root mean square of each target's errors, [..., plane], in its unit; of the coupling the rms
+    of the complex amplitude."""
+    parted = {"coupling": 2.0}
+    return {
+        name: np.sqrt(parted.get(name, 1.0) * np.mean(part**2, axis=-2))
+        for name, part in parts.items()
+    }

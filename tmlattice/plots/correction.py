@@ -1,0 +1,40 @@
+"""The beta beating, or the first turns, of a ring now and after a correction."""
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+from tmlattice.correction.result import Correction
+from tmlattice.correction.targets import TARGETS
+from tmlattice.plots.readings import AFTER, BEFORE
+from tmlattice.plots.strip import lattice_strip
+
+CAPTION = "At the BPMs now, and expected after the correction, with 68 % bands."
+
+
+def plot_correction(correction: Correction, figure: Figure | None = None) -> Figure:
+    """The errors of the shown target at the BPMs now and expected, a panel a plane, the lattice
+    below.
+
+    Args:
+        correction: of `correct`.
+        figure: an empty one; else a new one.
+    """
+    if figure is None:
+        figure = plt.figure(figsize=(11, 5.2), layout="constrained")
+    *axes, strip = figure.subplots(3, 1, sharex=True, height_ratios=[3, 3, 1])
+    target = TARGETS[correction.shown]
+    scale, unit = (100.0, "%") if target.unit == "relative" else (1e3, "mm")
+    shown = [(correction.profile[0], BEFORE, "now")]
+    if not correction.refused:
+        shown.append((correction.profile[1], AFTER, "expected"))
+    for plane, ax in enumerate(axes):
+        for values, colour, label in shown:
+            middle, low, high = scale * values[:, plane].T
+            ax.plot(correction.s, middle, ".-", color=colour, lw=0.9, ms=4, label=label)
+            ax.fill_between(correction.s, low, high, color=colour, alpha=0.25, lw=0)
+        ax.axhline(0.0, color="k", lw=0.7)
+        ax.set_ylabel(f"{target.words} {'xy'[plane]} [{unit}]", fontsize="small")
+        ax.grid(alpha=0.25)
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    lattice_strip(correction.ring, strip)
+    return figure

@@ -1,0 +1,101 @@
+"""The sentences and rows of a correction: those of the terminal and of the page."""
+
+from tmlattice.correction.result import Correction, Setting
+from tmlattice.correction.targets import TARGETS
+from tmlattice.report.text import columns, wrapped
+
+MOST = 20
+"""Devices that are listed; the table has all."""
+
+
+def settings_head() -> list[str]:
+    """Of the settings' table."""
+    return ["device", "present", "new", "change", "unit", "limits", "gain"]
+
+
+def setting_row(setting: Setting) -> list[str]:
+    """Of the settings' table."""
+    knob = setting.knob
+    ends = ["" if abs(end) == float("inf") else f"{end:.6g}" for end in (knob.low, knob.high)]
+    limits = " to ".join(ends) if any(ends) else "-"
+    change = setting.new - knob.present
+    return [
+        knob.name, f"{knob.present:.6g}", f"{setting.new:.6g}", f"{change:+.3g}", knob.unit,
+        limits + (" (at its limit)" if setting.at_limit else ""),
+        f"{100 * setting.gain:.1f} %",
+    ]  # fmt: skip
+
+
+def setting_rows(correction: Correction) -> list[list[str]]:
+    """Of the settings' table, the first `MOST`."""
+    return [setting_row(own) for own in correction.settings[:MOST]]
+
+
+def expected_head() -> list[str]:
+    """Of the table of targets."""
+    return ["rms", "", "now", "expected", "68 %", "not reachable", "not determined"]
+
+
+def expected_rows(correction: Correction) -> list[list[str]]:
+    """Of the table of targets."""
+    rows = []
+    for name in correction.before:
+        target = TARGETS[name]
+        for plane in (0, 1):
+            now, *_ = correction.before[name][plane]
+            then, low, high = correction.after[name][plane]
+            reach, data = (own[plane] for own in correction.stays[name])
+            shown = [amount(name, value) for value in (now, then, low, high, reach, data)]
+            words = target.words + ("" if name in correction.counted else " (no target)")
+            rows.append([words, target.planes[plane], shown[0], shown[1],
+                         f"{shown[2]} to {shown[3]}", *shown[4:]])  # fmt: skip
+    return rows
+
+
+def amount(name: str, value: float) -> str:
+    """An error of a target with its unit."""
+    unit = TARGETS[name].unit
+    if unit == "relative":
+        return f"{100 * value:.3g} %"
+    if unit == "m":
+        return f"{1e3 * value:.3g} mm"
+    return f"{value:.2g}"
+
+
+def gain_head(correction: Correction) -> list[str]:
+    """Of the table of gains."""
+    return ["devices", *(TARGETS[name].words for name in correction.counted)]
+
+
+def gain_rows(correction: Correction) -> list[list[str]]:
+    """Devices, and the expected rms of each target with so many of them, the worse plane's."""
+    return [
+        [str(n), *(amount(name, max(own[name])) for name in correction.counted)]
+        for n, own in correction.gains
+    ]
+
+
+def correction_text(correction: Correction, width: int = 100) -> str:
+    """The whole report as plain text."""
+    lines = wrapped(correction.words, "", width)
+    if correction.settings:
+        lines += ["", *columns([settings_head(), *setting_rows(correction)])]
+        if len(correction.settings) > MOST:
+            lines += [f"and {len(correction.settings) - MOST} more (settings.csv)"]
+    lines += ["", *columns([expected_head(), *expected_rows(correction)])]
+    if correction.gains:
+        lines += ["", "Expected rms with the first devices:"]
+        lines += columns([gain_head(correction), *gain_rows(correction)])
+    for sentence in sentences(correction):
+        lines += ["", *wrapped(sentence, "", width)]
+    return "\n".join(lines)
+
+
+def sentences(correction: Correction) -> list[str]:
+    """The gain, its error, iterations and warnings."""
+    share, error = 100 * correction.gain, 100 * correction.gain_error
+    found = [] if correction.refused else [
+        f"Expected gain: {share:.3g} ± {error:.1g} % of the squared errors in units of their "
+        f"tolerances. Measurements and corrections that this ring needs: {correction.iterations}."
+    ]  # fmt: skip
+    return found + [f"Note: {text}." for text in correction.warnings]
