@@ -35,8 +35,17 @@ from tmlattice.diagnosis.response.judges import (
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.outliers import good_monitors, outliers, without
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
-from tmlattice.diagnosis.response.state import Outcome, State, allow, begin, bend, forbid, jump
-from tmlattice.diagnosis.response.weights import with_waves
+from tmlattice.diagnosis.response.state import (
+    WAVED,
+    Outcome,
+    State,
+    allow,
+    begin,
+    bend,
+    forbid,
+    jump,
+)
+from tmlattice.diagnosis.response.weights import used, with_waves
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import solve
 from tmlattice.observe.response_data import ResponseData
@@ -210,12 +219,15 @@ def _validated(state: State, refused: list[Step], progress: Callable[[str], Any]
     correctors do not object, for waves absorb what gradients should explain; and without late
     families that inner correctors reject."""
     progress("validation")
-    more = settle(with_waves(state), gain=LEADS)
-    rise = lost(inner(state), inner(more), CORRECTORS)
-    gained = log_evidence(more) - log_evidence(state)
-    log.info("waves: evidence %+.1f, validation %+.3f +- %.3f", gained, *rise)
-    if gained > WORTH and not against(rise):
-        state = more
+    for block in (1, 0):
+        if not used(state, block).any():
+            continue
+        more = settle(with_waves(state, block), gain=LEADS)
+        rise = lost(inner(state), inner(more), CORRECTORS)
+        gained = log_evidence(more) - log_evidence(state)
+        log.info("%s: evidence %+.1f, validation %+.3f +- %.3f", WAVED[block], gained, *rise)
+        if gained > WORTH and not against(rise):
+            state = more
     for family in [own for own in state.families if own.name in SECOND]:
         if not state.values[family.variable].any():
             continue

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.state import WAVED, State
 from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.diagnosis.response.weights import FREEDOM, used
 from tmlattice.measurement import OrbitResponse
@@ -382,8 +382,10 @@ def common_modes(state: State) -> list[str]:
     """What all readings of a step have in common, where that is more than their noise."""
     noise, data = state.noise, state.data
     moved = []
-    for plane in (0, 1) if "waves" in noise.kinds else ():
-        blocks = [block for block in (0, 1) if used(state, block).any()]
+    for plane in (0, 1):
+        blocks = [
+            block for block in (0, 1) if WAVED[block] in noise.kinds and used(state, block).any()
+        ]
         waves = noise.waves.shape[1]
         rms = max((float(noise.scale[b, plane, 0]) * np.sqrt(waves) for b in blocks), default=0.0)
         if rms > float(np.median(data.noise[:, plane])):

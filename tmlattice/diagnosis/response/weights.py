@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.state import DRIFT, KINDS, PLACE, State
+from tmlattice.diagnosis.response.state import DRIFT, KINDS, PLACE, WAVED, State
 from tmlattice.inference.common import amounts, beside, common
 from tmlattice.inference.priors import Group
 
@@ -34,6 +34,8 @@ LEAST = 0.05
 """Of the noise: the misfit of a column at least."""
 DAMPING = 0.7
 """Share of a step of the misfits that is taken: columns and monitors would else take turns."""
+STEPS = 5
+"""Steps of a plane whose waves say how large a jitter is."""
 MEDIAN_SQUARE = 0.455
 """Median of chi-square of one degree of freedom."""
 
@@ -74,7 +76,7 @@ def patterns(state: State, block: int) -> Array:
     data, at, noise = state.data, state.at, state.noise
     plane = data.plane_of(block)
     out = np.zeros((data.shape[0], noise.size.shape[2], data.shape[1]))
-    if "waves" in noise.kinds:
+    if WAVED[block] in noise.kinds:
         out[:, KINDS["waves"]] = noise.waves[plane]
     if "drift" in noise.kinds:
         out[:, KINDS["drift"]] = at.seen(at.beam)[-1].T[plane][:, None]
@@ -82,13 +84,23 @@ def patterns(state: State, block: int) -> Array:
         kicks = data.kicks * (1 + at.errors.calibration)
         out[:, KINDS["place"]] = (data.pick(at.seen(at.jumps)) * kicks[:, None])[:, None]
     out *= noise.size[block][:, :, None]
-    # the RF's orbit is one: what is common to it is its own, but for a jitter of the beam, which
-    # readings across show best
+    # the RF's orbit is one: what is common to it is its own, but for a jitter of the beam
     out[-1] = 0.0
-    if "waves" in noise.kinds:
-        read = plane[-1]
-        out[-1, KINDS["waves"]] = noise.waves[read] * noise.scale[1, read, 0]
+    read = plane[-1]
+    out[-1, KINDS["waves"]] = noise.waves[read] * _jitter(state, read)
     return out
+
+
+def _jitter(state: State, read: int) -> float:
+    """rms amount of each wave of a jitter in a plane, m: waves of steps of either plane have it,
+    and what the model lacks of these steps besides."""
+    noise = state.noise
+    sizes = [
+        float(noise.scale[block, read, 0]) if WAVED[block] in noise.kinds else 0.0
+        for block in (0, 1)
+        if (state.fitted & (state.data.plane_of(block) == read)).sum() >= STEPS
+    ]
+    return min(sizes, default=0.0)
 
 
 def taken(state: State, block: int) -> Array:
@@ -153,31 +165,35 @@ def learnt(state: State, spent: dict[int, Spent], alike: bool = False) -> State:
     return replace(state, noise=replace(new, column=column, monitor=monitor))
 
 
-def with_waves(state: State) -> State:
+def with_waves(state: State, block: int) -> State:
     """With waves of the orbit in each step, as large as least squares of what the fit leaves makes
-    them: beside misfits that have learnt them they would stay at nothing."""
+    them: beside misfits that have learnt them they would stay at nothing.
+
+    Args:
+        state: without.
+        block: of the steps that have some.
+    """
     old = state.noise
     noise = replace(
-        old, kinds=(*old.kinds, "waves"), column=old.column.copy(), size=old.size.copy(),
+        old, kinds=(*old.kinds, WAVED[block]), column=old.column.copy(), size=old.size.copy(),
         scale=old.scale.copy(),
     )  # fmt: skip
-    for block in (0, 1):
-        use, plane = used(state, block), state.data.plane_of(block)
-        left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-        amounts = np.full((len(use), noise.waves.shape[1]), np.nan)
-        for c in np.flatnonzero(use.sum(axis=1) > 2 * noise.waves.shape[1])[:-1]:
-            seen = use[c]
-            modes = noise.waves[plane[c]][:, seen].T
-            amounts[c] = np.linalg.lstsq(modes, left[c, seen], rcond=None)[0]
-            rest = np.sum((left[c, seen] - modes @ amounts[c]) ** 2) / (seen.sum() - modes.shape[1])
-            square = rest - np.mean(state.data.noise_of(block)[c, seen] ** 2)
-            noise.column[block, c] = min(noise.column[block, c], max(square, _floor(state)))
-        for read in (0, 1):
-            own = amounts[plane == read]
-            own = own[np.isfinite(own[:, 0])]
-            if len(own):
-                noise.scale[block, read, 0] = float(np.sqrt(np.mean(np.median(own**2, axis=0))))
-            noise.size[block, plane == read, KINDS["waves"]] = noise.scale[block, read, 0]
+    use, plane = used(state, block), state.data.plane_of(block)
+    left = np.where(use, state.data.pick(state.at.left, block), 0.0)
+    likely = np.full((len(use), noise.waves.shape[1]), np.nan)
+    for c in np.flatnonzero(use[:-1].sum(axis=1) > 2 * noise.waves.shape[1]):
+        seen = use[c]
+        modes = noise.waves[plane[c]][:, seen].T
+        likely[c] = np.linalg.lstsq(modes, left[c, seen], rcond=None)[0]
+        rest = np.sum((left[c, seen] - modes @ likely[c]) ** 2) / (seen.sum() - modes.shape[1])
+        square = rest - np.mean(state.data.noise_of(block)[c, seen] ** 2)
+        noise.column[block, c] = min(noise.column[block, c], max(square, _floor(state)))
+    for read in (0, 1):
+        own = likely[plane == read]
+        own = own[np.isfinite(own[:, 0])]
+        if len(own):
+            noise.scale[block, read, 0] = float(np.sqrt(np.mean(np.median(own**2, axis=0))))
+        noise.size[block, plane == read, KINDS["waves"]] = noise.scale[block, read, 0]
     return replace(state, noise=noise)
 
 
@@ -204,7 +220,7 @@ def _learn_modes(
         for kind, (name, which) in enumerate(KINDS.items()):
             own = np.ix_(mine, there[which])
             now = noise.size[block][own]
-            if not now.size or name not in noise.kinds:
+            if not now.size or (WAVED[block] if name == "waves" else name) not in noise.kinds:
                 continue
             group = Group(
                 name, np.eye(now.size), noise.scale[block, read, kind],
