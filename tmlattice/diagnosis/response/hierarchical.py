@@ -219,7 +219,7 @@ def _validated(state: State, refused: list[Step], progress: Callable[[str], Any]
     correctors do not object, for waves absorb what gradients should explain; and without late
     families that inner correctors reject."""
     progress("validation")
-    for block in (1, 0):
+    for block in (1,):
         if not used(state, block).any():
             continue
         more = settle(with_waves(state, block), gain=LEADS)
