@@ -117,6 +117,7 @@ def test_a_supply_of_magnets_with_names_of_their_own(small_ring, before, after, 
     assert weaker["QD_a3"].k1 == ring["QD_a3"].k1
 
 
+@pytest.mark.slow
 def test_a_supply_of_magnets_that_are_alike_in_the_design_alone(
     small_ring, before, after, change, tmp_path
 ):
@@ -150,6 +151,7 @@ def crowded(small_ring):
     return machine(small_ring, changes, seed=2)
 
 
+@pytest.mark.slow
 def test_single_magnets_do_not_hide_a_small_change_of_their_supply(small_ring, before, crowded):
     """They had counted as what magnets of a supply scatter by: 8e-4, which hid it, and was in the
     error of every amount."""
@@ -163,6 +165,7 @@ def test_single_magnets_do_not_hide_a_small_change_of_their_supply(small_ring, b
         assert own.amount_sigma < 3e-4
 
 
+@pytest.mark.slow
 def test_a_limit_of_findings_does_not_make_the_others_scatter(small_ring, before, crowded):
     few = diagnose(small_ring, crowded, reference=before, max_effects=1)
     (own,) = few.findings
@@ -170,6 +173,7 @@ def test_a_limit_of_findings_does_not_make_the_others_scatter(small_ring, before
     assert own.amount_sigma < 3e-4
 
 
+@pytest.mark.slow
 def test_the_largest_drift_is_no_finding(small_ring, before):
     """A gain that changed by 0.6 %, where nobody else did, explained all that differs."""
     drift = Cause("monitor_gain_y", "bpm::6", 0.006)
@@ -295,6 +299,7 @@ def test_monitors_and_correctors_of_one_measurement_alone_do_no_harm(small_ring,
     assert any(before.monitors[0].casefold() in said for said in result.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("days", ["after", "both"])
 @pytest.mark.parametrize("gone", ["y of every other monitor", "x", "across"])
 def test_a_plane_that_is_not_read_takes_nothing_of_the_other(small_ring, before, after, gone, days):

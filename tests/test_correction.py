@@ -14,7 +14,7 @@ from tmlattice import correct, diagnose, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
 from tmlattice.correction.applied import applied, read_settings
-from tmlattice.correction.estimate import estimate_with
+from tmlattice.correction.estimate import estimate_with, read_estimate
 from tmlattice.correction.knobs import write_knobs
 from tmlattice.diagnosis.twin import known_document
 from tmlattice.effects import Cause, apply, find
@@ -25,6 +25,7 @@ from tmlattice.lattice import save_ring, write_ring
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
+from tmlattice.observe.calibration import write_calibration
 
 NO_ORBIT = ("beta_beating", "phase_advance", "dispersion", "tunes")
 
@@ -379,10 +380,28 @@ def test_diagnose_states_the_correction(small_ring, tmp_path):
     rows = {r["device"]: r for r in csv.DictReader((tmp_path / "out" / "settings.csv").open())}
     k1 = small_ring["QD::0"].k1
     assert float(rows["QD"]["new"]) == pytest.approx(k1 / 1.01, rel=1e-3)
-    again = CliRunner().invoke(tmlattice, ["correct", str(tmp_path / "out"), "--design",
-                                           str(tmp_path / "design.json")])  # fmt: skip
+    again = CliRunner().invoke(tmlattice, [
+        "correct", str(tmp_path / "out"), "--design", str(tmp_path / "design.json"), "--json",
+        str(tmp_path / "again.json"),
+    ])  # fmt: skip
     assert again.exit_code == 0, again.output
-    assert "QD" in again.output
+    # from the files the same answer: nothing that widens an interval is lost on the way
+    first, second = (
+        json.loads(path.read_text())
+        for path in (tmp_path / "out" / "correction.json", tmp_path / "again.json")
+    )
+    for part in ("before", "after"):
+        for name, planes in first[part].items():
+            np.testing.assert_allclose(second[part][name], planes, rtol=1e-4, atol=1e-9)
+
+
+def test_an_energy_is_as_uncertain_in_the_files_as_in_the_diagnosis(small_ring, tmp_path):
+    path, energy = tmp_path / "found.json", Cause("energy_offset", None, 1e-3)
+    save_ring(small_ring, path)
+    errors = {("energy_offset", None): 2e-4}
+    write_calibration(tmp_path / "found.json.calibration.json", [energy], errors=errors)
+    estimate, _ = read_estimate(path, small_ring, small_ring)
+    assert (estimate.energy, estimate.energy_error) == (1e-3, 2e-4)
 
 
 def test_applied_settings_have_a_calibration(small_ring, tmp_path):

@@ -29,7 +29,7 @@ SETTINGS = [
 class Base:
     """A measurement of petra3 with its launches fitted."""
 
-    def __init__(self, ring, causes, settings=SETTINGS, background=False, seed=2, **options):
+    def __init__(self, ring, causes, settings=SETTINGS, seed=2, **options):
         simulation = simulate(
             ring,
             causes,
@@ -42,15 +42,7 @@ class Base:
         self.data = of_measurement(ring, simulation.measurement())
         self.model = Model(ring, self.data.settings)
         self.hypotheses = [h for h in self.model.hypotheses() if h[0] != "monitor_dead"]
-        spread = None
-        if background:
-            alone = FirstTurns(model=self.model, data=self.data, places={})
-            plain = fit(alone, (), self.data.launches)
-            some = [
-                h for h in self.hypotheses if h[0] in ("quadrupole_gradient", "monitor_offset_x")
-            ]
-            spread = 1e-4 * self.model.signatures(plain.point.view, some, plain.nuisances)
-        self.problem = FirstTurns(model=self.model, data=self.data, places={}, spread=spread)
+        self.problem = FirstTurns(model=self.model, data=self.data, places={})
         self.whitening = self.problem.whitening
         self.fit = fit(self.problem, (), self.data.launches)
         self.metric = self.problem.metric(self.fit.point)
@@ -70,15 +62,8 @@ def base(petra3):
     return Base(petra3, [Cause("quadrupole_gradient", "qd::12", -0.05)])
 
 
-@pytest.fixture(scope="module")
-def dense(petra3):
-    return Base(petra3, [Cause("quadrupole_gradient", "qd::12", -0.05)], background=True)
-
-
-@pytest.mark.parametrize("kind", ["base", "dense"])
-def test_sums_behind_each_place_equal_explicit_signatures(kind, request):
+def test_sums_behind_each_place_equal_explicit_signatures(base):
     """The fast scan of every effect against its signatures written out, settings included."""
-    base = request.getfixturevalue(kind)
     found = base.scan(effective=1000.0)
     random = np.random.default_rng(3)
     chosen = [
@@ -101,9 +86,7 @@ def test_sums_behind_each_place_equal_explicit_signatures(kind, request):
     assert np.count_nonzero(found.information[chosen]) > 50
 
 
-@pytest.mark.parametrize("kind", ["base", "dense"])
-def test_free_kicks_and_free_monitors_equal_explicit_least_squares(kind, request):
-    base = request.getfixturevalue(kind)
+def test_free_kicks_and_free_monitors_equal_explicit_least_squares(base):
     kicks = scanning.scan_kicks(base.metric, [5, 700, 1400], base.fit.residual)
     clean = base.fit.projection.out(base.fit.residual)
     for i, layer in enumerate([5, 700, 1400]):

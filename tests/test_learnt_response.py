@@ -90,6 +90,7 @@ def test_a_response_says_that_it_does_not_start_from_what_is_known(tmp_path):
     assert "--reference" in said
 
 
+@pytest.mark.slow
 def test_a_challenge_whose_machine_was_learnt(tmp_path):
     some = {"lattice": str(SMALL), "effects": ["quadrupole_gradient"], "amount": 0.02, "seed": 101}
     make("B", 1, folder=tmp_path, learnt=True, progress=False, **some)

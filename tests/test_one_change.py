@@ -247,12 +247,14 @@ def test_a_change_is_seen_beside_one_that_nearly_explains_it(
         assert own.amount_sigma < 0.15 * abs(own.amount)
 
 
+@pytest.mark.slow
 def test_a_limit_of_findings_is_none_of_causes(small_ring, before, after_both):
     (own,) = diagnose(small_ring, after_both, reference=before, max_effects=1).findings
     assert (own.effect, own.element) == ("family_gradient", "QF")
     assert abs(own.amount - 6e-4) < 4 * own.amount_sigma
 
 
+@pytest.mark.slow
 def test_what_a_large_change_makes_of_what_is_open_is_no_change(small_ring, before):
     """The dipole field of a bend was one, five of its errors off zero."""
     changes = {("family_gradient", "QF"): 2e-2, ("quadrupole_gradient", "QD::5"): -8e-3}

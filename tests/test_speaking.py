@@ -214,7 +214,8 @@ def test_what_a_room_names_above_itself_is_there():
     """A method in words, of every class of the package."""
     seen = set()
     for module in pkgutil.walk_packages(tmlattice.__path__, "tmlattice."):
-        if ".lattices" in module.name or module.name.endswith("__main__"):
+        # sweeps on a card need Triton, and have no such classes
+        if ".lattices" in module.name or module.name.endswith(("__main__", ".kernels", ".cuda")):
             continue
         for own in vars(importlib.import_module(module.name)).values():
             if isinstance(own, Method):

@@ -147,11 +147,13 @@ def _sources(estimated: Path) -> tuple[Path, str | None]:
     """The estimated lattice's file, and the design where a diagnosis names it.
 
     Raises:
-        MeasurementError: a diagnosis that wrote no estimated lattice.
+        MeasurementError: no such file, or a diagnosis that wrote no estimated lattice.
     """
     from tmlattice.errors import MeasurementError
     from tmlattice.input_files import json_of
 
+    if not estimated.exists():
+        raise MeasurementError(f"'{estimated}' is not there; check the path")
     document = estimated / "diagnosis.json" if estimated.is_dir() else estimated
     if document.name != "diagnosis.json":
         return estimated, None

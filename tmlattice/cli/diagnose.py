@@ -4,6 +4,7 @@ import logging
 import warnings
 from contextlib import ExitStack
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -353,7 +354,11 @@ def _write_rings(
         written[str(lattice_out)] = write_ring(ring, lattice_out)
         beside = calibration_beside(lattice_out)
         if result.calibration or result.by_steps:
-            write_calibration(beside, result.calibration, result.dispersion, result.rejected)
+            amounts = zip(result.causes, result.errors, strict=True)
+            errors = {(c.effect, c.element): e for c, e in amounts if isfinite(e)}
+            write_calibration(
+                beside, result.calibration, result.dispersion, result.rejected, errors
+            )
             written[str(beside)] = ()
         else:  # that of the ring which stood there
             beside.unlink(missing_ok=True)

@@ -17,12 +17,7 @@ from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError
 from tmlattice.inference.among import Known
 from tmlattice.lattice import Ring
-from tmlattice.observe.calibration import (
-    Dispersion,
-    offset_of,
-    read_calibration,
-    read_dispersion,
-)
+from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
@@ -159,6 +154,6 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
         said = (f"'{beside.name}' is not there: the estimated ring is taken as certain",)
     found = estimate_with(ring, settings, read_known(beside, ring) if not said else None)
     if calibration.is_file():
-        energy = offset_of(read_calibration(calibration, ring))
-        found = found.beside(read_dispersion(calibration, ring), energy)
+        energy = read_energy(calibration, ring)
+        found = found.beside(read_dispersion(calibration, ring), *energy)
     return found, said

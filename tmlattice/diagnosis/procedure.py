@@ -170,9 +170,15 @@ def diagnose_together(
         first, _ = problem.reference(problem.first)
         earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
         sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
+    small = sought_out.small
+    if noisy and problem.alone and small is not None:  # with the noise that was learnt
+        assert isinstance(small.plain, Together)
+        problem = small.plain
+        own = zip(parts, problem.parts, strict=True)
+        parts = [replace(part, problem=learnt) for part, learnt in own]
     progress("report")
     return _told(
-        ring, parts, problem, sought_out.explanation, sought_out.small, how,
+        ring, parts, problem, sought_out.explanation, small, how,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
             "options": {

@@ -510,5 +510,7 @@ def sizes_of(
     launch = directions[:, np.abs(directions).max(axis=0) > 0]
     size = np.linalg.norm(launch, axis=0)
     basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(residual), 0))
-    families = [rows[belongs == k] for k in range(belongs.max() + 1)]
-    return learn_sizes(residual, basis, families, noise)
+    there = basis.any(axis=1)  # nobody read the others, which have no noise
+    there = np.any(noise, axis=0) | there if noise else np.ones_like(there)
+    families = [rows[belongs == k][:, there] for k in range(belongs.max() + 1)]
+    return learn_sizes(residual[there], basis[there], families, [part[there] for part in noise])

@@ -86,6 +86,19 @@ def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
     return found
 
 
+def read_energy(path: str | Path, ring: Ring) -> tuple[float, float]:
+    """The relative deviation of the beam's mean energy in a calibration file, and its standard
+    error, 0 where the file does not state one.
+
+    Raises:
+        MeasurementError: no such file, or not a calibration of this ring.
+    """
+    amount = offset_of(read_calibration(path, ring))
+    rows = read_document(Path(path), "calibration", FORMAT)["effects"]
+    sigmas = [row.get("sigma", 0.0) for row in rows if row["effect"] == "energy_offset"]
+    return amount, float(np.linalg.norm(sigmas))
+
+
 def read_rejected(path: str | Path, ring: Ring) -> list[Channel]:
     """The channels of which a calibration file lets nothing be predicted; empty if it names none.
 
@@ -108,6 +121,7 @@ def write_calibration(
     causes: Iterable[Cause],
     dispersion: Dispersion | None = None,
     rejected: Iterable[Channel] = (),
+    errors: Mapping[Channel, float] | None = None,
 ) -> None:
     """Write a calibration file: whole, or not at all.
 
@@ -116,6 +130,7 @@ def write_calibration(
         causes: effects on monitors, correctors and the beam.
         dispersion: beside that of the lattice.
         rejected: channels that the fit rejected.
+        errors: standard errors of the amounts, by effect and element, where they are known.
 
     Raises:
         EffectError: an effect that is no calibration.
@@ -123,9 +138,13 @@ def write_calibration(
     """
     from tmlattice import __version__
 
-    causes = list(causes)
+    causes, errors = list(causes), errors or {}
     _check(causes)
-    effects = [{"effect": c.effect, "element": c.element, "amount": c.amount} for c in causes]
+    effects = [
+        {"effect": c.effect, "element": c.element, "amount": c.amount}
+        | ({"sigma": errors[c.effect, c.element]} if (c.effect, c.element) in errors else {})
+        for c in causes
+    ]
     document = {"format": FORMAT, "version": 1, "package": __version__, "effects": effects}
     if dispersion:
         document["dispersion"] = [
