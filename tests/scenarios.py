@@ -477,7 +477,7 @@ RESPONSES = (
         small=GRADIENTS,
         found=(),
         verdicts=MANY,
-        says=("vertical_focusing",),
+        says=("vertical_focusing|vertical focusing",),
         lasts=True,
     ),
     Scenario(
@@ -503,7 +503,7 @@ RESPONSES = (
         found=(),
         verdicts=MANY | ONE,
         others=1,
-        says=("energy_offset",),
+        says=("energy_offset|energy deviation",),
         lasts=True,
     ),
     Scenario(

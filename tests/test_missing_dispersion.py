@@ -23,8 +23,8 @@ from tmlattice.diagnosis.families.dispersion import (
     patterns_of_kicks,
 )
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.dense import fit_steps
+from tmlattice.diagnosis.families.steps import FAMILIES
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.state import begin
@@ -46,7 +46,7 @@ from tmlattice.observe.split import split_columns
 
 STEP = -2000.0
 """Hz."""
-WITHOUT = [step for step in STEPS if not isinstance(step.families[0], HorizontalKicks)]
+WITHOUT = [own for own in FAMILIES if not isinstance(own, HorizontalKicks)]
 
 
 def simulated(ring, causes, **how):
@@ -71,7 +71,7 @@ def with_kicks(ring, measured, more):
 def state_of(ring, measured, fit):
     data = response_data(ring, measured)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
+    return fit_families(data, split, WITHOUT).state if fit else begin(data, split)
 
 
 @pytest.fixture(scope="module")
@@ -138,9 +138,9 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
     causes, plain, kicked = measured
     amounts = {cause.element: cause.amount for cause in causes}
     missed, said = [], []
-    for own, steps in ((plain, STEPS), (kicked, STEPS), (kicked, WITHOUT)):
+    for own, steps in ((plain, FAMILIES), (kicked, FAMILIES), (kicked, WITHOUT)):
         data = response_data(small_ring, own)
-        fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
         true = [amounts[name] for name in QuadrupoleGradient().places(data)]
         missed.append(np.std(fit.state.values["gradient"] - true))
         said.append(len(list(dispersion_by_kicks(fit.state.values, data))))

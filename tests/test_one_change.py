@@ -8,15 +8,14 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.families.steps import CHANGES, STEPS
+from tmlattice.diagnosis.families.steps import CHANGES, FAMILIES
 from tmlattice.diagnosis.response import few
 from tmlattice.diagnosis.response.before_after import ANY
-from tmlattice.diagnosis.response.dense import one_by_one
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, and_orbits, left_open, strongest
 from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.one_change import OneChange, _Line, _peaks
 from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.diagnosis.response.what_changed import what_changed
 from tmlattice.effects import Cause, find
@@ -52,7 +51,7 @@ def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
     data = response_data(small_ring, before)
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    *_, (_, state) = one_by_one(begin(data, split), STEPS)
+    state = settle(jump(allow(begin(data, split), FAMILIES)))
     return state
 
 
@@ -73,9 +72,8 @@ def crowded_change(small_ring, before, fitted):
     data = response_change(first, ring_alone, second)
     split = split_columns(data, 0.2, np.random.default_rng(0))
     state = begin(data, split)
-    for _, settled in one_by_one(replace(state, exploring=False, guessed=ANY), CHANGES):
-        state = settled
-    return settle(state)
+    state = allow(replace(state, exploring=False, guessed=ANY), CHANGES)
+    return settle(settle(jump(state), alike=True))
 
 
 def chi2_per_reading(state):

@@ -96,7 +96,7 @@ class Assessment:
         closed, interval: share of the gap that is closed, and its 95 % interval.
         series: rms of the held-out readings of each model, and what the last one expects, m; empty
             without small errors.
-        families: whether families of errors were fitted step by step.
+        families: whether families of errors were fitted.
         rejected: families that were tried and are not in the result.
         small_errors: whether small errors everywhere are in the model.
         reference: whether a reference measurement was given.

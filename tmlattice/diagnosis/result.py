@@ -25,7 +25,7 @@ from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
 if TYPE_CHECKING:
-    from tmlattice.diagnosis.response.dense import Step
+    from tmlattice.diagnosis.response.hierarchical import Step
     from tmlattice.diagnosis.response.inconsistencies import Inconsistency
     from tmlattice.diagnosis.response.missing import Weighed
     from tmlattice.diagnosis.response.reasons import Reasons
@@ -212,14 +212,14 @@ class Diagnosis(ShownDiagnosis):
         errors: standard error of each one's amount, the same length.
         view: what figures need; it says what was measured.
         steps: of a dense fit, those kept; the first is the design's, the last the result's.
-        refused: those that did not help.
+        rejected_steps: families that are closed, with the figures with them.
         bad_monitors: names of those left out.
         priors: rms of small errors, as the data have them or as they were told, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
             see the family.
         degenerate: what the data alone do not settle, in words.
         reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
-        pulled_apart: what the RF's orbit and the correctors' responses disagree about, or None.
+        inconsistencies: what the RF's orbit and the correctors' responses disagree about, or None.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: where to look first for a fault that was not detected.
         dispersion: beside that of the ring as found, for `write_calibration`.
@@ -315,7 +315,7 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def by_steps(self) -> bool:
-        """Whether families of errors were fitted step by step, as to an orbit response."""
+        """Whether families of errors were fitted, as to an orbit response."""
         return isinstance(self.view, ResponseView)
 
     @property

@@ -1,10 +1,10 @@
-"""What only a dense fit has to say: its steps, its errors, what may be missing."""
+"""What only a hierarchical fit reports: held-out figures, errors, what may be missing."""
 
 from collections.abc import Iterable
 
 import numpy as np
 
-from tmlattice.diagnosis.response.dense import Step
+from tmlattice.diagnosis.response.hierarchical import Step
 from tmlattice.diagnosis.response.reasons import Reason
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import Support
@@ -258,7 +258,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
     lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
     if result.rejected_steps:
-        lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
+        lines += ["", "Closed, for held-out readings are worse with them, or no beam has so much:"]
         lines += columns([HEAD, *step_rows(result.rejected_steps)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.reasons is not None:

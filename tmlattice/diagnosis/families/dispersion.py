@@ -147,7 +147,7 @@ class VerticalKicks(_Kicks):
 
 
 def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
-    """A sentence for each plane in which the RF's orbit has something that no gradient makes.
+    """A sentence for each plane in which the RF's orbit has more than noise that no gradient makes.
 
     Args:
         values: that were found, by variable.
@@ -155,8 +155,8 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
     """
     for family, gradient in ((HorizontalKicks(), "gradient"), (VerticalKicks(), "skew gradient")):
         own = values.get(family.variable, np.zeros(0))
-        if own.any():
-            size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2))
+        size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2)) if own.any() else 0.0
+        if size > np.median(data.noise[:, family.plane]):
             yield (
                 f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} no {gradient} "
                 "makes: kicks of the closed orbit do (errors of bends, displaced quadrupoles, "

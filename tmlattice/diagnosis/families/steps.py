@@ -2,13 +2,13 @@
 
 To add one, write a class with its places, prior, rows, how its values are put among the errors and
 how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`, of the
-beam's energies in `energy`); and name it in `STEPS`, which says when it is tried.
+beam's energies in `energy`); and name it in `FAMILIES`.
 
 Families that move the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,46 +202,19 @@ class CorrectorRoll(_Columns):
         return self._told(errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data)
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Families that are tried together.
+FAMILIES: tuple[Family, ...] = (
+    CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), BendGradient(),
+    VerticalFocusing(), EdgeFocusing(), CorrectorPosition(), EnergySpread(), MonitorRoll(),
+    CorrectorRoll(), SkewGradient(), HorizontalKicks(), EnergyOffset(), VerticalKicks(),
+)  # fmt: skip
+"""What a ring may have wrong. All of them are open from the start, but for those of `SECOND`."""
 
-    Attributes:
-        families: the first one's block says who judges.
-        own, across: rounds in-plane, and before them rounds of the other plane.
-    """
+SECOND = ("energy_offset", "energy_spread", "horizontal kicks", "vertical kicks")
+"""Names of families of second order, or of one orbit: they are opened once the others have settled,
+for far from the ring they make up for what is not their own."""
 
-    families: tuple[Family, ...]
-    own: int
-    across: int
-
-
-STEPS = (
-    Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
-    Trial((MonitorGain(),), 2, 0),
-    Trial((QuadrupoleGradient(),), 4, 0),
-    Trial((BendGradient(),), 2, 0),
-    Trial((VerticalFocusing(),), 2, 0),
-    Trial((EdgeFocusing(),), 2, 0),
-    Trial((CorrectorPosition(),), 2, 0),
-    Trial((EnergySpread(),), 2, 0),
-    Trial((MonitorRoll(),), 0, 1),
-    Trial((CorrectorRoll(),), 0, 1),
-    Trial((SkewGradient(),), 2, 2),
-    Trial((HorizontalKicks(),), 2, 0),
-    Trial((EnergyOffset(),), 2, 0),
-    Trial((VerticalKicks(),), 0, 2),
-)
-"""What is tried, one after another. Skew gradients move the tunes to second order, which the
-gradients then take back. A beam off its energy has another dispersion: it comes in once that has
-what else may be wrong with it."""
-
-CHANGES = (
-    Trial((CorrectorCalibration(),), 3, 0),
-    Trial((MonitorGain(),), 2, 0),
-    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()), 4, 0),
-    Trial((MonitorRoll(),), 0, 1),
-    Trial((CorrectorRoll(),), 0, 1),
-    Trial((SkewGradient(),), 2, 2),
-)
+CHANGES: tuple[Family, ...] = (
+    CorrectorCalibration(), MonitorGain(), FamilyGradient(), QuadrupoleGradient(), OtherGradient(),
+    FocusingChange(), MonitorRoll(), CorrectorRoll(), SkewGradient(),
+)  # fmt: skip
 """What may have changed between two measurements of one ring."""

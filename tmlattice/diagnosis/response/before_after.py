@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, kicks_astray
 from tmlattice.diagnosis.families.energy import EnergyOffset
-from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.family import Family, Told
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
+from tmlattice.diagnosis.families.steps import CHANGES, FAMILIES
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,
@@ -35,16 +35,16 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.dense import DenseFit, Step, fit_steps, one_by_one
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
 from tmlattice.diagnosis.response.exchanged_since import all_right, since
 from tmlattice.diagnosis.response.few import Few, few_causes, knows_more
+from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, Step, fit_families
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import LeftOpen, and_orbits, left_open
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
+from tmlattice.diagnosis.response.procedure import as_diagnosis, families_of, provenance
 from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.state import State, begin, bend, jump
+from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
 from tmlattice.diagnosis.response.unnamed import unnamed
 from tmlattice.diagnosis.response.what_changed import MOST, REPRODUCED, what_changed
 from tmlattice.diagnosis.result import Diagnosis
@@ -109,7 +109,7 @@ def diagnose_change(
         UnstableRingError: no closed orbit.
     """
     started = time.perf_counter()
-    trials = trials_of(effects, CHANGES)
+    families = families_of(effects, CHANGES)
     before, after = (mended(ring, one, assume) for one in (before, after))
     said = consulted(ring, after, reference=before)
     said += _lost(before, after)
@@ -118,13 +118,13 @@ def diagnose_change(
     said += assumed_of(after, second)
     same = _same(first, second)
     if same:
-        trials = []
+        families = []
         said.append("the two measurements are the same, to the last digit")
     before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    steps = () if same else STEPS
-    fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
+    open_families = () if same else FAMILIES
+    fitted, more = _reference(first, split_columns(first, holdout, rng), open_families, progress)
     astray = kicks_astray(fitted.at)
     said += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
     first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
@@ -143,7 +143,7 @@ def diagnose_change(
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
     open_ = left_open(fitted)
-    fit = _few_or_all(data, split, trials, effects, judgement, seed, progress, open_)
+    fit = _few_or_all(data, split, families, effects, judgement, seed, progress, open_)
     if isinstance(fit, Few):
         causes = tuple(cause for cause, _ in fit.told)
         sought = [own for own in fit.findings if not is_drift(cause_of(own))]
@@ -218,16 +218,16 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 
 
 def _reference(
-    data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
+    data: ResponseData, split: Split, families: Sequence[Family], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
     """What a lattice can have wrong, as one measurement has it, then fitted to all of the first.
     The design where that goes astray. And what is to be said of it."""
     nothing = replace(begin(data, _judged_by_nobody(split)), exploring=False)
-    if not steps:
+    if not families:
         return nothing, []
     try:
-        fit = fit_steps(data, split, steps, len(steps), progress)
-        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.said)
+        fit = fit_families(data, split, families, progress)
+        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.messages)
     except (TmlatticeError, np.linalg.LinAlgError):
         return nothing, ["it could not be fitted, and the change is one of the design"]
 
@@ -262,25 +262,22 @@ def _by_good_monitors(
 
 
 def _fit_change(
-    data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
-) -> DenseFit:
+    data: ResponseData, split: Split, families: Sequence[Family], progress: Callable[[str], Any]
+) -> HierarchicalFit:
     """All that may have changed, with the noise that the two measurements have."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
     before = score(design, split.held)
     steps = [Step.scored("reference", 0, before)]
-    state = design
-    for trial, settled in one_by_one(design, trials, progress):
-        state = settled
-        count = sum(family.count(data) for family in trial.families)
-        title = ", ".join(family.title for family in trial.families)
-        steps.append(Step.scored(title, count, score(state, split.held)))
-    state = settle(bend(jump(state)))
-    state = settle(_learnt_noise(state))
+    there = [f for f in families if design.reads(f.block) and f.size(data) and f.count(data)]
+    progress("all families")
+    state = settle(bend(jump(allow(design, there))), alike=True)
+    state = settle(_learnt_noise(settle(bend(jump(state)))))
     after = score(state, split.held)
-    if len(steps) > 1:
-        steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
+    if there:
+        count = sum(family.count(data) for family in there)
+        steps.append(Step.scored("all families", count, after))
     design = _with_noise(design, state.data.noise)
-    return DenseFit(design, state, tuple(steps), (), (score(design, split.held), after))
+    return HierarchicalFit(design, state, tuple(steps), (), (score(design, split.held), after))
 
 
 def _learnt_noise(state: State) -> State:
@@ -312,13 +309,13 @@ def _all_columns(state: State) -> State:
 def _few_or_all(
     data: ResponseData,
     split: Split,
-    trials: Sequence[Trial],
+    families: Sequence[Family],
     effects: Sequence[str] | None,
     judgement: Judgement,
     seed: int,
     progress: Callable[[str], Any],
     open_: LeftOpen,
-) -> Few | DenseFit:
+) -> Few | HierarchicalFit:
     """The few causes that explain a change, or the fit of everything that may have changed."""
     asked = changes() if effects is None else effects
     few = few_causes(
@@ -328,7 +325,7 @@ def _few_or_all(
         few = None
     if few is not None and few.noise:
         return few
-    fit = _fit_change(data, split, trials, progress)
+    fit = _fit_change(data, split, families, progress)
     return fit if few is None or knows_more(fit, few.fit) else few
 
 
@@ -338,7 +335,7 @@ def _verdict(state: State) -> str:
 
 
 def _said(
-    data: ResponseData, fit: DenseFit, state: State, scatter: Mapping[str, float]
+    data: ResponseData, fit: HierarchicalFit, state: State, scatter: Mapping[str, float]
 ) -> list[str]:
     """How well two measurements agree, and by how much magnets, and supplies, scatter."""
     left = data.pick(state.at.left)[:-1][:, state.good]

@@ -60,6 +60,5 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
 def is_drift(cause: Cause) -> bool:
     """Whether it is no more than what monitors and correctors do from day to day: everybody may
     have it, and the largest of them is no finding."""
-    of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
-               for name in family.effects}  # fmt: skip
+    of_each = {name for family in CHANGES if family.per != "ring" for name in family.effects}
     return cause.effect in of_each and abs(cause.amount) <= DRIFT

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.response.displaced import displaced
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.strangers import Strangers
+from tmlattice.diagnosis.response.strangers import ODD, Strangers, strangers
 from tmlattice.measurement import OrbitResponse
 
 Array = NDArray[np.float64]
@@ -61,6 +62,12 @@ def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
     new = [pair for pair in found if pair not in known]
     known.update((pair, found[pair]) for pair in new)
     return new
+
+
+def mislabelled(state: State) -> set[str]:
+    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
+    leaves far more of them than of the others."""
+    return {*(own.name for own in displaced(state)), *strangers(state, ODD).correctors}
 
 
 def exchanged(state: State, among: Collection[str] = ()) -> dict[Pair, float]:

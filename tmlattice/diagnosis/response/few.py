@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Told
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
-from tmlattice.diagnosis.response.dense import DenseFit, Step
+from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, Step
 from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.left_open import Blur, LeftOpen
 from tmlattice.diagnosis.response.one_change import OneChange
@@ -86,7 +86,7 @@ class Few:
             beside less there is room for other causes.
     """
 
-    fit: DenseFit
+    fit: HierarchicalFit
     findings: tuple[Finding, ...]
     verdict: str
     told: list[Told]
@@ -161,7 +161,7 @@ def few_causes(
     return _told(data, split, problem.base, found, count, most, judgement)
 
 
-def knows_more(fit: DenseFit, few: DenseFit) -> bool:
+def knows_more(fit: HierarchicalFit, few: HierarchicalFit) -> bool:
     """Whether correctors that were not fitted say that a fit of everything knows more than a few
     causes do, of the monitors that it takes for good and the planes that were read."""
     of_all = fit.heldout[1]
@@ -323,7 +323,7 @@ def _told(
         steps.append(Step.scored(name, 1, score(state, split.held)))
     heldout = (score(design, split.held), score(state, split.held))
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
-    dense = DenseFit(design, state, tuple(steps), (), heldout)
+    dense = HierarchicalFit(design, state, tuple(steps), (), heldout)
     told = list(zip(causes, errors, strict=True))
     less = p_value > 1 - judgement.noise[1]
     noise = p_value >= judgement.noise[1] and not less

@@ -20,12 +20,13 @@ JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
 reading a monitor), and by how much their sum may fall without a step that stays all the same:
 evidence takes what the model lacks for noise, and gladly fits it."""
+CORRECTORS = np.array([1.0, 1.0, 0.0])
+"""The same, of correctors alone: all monitors share a jitter of the RF's orbit."""
 FLOOR = np.array([0.1, 0.1, 1.0])
 """Of the noise, beside what is left in-plane, across and of the RF: what is left of nothing (a
 model's own orbit) is no better for being less."""
-SURELY, WORTH = 1.0, 0.05
-"""Standard errors of a fall from which on it counts; and how much one is at least that refuses what
-most of the readings ask for."""
+SURELY = 1.0
+"""Standard errors of a fall from which on it counts."""
 
 
 class Chi2(NamedTuple):
@@ -80,15 +81,8 @@ class _Missed(NamedTuple):
     rf_monitors: Flags
 
 
-def _missed(
-    state: State, judges: Flags, rf: Flags | None = None, jitter: Array | None = None
-) -> _Missed:
-    """What correctors that were not fitted say; see `score`.
-
-    Args:
-        state, judges, rf: as there.
-        jitter: orbits that a step may have some of, see `State`, which near monitors tell too.
-    """
+def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
+    """What correctors that were not fitted say; see `score`."""
     data, at, half = state.data, state.at, state.split.half
     read = at.seen(at.beam)
     straight, across = data.pick(read), data.pick(read, 1)
@@ -99,25 +93,13 @@ def _missed(
     variance, variance_across = (data.noise_of(block) ** 2 for block in (0, 1))
     inside, jumped, outside, rolled, squares, spread = [], [], [], [], [], []
     cross = []
-    moving = np.zeros((2, 0, data.shape[1])) if jitter is None else jitter
-    typical = np.median(data.noise, axis=0)
-
-    def still(left: Array, near: Flags, plane: int) -> Array:
-        """Without the jitter that near monitors tell."""
-        orbits = moving[plane].T
-        held = np.full(orbits.shape[1], typical[plane])
-        amounts, _ = amplitudes(orbits, left, near, near, held)
-        return np.asarray(left - orbits @ amounts)
-
     for c in np.flatnonzero(judges):
         seen = np.isfinite(orbits[c]) & state.good
         near, far = seen & half[c], seen & ~half[c]
         if not (near.any() and far.any()):
             continue
         # all alike: what the model lacks is not the readings' noise
-        moved = moving[data.plane[c]].T
-        held = np.append(0.0, np.full(moved.shape[1], typical[data.plane[c]]))
-        kick, miss = amplitudes(np.column_stack([straight[c], moved]), orbits[c], near, far, held)
+        kick, miss = amplitudes(straight[c][:, None], orbits[c], near, far)
         inside.append(miss)
         squares.append(miss**2 / variance[c, far])
         # the kick's own error stands beside the reading's
@@ -125,16 +107,12 @@ def _missed(
         jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
         left = orbits_across[c] - kick[0] * across[c]
         there = np.isfinite(left)
-        if moving.size and (near & there).any():
-            left = still(left, near & there, 1 - data.plane[c])
         outside.append(left[far & there])
         cross.append(outside[-1] ** 2 / variance_across[c, far & there])
         if rolls[c].any() and (near & there).any():
             rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
     judge = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
-    left = orbits[-1] - straight[-1]
-    near = state.good & np.isfinite(left) & half[-1] & ~judge
-    of_rf = (still(left, near, 0) if moving.size and near.any() else left)[judge]
+    of_rf = (orbits[-1] - straight[-1])[judge]
     return _Missed(inside, outside, jumped, rolled, squares, cross, spread, of_rf,
                    of_rf**2 / variance[-1, judge], judge)  # fmt: skip
 
@@ -186,28 +164,17 @@ def _logs(sums: Array) -> Array:
         return np.asarray(0.5 * np.log(sums[..., 0] / sums[..., 1]))
 
 
-def inner(state: State, by_others: Array | None = None) -> Judged:
+def inner(state: State) -> Judged:
     """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
-    monitors gives the kick once, and a jitter of the beam that the state has: else one that the
-    judges have themselves would hide what is better.
-
-    Args:
-        state: that is judged.
-        by_others: what fitted monitors leave of the RF's orbit, `rf_by_others`: they judge too.
-    """
+    monitors gives the kick once."""
     other = replace(state, split=replace(state.split, half=~state.split.half))
-    said = [
-        _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
-        for one in (state, other)
-    ]
+    said = [_missed(one, state.split.inner, state.split.inner_rf) for one in (state, other)]
     sums = [
         np.array([[[np.sum(own**2), len(own)] for own in pair]
                   for pair in zip(one.inside, one.outside, strict=True)])
         for one in said
     ]  # fmt: skip
     rf = np.zeros((len(state.good), 2))
-    if by_others is not None:
-        rf = np.stack([np.nan_to_num(by_others) ** 2, np.isfinite(by_others)], axis=1)
     rf[said[0].rf_monitors] = np.stack([said[0].rf ** 2, np.ones(len(said[0].rf))], axis=1)
     floor = (FLOOR * float(np.median(state.data.noise))) ** 2
     columns = sums[0] + sums[1]
@@ -216,14 +183,19 @@ def inner(state: State, by_others: Array | None = None) -> Judged:
     return Judged(columns, rf)
 
 
-def lost(without: Judged, within: Judged) -> tuple[float, float]:
+def lost(without: Judged, within: Judged, counts: Array = JUDGES) -> tuple[float, float]:
     """By how much the judges' figures rise, and its standard error: by the jackknife, each
-    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing."""
-    whole = float(np.nansum(JUDGES * (without.logs - within.logs)))
+    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing.
+
+    Args:
+        without, within: what is compared.
+        counts: weights of in-plane, across and RF readings.
+    """
+    whole = float(np.nansum(counts * (without.logs - within.logs)))
     variance = 0.0
     for now, then, weights in (
-        (within.columns, without.columns, JUDGES[:2]),
-        (within.rf[:, None], without.rf[:, None], JUDGES[2:]),
+        (within.columns, without.columns, counts[:2]),
+        (within.rf[:, None], without.rf[:, None], counts[2:]),
     ):
         judged = now[:, 0, 1] > 0
         if judged.sum() > 1:
@@ -233,11 +205,6 @@ def lost(without: Judged, within: Judged) -> tuple[float, float]:
     return whole, float(np.sqrt(variance))
 
 
-def against(said: tuple[float, float], least: float = VETO) -> bool:
-    """Whether the judges would rather be without, by what `lost` says, and by so much at least."""
-    return said[0] < -max(least, SURELY * said[1])
-
-
-def in_favour(said: tuple[float, float]) -> bool:
-    """Whether they would rather be with, likewise."""
-    return against((-said[0], said[1]))
+def against(said: tuple[float, float]) -> bool:
+    """Whether the validation set is better off without, by what `lost` says."""
+    return said[0] < -max(VETO, SURELY * said[1])

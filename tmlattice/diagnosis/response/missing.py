@@ -1,6 +1,6 @@
 """Which effect a fitted orbit response still lacks: each hypothesis weighed on held-out readings.
 
->>> fit = fit_steps(data, split)
+>>> fit = fit_families(data, split)
 >>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
 
 A hypothesis is a set of patterns: what the readings would change by for one unit of each of its
@@ -213,7 +213,8 @@ class Fitted:
     """The linearised fit, to which patterns can be added."""
 
     def __init__(self, state: State) -> None:
-        state = replace(state, jitter=None)  # a hypothesis among the others here
+        # common modes are hypotheses among the others here
+        state = replace(state, noise=replace(state.noise, kinds=()))
         self.state, data = state, state.data
         there = linear(state, 0)
         normal, self.start = there.normal, there.start

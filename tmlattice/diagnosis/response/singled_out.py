@@ -20,8 +20,8 @@ from scipy.stats import t as student
 
 from tmlattice.diagnosis.families.orbit_modes import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.diagnosis.response.dense import ROUGH, DenseFit, Step, fit_chi2
 from tmlattice.diagnosis.response.faults import Fault, as_turned
+from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, Step, fit_chi2
 from tmlattice.diagnosis.response.judges import Chi2, score
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.others import KINDS, with_number
@@ -183,7 +183,7 @@ class _Search:
         for cause, _, information in self.leaders():
             state = self.put(self.state, cause, information)
             if state is not None:
-                tried.append((log_evidence(state, state.good) + self.problem.prior(cause), state))
+                tried.append((log_evidence(state) + self.problem.prior(cause), state))
         for _, state in sorted(tried, key=lambda one: -one[0]):
             state = self.better(state, state.apart[-1])  # noqa: PLW2901
             if self.clear(self.seen(state), state.apart[-1]):
@@ -238,7 +238,7 @@ class _Search:
         if other is None:
             return state
         prior = self.problem.prior
-        gained = log_evidence(other, state.good) - log_evidence(state, state.good)
+        gained = log_evidence(other) - log_evidence(state)
         gained += prior(other.apart[-1].cause) - prior(one.cause)
         return other if gained > 0 else state
 
@@ -384,7 +384,7 @@ def _stepped(state: State) -> State:
 
 
 # --- what is told ---------------------------------------------------------------------------------
-def beside_faults(fit: DenseFit, apart: Sequence[Apart]) -> DenseFit:
+def beside_faults(fit: HierarchicalFit, apart: Sequence[Apart]) -> HierarchicalFit:
     """The dense fit with the faults' numbers free of their families, as a step more; as it was,
     where held-out correctors want none of it."""
     state = fit.state

@@ -73,11 +73,11 @@ def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
-    """What sizes of families add to the covariance that are unknown, of those too that were tried
-    and not needed: F, of F F^T, [parameter, direction]; see `stated`."""
+    """What unknown prior scales add to the covariance, those of closed families, too: F, of F F^T,
+    [parameter, direction]; see `stated`."""
     tried = [
         family
-        for family in state.unneeded
+        for family in state.explained
         if family.block == block and family.per == "ring" and family.size(state.data) <= MANY
     ]
     whole = linear(allow(state, tried), block) if tried else there
