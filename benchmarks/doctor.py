@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import tmlattice
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.effects import Cause, find, names
 from tmlattice.machine import simulate
 from tmlattice.machine.response import simulate_response
@@ -275,7 +275,7 @@ def main(rings):
             seconds.append(took)
             print(f"| {kind}: {what} | {'yes' if good else 'NO'} | {took:.2f} |", flush=True)
             if not good:
-                for check in found.told:
+                for check in found.reported:
                     print(f"    {check.status}: {check.sentence}")
         print(f"\nnamed {right} of {len(cases)}; {np.median(seconds):.2f} s, {max(seconds):.2f}")
         print("\n| healthy | cases | told |\n|---|---|---|")
@@ -292,7 +292,7 @@ def main(rings):
                     print(f"    not made: {what}: {error}"[:150])
                     continue
                 found, took = checked(ring, own)
-                bad = [c for c in found.told if c.name not in expected_notes(causes)]
+                bad = [c for c in found.reported if c.name not in expected_notes(causes)]
                 count[what] = count.get(what, 0) + 1
                 told[what] = told.get(what, 0) + bool(bad)
                 for check in bad:

@@ -26,7 +26,7 @@ from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import FAMILIES
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
-from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError

@@ -142,4 +142,4 @@ def test_a_ring_without_quadrupoles(tmp_path):
     result = diagnose(ring, data)
     assert len(result.steps) == 2
     assert left(result) < 1.25
-    assert result.reasons is None
+    assert result.common_factors is None

@@ -7,9 +7,9 @@ import pytest
 
 from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
 from tmlattice.diagnosis.families.steps import FAMILIES
+from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.state import allow
-from tmlattice.diagnosis.response.told import told
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
@@ -53,8 +53,8 @@ def test_gradients_of_bends_are_found(bent):
     """ESRF-EBS: 96 of its magnets had none to fit; they were made up for."""
     data, bends, wrong = bent
     fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), OPEN)
-    assert all(error > 0 for _, error in told(fit.state)[0])
-    found = {(c.effect, c.element): (c.amount, error) for c, error in told(fit.state)[0]}
+    assert all(error > 0 for _, error in fitted_causes(fit.state)[0])
+    found = {(c.effect, c.element): (c.amount, error) for c, error in fitted_causes(fit.state)[0]}
     own = np.array([found["bend_gradient", name] for name in bends])
     mean, error = np.mean(own[:, 0]) / GRADIENT, np.mean(own[:, 1]) / abs(GRADIENT)
     left = [
@@ -77,7 +77,7 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
         """rms over the quadrupoles, which make up for one number together: a single pull."""
         left = [
             (cause.amount - WRONG.get(cause.element, 0.0)) / error
-            for cause, error in told(state)[0]
+            for cause, error in fitted_causes(state)[0]
             if cause.effect == "quadrupole_gradient"
         ]
         return np.sqrt(np.mean(np.square(left)))

@@ -19,7 +19,7 @@ from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.families.steps import FAMILIES
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
-from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.outliers import without as without_steps
 from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause, apply
@@ -343,9 +343,9 @@ def test_a_cause_s_rows_are_what_it_does_to_the_readings(small_ring, measured, c
 
 
 def test_what_is_missing_is_said(small_ring, measured):
-    few = measured.select(monitors=measured.monitors[:4])
+    sparse = measured.select(monitors=measured.monitors[:4])
     with pytest.raises(MeasurementError, match="too few columns or monitors tell it: state it"):
-        diagnose(small_ring, replace(few, noise=None))
+        diagnose(small_ring, replace(sparse, noise=None))
     with pytest.raises(MeasurementError, match="cannot be split"):
         diagnose(small_ring, measured.select(correctors=measured.correctors[:2]))
 

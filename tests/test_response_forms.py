@@ -9,13 +9,13 @@ import pytest
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import FAMILIES
-from tmlattice.diagnosis.response import few
+from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
-from tmlattice.diagnosis.response.missing import control, weigh
+from tmlattice.diagnosis.response.missing_effects import control, weigh
 from tmlattice.diagnosis.response.outliers import without_gross
-from tmlattice.diagnosis.response.strangers import reversed_ones
+from tmlattice.diagnosis.response.unlike_model import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
@@ -152,10 +152,10 @@ def test_no_causes_are_sought_of_kicks_beyond_all_measure(small_ring, whole, mon
     seen = SimpleNamespace(
         statistic=np.array([1e12]), amount=np.array([1e-2]), hypotheses=[("corrector_kick_x", "h1")]
     )
-    monkeypatch.setattr(few, "scan", lambda *_, **__: seen)
-    monkeypatch.setattr(few, "_beyond", lambda *_: 1e12)
-    monkeypatch.setattr(few, "explain", lambda *_: pytest.fail("a search was begun"))
-    assert few.few_causes(data, split, None, 10, DEFAULT) is None
+    monkeypatch.setattr(sparse, "scan", lambda *_, **__: seen)
+    monkeypatch.setattr(sparse, "_beyond", lambda *_: 1e12)
+    monkeypatch.setattr(sparse, "explain", lambda *_: pytest.fail("a search was begun"))
+    assert sparse.sparse_fit(data, split, None, 10, DEFAULT) is None
 
 
 def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_ring, whole, rng):

@@ -8,18 +8,18 @@ import pytest
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import FAMILIES
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.exchanged import (
-    exchanged,
-    exchanged_monitors,
-    monitors_back,
-    put_right,
-)
+from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.hierarchical import fit_families
+from tmlattice.diagnosis.response.inconsistent_steps import torn
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.outliers import common_modes, messages
-from tmlattice.diagnosis.response.strangers import ODD, strangers
-from tmlattice.diagnosis.response.told import told
-from tmlattice.diagnosis.response.torn_steps import torn
+from tmlattice.diagnosis.response.swaps import (
+    correctors_back,
+    exchanged,
+    monitors_back,
+    swapped_monitors,
+)
+from tmlattice.diagnosis.response.unlike_model import ODD, unlike_model
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
@@ -259,7 +259,7 @@ def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
     state = fitted(small_ring, clean)
     assert exchanged(state) == {}
     pair = ("v5", "v6")
-    wrong = put_right(clean, [pair])
+    wrong = correctors_back(clean, [pair])
     assert list(exchanged(fitted(small_ring, wrong))) == [pair]
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
     assert any("v5 and v6" in said for said in found.warnings)
@@ -269,14 +269,14 @@ def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
 def test_two_that_answer_as_others_should_are_no_strangers(small_ring, clean):
     """A fit leaves more of them than of all others: that is enough to look at both. Two that are
     odd, each in its own way, are not exchanged."""
-    wrong = put_right(clean, [("v5", "v7")])
+    wrong = correctors_back(clean, [("v5", "v7")])
     odd = clean.response.copy()
     odd[5] += 0.4 * odd[2]
     odd[7] += 0.4 * odd[12]
     for measured, pairs in ((wrong, [("v5", "v7")]), (replace(clean, response=odd), [])):
         state = fitted(small_ring, measured)
-        assert strangers(state).correctors == ()
-        assert strangers(state, ODD).correctors == ("v5", "v7")
+        assert unlike_model(state).correctors == ()
+        assert unlike_model(state, ODD).correctors == ("v5", "v7")
         assert list(exchanged(state, {"v5", "v7"})) == pairs
 
 
@@ -284,11 +284,11 @@ def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
     """Anywhere in the ring; without the names both had been left out as strangers. Where nothing is
     exchanged, and of monitors that are not strangers, nothing is told."""
     state = fitted(small_ring, clean)
-    assert exchanged_monitors(state, clean.monitors) == {}
+    assert swapped_monitors(state, clean.monitors) == {}
     pair = (clean.monitors[4], clean.monitors[20])
     wrong = monitors_back(clean, [pair])
     assert not np.array_equal(wrong.rf.orbit, clean.rf.orbit)
-    (told_of,) = exchanged_monitors(fitted(small_ring, wrong), clean.monitors)
+    (told_of,) = swapped_monitors(fitted(small_ring, wrong), clean.monitors)
     assert sorted(told_of) == sorted(pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
     assert any("monitors that answer each as the other one should" in s for s in found.warnings)
@@ -313,7 +313,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     measured = simulate_response(
         small_ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=3
     ).measured  # fmt: skip
-    wrong = (put_right if what == "correctors" else monitors_back)(measured, [tuple(pair)])
+    wrong = (correctors_back if what == "correctors" else monitors_back)(measured, [tuple(pair)])
     effects = ["quadrupole_gradient"] if case == "neighbours" else None
     found = diagnose(small_ring, wrong, effects=effects)
     assert found.verdict == "localised"
@@ -351,7 +351,8 @@ def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring,
     state = fitted(small_ring, replace(clean, response=response))
     truth = {name.casefold(): amount for name, amount in GRADIENTS.items()}
     found = [(own.amount - truth.get(own.element.casefold(), 0.0), sigma)
-             for own, sigma in told(state)[0] if own.effect == "quadrupole_gradient"]  # fmt: skip
+             for own, sigma in fitted_causes(state)[0]
+             if own.effect == "quadrupole_gradient"]  # fmt: skip
     off, sigma = np.transpose(found)
     there = linear(state, 0)
     plain = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where["gradient"]]

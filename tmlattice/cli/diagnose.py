@@ -270,9 +270,9 @@ def _read(
 
 def _not_used(lattice: str) -> list[str]:
     """What stands beside a lattice that an orbit response does not start from."""
-    from tmlattice.diagnosis.twin import known_beside
+    from tmlattice.diagnosis.twin import knowledge_file
 
-    beside = known_beside(Path(lattice))
+    beside = knowledge_file(Path(lattice))
     if not beside.is_file():
         return []
     return [
@@ -283,9 +283,9 @@ def _not_used(lattice: str) -> list[str]:
 
 def _known(ring: "Ring", lattice: str) -> "Known | None":
     """What an earlier diagnosis left known beside the ring as it found it."""
-    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, read_known
+    from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, read_known
 
-    beside = known_beside(Path(lattice))
+    beside = knowledge_file(Path(lattice))
     if beside.is_file():
         return read_known(beside, ring)
     if ring.model == ESTIMATED:
@@ -341,7 +341,7 @@ def _write_rings(
     corrected_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
-    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document
+    from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
@@ -362,7 +362,7 @@ def _write_rings(
             written[str(beside)] = ()
         else:  # that of the ring which stood there
             beside.unlink(missing_ok=True)
-        beside = known_beside(lattice_out)
+        beside = knowledge_file(lattice_out)
         beside.unlink(missing_ok=True)  # that of the ring which stood there
         if lattice_out.is_file() and known is not None:
             with output_file(beside) as temporary:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis import Diagnosis
-from tmlattice.diagnosis.twin import known_beside, known_of, read_known
+from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError
 from tmlattice.inference.among import Known
@@ -148,7 +148,7 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
             f"'{path}' and '{settings.name}' do not have the same elements; give the lattice that "
             "the diagnosis started from"
         )
-    beside, calibration = known_beside(path), path.with_name(f"{path.name}.calibration.json")
+    beside, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
     said: tuple[str, ...] = ()
     if not beside.is_file():
         said = (f"'{beside.name}' is not there: the estimated ring is taken as certain",)

@@ -177,7 +177,7 @@ def diagnose_together(
         own = zip(parts, problem.parts, strict=True)
         parts = [replace(part, problem=learnt) for part, learnt in own]
     progress("report")
-    return _told(
+    return _report(
         ring, parts, problem, sought_out.explanation, small, how,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
@@ -222,7 +222,7 @@ def _of_launches(effect: Effect) -> bool:
 
 
 # --- what is told ----
-def _told(
+def _report(
     ring: Ring,
     parts: Sequence[Part],
     problem: Together,
@@ -242,11 +242,11 @@ def _told(
     estimated = any(part.estimated for part in parts)
     findings = findings_of(ring, found, dead, judgement)
     fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
-    verdict, findings, said = verdict_of(found, findings, fitted.p_value, estimated, judgement)
+    verdict, findings, messages = verdict_of(found, findings, fitted.p_value, estimated, judgement)
     if verdict == "none" and small is not None and small.errors and problem.alone:
         verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
-        said = (*said, f"the amounts are not settled: {result.outcome.value}")
+        messages = (*messages, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
     left = found.left if causes or (found.kicks and findings) else found.first_kicks
     if result.causes and not causes:  # nothing is explained: what is left is what was there
@@ -262,18 +262,18 @@ def _told(
         heldout = held_out(parts, problem.fixed, stages, aside, since)
         # what small errors leave undetermined is not in the errors of held-out readings
         compared = compared_of(fitted, heldout if small is None else None)
-        told = (f"{part.label}: {one}" for part in parts for one in part.said)
+        told = (f"{part.label}: {one}" for part in parts for one in part.messages)
         notes = list(spikes(parts, problem, found))
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
-        told = (one for one in turns.said)
+        told = (one for one in turns.messages)
         rejected = rejected_readings(turns, found)
         notes = about_rejected(rejected)
         if turns.estimated:
             notes.append(noise_text(_noise(parts)))
         notes += about_launches(turns, findings)
-    warnings = [*told, *notes, *said, *too_large(stages)]
+    warnings = [*told, *notes, *messages, *too_large(stages)]
     corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     return Diagnosis(

@@ -25,10 +25,10 @@ from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
 if TYPE_CHECKING:
+    from tmlattice.diagnosis.response.common_factors import CommonFactors
     from tmlattice.diagnosis.response.hierarchical import Step
     from tmlattice.diagnosis.response.inconsistencies import Inconsistency
-    from tmlattice.diagnosis.response.missing import Weighed
-    from tmlattice.diagnosis.response.reasons import Reasons
+    from tmlattice.diagnosis.response.missing_effects import Weighed
     from tmlattice.diagnosis.suspects import Suspect
 
 _MEASURES = {
@@ -258,7 +258,7 @@ class Diagnosis(ShownDiagnosis):
     priors: Mapping[str, float] = field(default_factory=dict)
     prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
-    reasons: "Reasons | None" = None
+    common_factors: "CommonFactors | None" = None
     inconsistencies: "Inconsistency | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
@@ -473,7 +473,9 @@ class Diagnosis(ShownDiagnosis):
                 for c, s, support in self.supported
             ],
             "correlations": [pair.as_json() for pair in self.correlations],
-            "reasons": None if self.reasons is None else self.reasons.as_json(),
+            "common_factors": None
+            if self.common_factors is None
+            else self.common_factors.as_json(),
             "inconsistencies": None
             if self.inconsistencies is None
             else self.inconsistencies.as_json(),

@@ -221,7 +221,7 @@ def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Exp
     narrow = replace(search, most=few, names_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(problem.judgement.retaken):
-        doubt = _beside(explanation, small, learn)
+        doubt = _given(explanation, small, learn)
         if doubt is None:
             break
         search.progress("small errors with what was found")
@@ -332,7 +332,7 @@ def _undecided(explanation: Explanation) -> bool:
     return False
 
 
-def _beside(
+def _given(
     explanation: Explanation, small: Learnt, learn: bool
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
     """Given which fit, and which causes, small errors have to be taken again; None: they stand.
@@ -351,7 +351,7 @@ def _beside(
         cause = outlier(estimate, small.sizes)
         if cause is not None and small.plain.alone:  # else it is in the reference too
             return explanation.fit, (replace(cause, amount=0.0),)  # so far all is a small error's
-        cause = _likeliest(explanation)
+        cause = _most_probable(explanation)
         if cause is None:
             return None
         tried = fit(explanation.problem, [cause], explanation.fit.nuisances)
@@ -449,7 +449,7 @@ def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | No
     return worst
 
 
-def _likeliest(explanation: Explanation) -> Cause | None:
+def _most_probable(explanation: Explanation) -> Cause | None:
     """What the scan sees most of, if that is to be doubted."""
     scan = explanation.first
     top = int(np.argmax(scan.statistic)) if len(scan.statistic) else -1

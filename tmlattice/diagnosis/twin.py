@@ -45,7 +45,7 @@ ROUNDED = 1e-4
 """Of the products of directions: single precision rounds them by 1e-6."""
 
 FORMAT = "tmlattice-known"
-BESIDE = ".known.json"
+SUFFIX = ".known.json"
 """What the name of a lattice file ends in besides."""
 
 
@@ -53,9 +53,9 @@ ESTIMATED = "estimated ring"
 """What a lattice file says that it is whose knowledge stands in a file of its own."""
 
 
-def known_beside(lattice: Path) -> Path:
+def knowledge_file(lattice: Path) -> Path:
     """Where the knowledge of a lattice file stands."""
-    return Path(f"{lattice}{BESIDE}")
+    return Path(f"{lattice}{SUFFIX}")
 
 
 def known_of(diagnosis: Diagnosis) -> Known | None:
@@ -125,7 +125,7 @@ def _together(
     return replace(
         known,
         amounts=known.amounts - np.where(inside, start, 0.0),
-        causes=tuple(c for c in problem.fixed if _beside(c)),
+        causes=tuple(c for c in problem.fixed if _held_by_ring(c)),
     )
 
 
@@ -139,11 +139,11 @@ def _each_alone(
     count = len(everywhere)
     return Known(
         tuple(everywhere), np.zeros(count), np.array(rms), np.zeros((0, count)), np.zeros(0),
-        tuple(c for c in diagnosis.causes if _beside(c)),
+        tuple(c for c in diagnosis.causes if _held_by_ring(c)),
     )  # fmt: skip
 
 
-def _beside(cause: Cause) -> bool:
+def _held_by_ring(cause: Cause) -> bool:
     """Whether it stands beside the ring as found: first turns have energies of
     their own."""
     return not _in_ring(cause) and not isinstance(find(cause.effect), LaunchEffect)
@@ -188,7 +188,7 @@ def read_known(path: Path, ring: Ring) -> Known:
         MeasurementError: it is damaged, or of another ring, or the lattice file was changed since.
     """
     document = read_document(path, "known", FORMAT)
-    lattice = path.with_name(path.name.removesuffix(BESIDE))
+    lattice = path.with_name(path.name.removesuffix(SUFFIX))
     made_for = document.get("lattice_sha256")
     if made_for is not None and hashlib.sha256(lattice.read_bytes()).hexdigest() != made_for:
         raise MeasurementError(

@@ -101,7 +101,7 @@ def fit_sparse(
         raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
     monitors = [monitor.name for monitor in ring.monitors]
     data = first_turn(monitors, measurement, noise, launch_sigma, network.dimension)
-    found = few_causes(
+    found = sparse_fit(
         ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
     )
     warn_of_launches(ring, data, network.dimension, found)
@@ -157,7 +157,7 @@ def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation)
         return
     sigma = data.launch_sigma.copy()
     sigma[:, :4] = np.inf
-    free = few_causes(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
+    free = sparse_fit(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
     readings, numbers = int(data.valid.sum()), int(stated.sum())
     gain = found.fit.chi2 - free.chi2
     explained = free.chi2 <= readings + BY_CHANCE * np.sqrt(2 * readings)
@@ -184,7 +184,7 @@ def in_coordinates(launches: Array, dimension: int) -> Array:
     return states
 
 
-def few_causes(
+def sparse_fit(
     ring: Ring,
     data: Data,
     kinds: Sequence[str] = ("quadrupole", "sextupole"),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import UnstableRingError
 from tmlattice.importers.imported import Array, counted
 from tmlattice.lattice import Ring
@@ -67,7 +67,7 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
         measured: the response.
     """
     try:
-        told = [check.sentence for check in check_data(ring, measured).told]
+        told = [check.sentence for check in check_data(ring, measured).reported]
         model, flat = ResponseModel(ring), ResponseModel(ring, dimension=4)
     except UnstableRingError as error:
         return [], [f"the lattice has no closed orbit to compare with ({error})"]

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.diagnosis.families.steps import FAMILIES, CorrectorCalibration
 from tmlattice.diagnosis.response import first_guess, hierarchical
 from tmlattice.diagnosis.response.hierarchical import fit_families
-from tmlattice.diagnosis.response.judges import score
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import allow, begin, bend, jump
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
@@ -59,11 +59,11 @@ def test_a_far_lattice_is_no_wrong_sign_and_no_other_ring(small_ring):
     """ALS with 3 % on its largest family: y was said to be reversed, or the ring to be another."""
     data = measured(small_ring, 0.02, 0.06)
     assert ResponseJudge(small_ring, data).misfit(()).max() > ANOTHER
-    (check,) = check_data(small_ring, data).told
+    (check,) = check_data(small_ring, data).reported
     assert check.status == "note"
     assert "is far from the ring that was measured" in check.sentence
     reversed_ones = dataclasses.replace(data, response=-data.response)
-    assert any(check.status == "wrong" for check in check_data(small_ring, reversed_ones).told)
+    assert any(check.status == "wrong" for check in check_data(small_ring, reversed_ones).reported)
 
 
 def in_mm(data):
@@ -84,7 +84,7 @@ def rf_in_mm(data):
 )
 def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
     """With kicks of their own every unit resembles the readings; the note alone was said."""
-    error, far = check_data(small_ring, change(measured(small_ring, 0.02, 0.06))).told
+    error, far = check_data(small_ring, change(measured(small_ring, 0.02, 0.06))).reported
     assert "is far from the ring that was measured" in far.sentence
     assert error.status == "wrong"
     assert said in error.sentence

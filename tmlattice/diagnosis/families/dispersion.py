@@ -19,7 +19,7 @@ from tmlattice.beam.kicks import (
     energy_of_way,
     kicking,
 )
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -121,7 +121,9 @@ class _Kicks(Family):
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Nothing: other kicks make the same dispersion."""
         return []
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
 from tmlattice.diagnosis.families.energy import EnergyOffset, EnergySpread
-from tmlattice.diagnosis.families.family import TAILS, Family, Told
+from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.fields import (
     BendGradient,
     CorrectorPosition,
@@ -67,7 +67,9 @@ class MonitorGain(_Monitors):
         monitors[:, [0, 1], [0, 1]] = 1 + values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """All of x, then all of y."""
         names, gain = data.measured.monitors, Monitors.of(errors.monitors).gain
         return [
@@ -101,7 +103,9 @@ class MonitorRoll(_Monitors):
         monitors[:, [0, 1], [1, 0]] = values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Of small ones x reads (coupling + roll) y, y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
         own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
@@ -142,7 +146,7 @@ class _Columns(Family):
         ]
         return [*own, {}]
 
-    def _told(self, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def _causes_of(self, values: Array, sigma: Array, data: ResponseData) -> list[StatedCause]:
         names = data.measured.correctors
         return [
             (Cause(self.name, name, float(v)), float(s))
@@ -174,9 +178,11 @@ class CorrectorCalibration(_Columns):
         """As it stands."""
         return replace(errors, calibration=values)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Of the whole kick, of which a rolled corrector has a part in the other plane."""
-        return self._told(errors.kick - 1, sigma, data)
+        return self._causes_of(errors.kick - 1, sigma, data)
 
 
 class CorrectorRoll(_Columns):
@@ -197,9 +203,13 @@ class CorrectorRoll(_Columns):
         """The kick in the other plane, as a share of what the corrector is told."""
         return replace(errors, roll=values)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """The angle of its kick to its plane: a right one where it has none in that."""
-        return self._told(errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data)
+        return self._causes_of(
+            errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data
+        )
 
 
 FAMILIES: tuple[Family, ...] = (

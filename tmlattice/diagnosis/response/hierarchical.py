@@ -21,17 +21,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.steps import FAMILIES, SECOND
-from tmlattice.diagnosis.response.exchanged import exchanged, mislabelled
 from tmlattice.diagnosis.response.first_guess import begun, strange
-from tmlattice.diagnosis.response.judges import (
-    CORRECTORS,
-    Chi2,
-    Score,
-    against,
-    inner,
-    lost,
-    score,
-)
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.outliers import good_monitors, outliers, without
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
@@ -44,6 +34,16 @@ from tmlattice.diagnosis.response.state import (
     bend,
     forbid,
     jump,
+)
+from tmlattice.diagnosis.response.swaps import mislabelled, swaps
+from tmlattice.diagnosis.response.validation import (
+    CORRECTORS,
+    Chi2,
+    Score,
+    against,
+    inner,
+    lost,
+    score,
 )
 from tmlattice.diagnosis.response.weights import used, with_waves
 from tmlattice.errors import TmlatticeError
@@ -164,10 +164,10 @@ def fit_families(
     state = settle(bend(jump(state)), gain=LEADS, alike=True)
     progress("misfits of columns and BPMs")
     state = settle(bend(jump(allow(state, late))), gain=LEADS)
-    swapped = {name for pair in exchanged(state, mislabelled(state)) for name in pair}
-    odd = outliers(state, swapped)
-    messages = list(odd.messages)
-    state, design = without(state, odd.unread), without(design, odd.unread)
+    swapped = {name for pair in swaps(state, mislabelled(state)) for name in pair}
+    found_outliers = outliers(state, swapped)
+    messages = list(found_outliers.messages)
+    state, design = without(state, found_outliers.unread), without(design, found_outliers.unread)
     rejected_steps: list[Step] = []
     state = _undoubted(replace(state, good=good_monitors(state)), messages, rejected_steps)
     state = settle(state, gain=LEADS)

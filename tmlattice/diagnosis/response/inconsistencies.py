@@ -106,16 +106,18 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
     kinds, members = supplied_alike(state.data.ring)
     mean = np.vstack([(members / members.sum(axis=0)).T, np.eye(len(own))])
     names = [*kinds, *(pieces[0].name for pieces in own)]
-    at, said = there.where[single.variable], []
+    at, answers = there.where[single.variable], []
     for found in (alone, both):
         spread = mean @ found.spread[at]
-        said.append((mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1)))
+        answers.append(
+            (mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1))
+        )
     return Inconsistency(
         float(np.sqrt(np.mean(missed**2))),
         float(np.sqrt(np.mean(np.diag(covariance)))),
         total,
         len(read),
-        _pulls(names, *said[0], *said[1], len(kinds)),
+        _pulls(names, *answers[0], *answers[1], len(kinds)),
     )
 
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
 from tmlattice.diagnosis.response.state import WAVED, State
-from tmlattice.diagnosis.response.torn_steps import torn
 from tmlattice.diagnosis.response.weights import FREEDOM, used
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -80,16 +80,16 @@ def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
         explained: correctors that are something else, such as swapped ones: their steps stay.
     """
     data = state.data
-    left = beside_own(state)
+    left = given_own(state)
     single = gross(data, left)
     read = np.isfinite(data.orbits).sum(axis=(1, 2))
     single[single.sum(axis=(1, 2)) > np.maximum(MANY * read, 1)] = False
     left[single] = np.nan
-    broken = torn(without(state, single))
+    broken = inconsistent(without(state, single))
     ratio = misfits(state, left)
     names = data.measured.correctors
-    odd = broken | (ratio > STEP)
-    steps = [c for c in np.flatnonzero(odd).tolist() if names[c] not in explained]
+    found_outliers = broken | (ratio > STEP)
+    steps = [c for c in np.flatnonzero(found_outliers).tolist() if names[c] not in explained]
     unread = single.copy()
     unread[steps] = True
     gone = unread.all(axis=(1, 2)) if steps else np.zeros(len(data.plane), dtype=bool)
@@ -108,7 +108,7 @@ def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
     return Outliers(unread, tuple(messages))
 
 
-def beside_own(state: State) -> Array:
+def given_own(state: State) -> Array:
     """What is left of each step beside its own amounts, which held-out ones have not been fitted
     for: its kick, its place, its roll; least absolute deviations, m, [column, monitor, 2]."""
     data, at = state.data, state.at
@@ -228,7 +228,7 @@ def _usual(state: State, block: int) -> Flags:
         bad = np.ones(data.shape[1], dtype=bool)
         rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, SPARED):
-            rms, gain, count = _beside_own_gain(read[rows], orbits[rows], spared)
+            rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
             told = (count > 0) & state.good
             usual = max(float(np.median(rms[told])), rounded) if told.any() else np.inf
             blind = (gain < BLIND) & (block == 0)
@@ -237,7 +237,7 @@ def _usual(state: State, block: int) -> Flags:
     return good
 
 
-def _beside_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
+def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
     """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
     and of how many readings, [monitor].
 
@@ -359,17 +359,17 @@ def messages(state: State) -> list[str]:
     out = []
     for block in (0, 1):
         use = used(state, block)
-        odd = use & (state.noise.share[block] < limit)
-        rf = np.flatnonzero(odd[-1])
+        found_outliers = use & (state.noise.share[block] < limit)
+        rf = np.flatnonzero(found_outliers[-1])
         if len(rf):
             names = ", ".join(measured.monitors[i] for i in rf)
             out.append(
                 f"readings of the RF's orbit in {'xy'[block]} that are more than {OUT:g} standard "
                 f"deviations off, and count little: {names}"
             )
-        count, total = count + int(odd[:-1].sum()), total + int(use[:-1].sum())
-        monitors.update(measured.monitors[i] for i in np.nonzero(odd[:-1])[1])
-        correctors.update(measured.correctors[i] for i in np.nonzero(odd[:-1])[0])
+        count, total = count + int(found_outliers[:-1].sum()), total + int(use[:-1].sum())
+        monitors.update(measured.monitors[i] for i in np.nonzero(found_outliers[:-1])[1])
+        correctors.update(measured.correctors[i] for i in np.nonzero(found_outliers[:-1])[0])
     if count:
         out.append(
             f"{count} of {total} readings are more than {OUT:g} standard deviations off, and count "

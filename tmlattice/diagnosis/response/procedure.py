@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import combined_p_value
-from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.families.steps import FAMILIES
 from tmlattice.diagnosis.findings import (
     cause_of,
@@ -35,27 +35,27 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.displaced import Displaced, displaced
-from tmlattice.diagnosis.response.exchanged import (
-    PutRight,
-    mislabelled,
-    planes_back,
-    righted,
-    swapped,
-)
-from tmlattice.diagnosis.response.few import few_causes, knows_more
+from tmlattice.diagnosis.response.common_factors import explain_gradients
+from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
 from tmlattice.diagnosis.response.first_guess import FAR, strange
+from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, fit_chi2, fit_families
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
-from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.label_findings import label_findings
+from tmlattice.diagnosis.response.misplaced import Misplaced, misplaced
+from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.outliers import messages, without, without_gross
-from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.remainder import remainder
-from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
+from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.strangers import Strangers, reversed_ones, strangers
-from tmlattice.diagnosis.response.told import told
-from tmlattice.diagnosis.response.unnamed import unnamed
+from tmlattice.diagnosis.response.swaps import (
+    Swaps,
+    labels_corrected,
+    mislabelled,
+    planes_back,
+    swapped_planes,
+)
+from tmlattice.diagnosis.response.unlike_model import RejectedChannels, reversed_ones, unlike_model
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
@@ -122,30 +122,30 @@ def diagnose_response(
     """
     begun = time.perf_counter()
     estimated = measured.noise is None
-    measured = mended(ring, measured, assume)
+    measured = corrected_data(ring, measured, assume)
     families, data = families_of(effects), response_data(ring, measured)
-    said = [*consulted(ring, measured), *assumed_of(measured, data)]
+    said = [*data_checks(ring, measured), *assumed_of(measured, data)]
     measured = replace(data.measured, noise=data.noise) if estimated else measured
     measured, gross = without_gross(measured, data)
     if gross:
         said, data = said + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
-    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
-    if few is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+    sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
+    if sparse is None or overstated(ring, data.measured):  # to such a noise a few explain anything
         whole = _families(ring, measured, families, holdout, seed, progress)
-        few = None if few is None or knows_more(whole[0], few.fit) else few
+        sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
-    if few is None:
-        fit, measured, odd, exchanges = whole
-        said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
-        rejected = tuple(exchanges.rejected)
-        fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, supports, degenerate, correlated = told(fit.state)
+    if sparse is None:
+        fit, measured, unlike, swaps = whole
+        said += unlike if measured.response.size <= LARGE else [*unlike, TOO_LARGE]
+        rejected = tuple(swaps.rejected)
+        fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
+        found, supports, degenerate, correlated = fitted_causes(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
-        fit, found, supports, degenerate, correlated = few.fit, few.told, (), (), ()
-        verdict, findings = few.verdict, few.findings
+        fit, found, supports, degenerate, correlated = sparse.fit, sparse.fitted_causes, (), (), ()
+        verdict, findings = sparse.verdict, sparse.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
@@ -158,14 +158,17 @@ def diagnose_response(
         noise_estimated=estimated,
         verdict=verdict,
         findings=with_consequences(ring, findings, causes),
-        warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
+        warnings=(
+            *said, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
+            *_warnings(fit),
+        ),
         degenerate=degenerate,
         rejected_channels=rejected,
         correlations=correlated,
         supports=supports,
         hypotheses=rows,
-        reasons=None if few is not None else explain_gradients(fit.state),
-        inconsistencies=None if few is not None else inconsistencies(fit.state, false_alarm),
+        common_factors=None if sparse is not None else explain_gradients(fit.state),
+        inconsistencies=None if sparse is not None else inconsistencies(fit.state, false_alarm),
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
 
@@ -177,33 +180,33 @@ def _families(
     holdout: float,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[HierarchicalFit, OrbitResponse, list[str], PutRight]:
+) -> tuple[HierarchicalFit, OrbitResponse, list[str], Swaps]:
     """The fit of what resembles the model; what was fitted, and what was done to it; and
     what is exchanged."""
     said: list[str] = []
-    known = PutRight([], {}, {}, [])
+    known = Swaps([], {}, {}, [])
     fit: HierarchicalFit | None = None
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
-        odd = strangers(state)
+        unlike = unlike_model(state)
         others = set() if fit is None else mislabelled(state)
-        far = fit is None and _far(state, odd)
-        right = None if far else righted(state, measured, known, odd, others)
+        far = fit is None and _far(state, unlike)
+        right = None if far else labels_corrected(state, measured, known, unlike, others)
         if right is not None:
             measured, fit = right[0], None
             said.append(right[1])
             continue
-        crossed = [name for name in swapped(state) if name not in known.planes]
+        crossed = [name for name in swapped_planes(state) if name not in known.planes]
         if crossed:
             known.planes.extend(crossed)
             measured, fit = planes_back(measured, crossed), None
             continue
-        if odd.any:
-            said += odd.said
-            known.rejected.extend([*odd.monitors, *((name, None) for name in odd.correctors)])
-            measured = odd.without(measured)
+        if unlike.any:
+            said += unlike.messages
+            known.rejected.extend([*unlike.monitors, *((name, None) for name in unlike.correctors)])
+            measured = unlike.without(measured)
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))
         elif fit is not None:
@@ -211,17 +214,17 @@ def _families(
         fit = fit_families(data, split, families, progress)
 
 
-def _far(state: State, odd: Strangers) -> bool:
+def _far(state: State, unlike: RejectedChannels) -> bool:
     """Whether the ring is to be fitted before columns are exchanged: in a design that is far off
     they fit in each other's place by chance."""
-    gone = {name for name, _ in odd.monitors}
+    gone = {name for name, _ in unlike.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
 
 
 def _faults(
     fit: HierarchicalFit,
-    exchanges: PutRight,
+    swaps: Swaps,
     effects: Sequence[str] | None,
     most: int,
     judgement: Judgement,
@@ -230,20 +233,22 @@ def _faults(
     """What is wrong alone among small errors, and the fit beside it."""
     state = fit.state
     ring = state.data.ring
-    found = [swap_of(state, name, judgement) for name in exchanges.planes
+    found = [swap_of(state, name, judgement) for name in swaps.planes
              if effects is None or "monitor_swap" in effects]  # fmt: skip
-    far = displaced(state)
+    far = misplaced(state)
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
         sound = _without(state, far)
-        alone = singled_out(sound.data, sound.split, sound, hypotheses, most, judgement, progress)
-        fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
+        alone = detected_faults(
+            sound.data, sound.split, sound, hypotheses, most, judgement, progress
+        )
+        fit = given_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
-    found = [*strongest_first(found)[:most], *unnamed(ring, exchanges, far)]
+    found = [*strongest_first(found)[:most], *label_findings(ring, swaps, far)]
     return fit, strongest_first(found)
 
 
-def _without(state: State, far: Sequence[Displaced]) -> State:
+def _without(state: State, far: Sequence[Misplaced]) -> State:
     """As if these had not been stepped: what they leave is explained, and no single fault's."""
     gone = np.zeros(state.data.orbits.shape, dtype=bool)
     gone[[own.column for own in far]] = True
@@ -251,7 +256,11 @@ def _without(state: State, far: Sequence[Displaced]) -> State:
 
 
 def as_diagnosis(
-    ring: Ring, fit: HierarchicalFit, within: Sequence[Cause], found: Sequence[Told], **told: Any
+    ring: Ring,
+    fit: HierarchicalFit,
+    within: Sequence[Cause],
+    found: Sequence[StatedCause],
+    **fields: Any,
 ) -> Diagnosis:
     """What a fit of a response says, as a diagnosis.
 
@@ -260,7 +269,7 @@ def as_diagnosis(
         fit: with its steps.
         within: what the ring as found has.
         found: causes with their errors.
-        told: what else the diagnosis is to say.
+        fields: further ones of the diagnosis.
     """
     data, good = fit.state.data, fit.state.good
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
@@ -268,7 +277,7 @@ def as_diagnosis(
     corrected = apply(ring, within)
     blocks = remainder(fit.state)
     errors = tuple(sigma for _, sigma in found)
-    named = [(finding.effect or "", finding.element) for finding in told["findings"]]
+    named = [(finding.effect or "", finding.element) for finding in fields["findings"]]
     return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
@@ -302,7 +311,7 @@ def as_diagnosis(
             if name not in {one.name for one in fit.state.apart}
         },
         dispersion=dispersion_beside(fit.state.values, data),
-        **told,
+        **fields,
     )
 
 

@@ -270,7 +270,7 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     scale = 1 + state.at.errors.calibration[:, None]
     # a kick is (1 + calibration) (linear + bent); only in its own plane
     flat = (rows - bent, left + scale * bent) if family.block == 0 else (rows, left)
-    amounts, without, told = np.full((3, len(left)), np.nan)
+    amounts, without, sure = np.full((3, len(left)), np.nan)
     for c in np.flatnonzero(~state.split.held[:-1]):
         seen = np.isfinite(left[c]) & state.good
         near, far = seen & state.split.half[c], seen & ~state.split.half[c]
@@ -280,9 +280,9 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
         for own, read in ((rows[c], left[c]), (flat[0][c], flat[1][c])):
             (amount,), miss = amplitudes(own[:, None], read, near, far)
             mean = np.mean((miss / noise[c, far]) ** 2)
-            if not mean >= told[c]:
-                amounts[c], told[c] = amount, mean
-    return amounts, without, told
+            if not mean >= sure[c]:
+                amounts[c], sure[c] = amount, mean
+    return amounts, without, sure
 
 
 def by_monitors(state: State) -> Array:
@@ -322,8 +322,8 @@ def jump(state: State, beyond: float | None = None) -> State:
         limit = family.gross if beyond is None else beyond * family.trust
         if family.per != "column" or np.isinf(limit):
             continue
-        amounts, without, told = by_columns(state, family)
-        far = state.fitted & (np.abs(amounts) > limit) & (told < ALONE**2 * without)
+        amounts, without, sure = by_columns(state, family)
+        far = state.fitted & (np.abs(amounts) > limit) & (sure < ALONE**2 * without)
         values[family.variable] = values[family.variable] + np.where(far, amounts, 0.0)
     changed = any((values[name] != state.values[name]).any() for name in values)
     return state.moved(values) if changed else state

@@ -81,7 +81,7 @@ class _Missed(NamedTuple):
     rf_monitors: Flags
 
 
-def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
+def _missed(state: State, validation: Flags, rf: Flags | None = None) -> _Missed:
     """What correctors that were not fitted say; see `score`."""
     data, at, half = state.data, state.at, state.split.half
     read = at.seen(at.beam)
@@ -93,7 +93,7 @@ def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
     variance, variance_across = (data.noise_of(block) ** 2 for block in (0, 1))
     inside, jumped, outside, rolled, squares, spread = [], [], [], [], [], []
     cross = []
-    for c in np.flatnonzero(judges):
+    for c in np.flatnonzero(validation):
         seen = np.isfinite(orbits[c]) & state.good
         near, far = seen & half[c], seen & ~half[c]
         if not (near.any() and far.any()):
@@ -117,7 +117,7 @@ def _missed(state: State, judges: Flags, rf: Flags | None = None) -> _Missed:
                    of_rf**2 / variance[-1, judge], judge)  # fmt: skip
 
 
-def score(state: State, judges: Flags, rf: Flags | None = None) -> Score:
+def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
     """What correctors that were not fitted say; each has its kick from its near monitors.
 
     Args:
@@ -125,7 +125,7 @@ def score(state: State, judges: Flags, rf: Flags | None = None) -> Score:
         judges: the correctors that judge, [column].
         rf: monitors that judge the RF's response; None: those that did not fit it.
     """
-    missed = _missed(state, judges, rf)
+    missed = _missed(state, validation, rf)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
     return Score(
         in_plane=rms_of(missed.inside),
@@ -142,7 +142,7 @@ def score(state: State, judges: Flags, rf: Flags | None = None) -> Score:
     )
 
 
-class Judged(NamedTuple):
+class Validated(NamedTuple):
     """What those who choose are left with: sums of squares, m^2, and counts of readings.
 
     Attributes:
@@ -164,7 +164,7 @@ def _logs(sums: Array) -> Array:
         return np.asarray(0.5 * np.log(sums[..., 0] / sums[..., 1]))
 
 
-def inner(state: State) -> Judged:
+def inner(state: State) -> Validated:
     """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
     monitors gives the kick once."""
     other = replace(state, split=replace(state.split, half=~state.split.half))
@@ -180,10 +180,10 @@ def inner(state: State) -> Judged:
     columns = sums[0] + sums[1]
     columns[..., 0] += floor[:2] * columns[..., 1]
     rf[:, 0] += floor[2] * rf[:, 1]
-    return Judged(columns, rf)
+    return Validated(columns, rf)
 
 
-def lost(without: Judged, within: Judged, counts: Array = JUDGES) -> tuple[float, float]:
+def lost(without: Validated, within: Validated, counts: Array = JUDGES) -> tuple[float, float]:
     """By how much the judges' figures rise, and its standard error: by the jackknife, each
     corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing.
 

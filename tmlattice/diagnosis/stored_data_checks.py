@@ -32,7 +32,7 @@ Flags = NDArray[np.bool_]
 OTHER = 0.3
 """Share that differs from the design's from which data are not those of the ring as stated: strong
 errors everywhere (a beta beat of a half) leave 0.1."""
-MENDED = 0.35
+CORRECTED = 0.35
 """Share of that at most which is left where a global error is undone."""
 TUNE = 0.1
 """From the design's tune to one that is another ring's, or of the other plane."""
@@ -44,30 +44,32 @@ Change = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
-class Mend:
+class GlobalError:
     """Something that may be wrong everywhere: its words, what mends it, how it is undone in data
     [..., monitor, plane, ...]."""
 
     words: str
-    mend: str
+    correction: str
     undo: Change
 
 
-EXCHANGED = Mend(
+SWAPPED = GlobalError(
     "the planes are exchanged everywhere", "exchange x and y", lambda data: data[..., ::-1]
 )
 
 
-def _of_lines() -> list[Mend]:
+def _of_lines() -> list[GlobalError]:
     """Of lines [shot, mode, monitor, plane]. An orbit is too smooth to tell the order of monitors:
     the dispersion of a machine with small errors is as near to that of the next ones."""
-    turned = Mend("the turns are numbered backwards", "number them from the kick on", np.conj)
-    reverse = Mend(
+    turned = GlobalError(
+        "the turns are numbered backwards", "number them from the kick on", np.conj
+    )
+    reverse = GlobalError(
         "the monitors are in reverse order", "reverse the order of the monitors' names",
         lambda data: data[..., ::-1, :],
     )  # fmt: skip
     shifted = [
-        Mend(
+        GlobalError(
             f"the monitors are shifted by {by:+d}",
             f"give each the readings of the {abs(by)}. monitor {'behind' if by > 0 else 'before'}",
             lambda data, by=by: np.roll(data, -by, axis=-2),  # type: ignore[misc]
@@ -77,17 +79,21 @@ def _of_lines() -> list[Mend]:
     return [turned, reverse, *shifted]
 
 
-SIGN = Mend(
+SIGN = GlobalError(
     "the sign is wrong everywhere", "change the sign of the readings, or of the step",
     lambda data: -data,
 )  # fmt: skip
 SIGNS = [
     SIGN,
-    Mend("the sign of x is wrong", "change the sign of x", lambda d: d * np.array([-1.0, 1.0])),
-    Mend("the sign of y is wrong", "change the sign of y", lambda d: d * np.array([1.0, -1.0])),
+    GlobalError(
+        "the sign of x is wrong", "change the sign of x", lambda d: d * np.array([-1.0, 1.0])
+    ),
+    GlobalError(
+        "the sign of y is wrong", "change the sign of y", lambda d: d * np.array([1.0, -1.0])
+    ),
 ]
 UNITS = [
-    Mend(
+    GlobalError(
         f"the unit is wrong: readings are {name}", f"multiply them by {factor:g}",
         lambda data, factor=factor: data * factor,  # type: ignore[misc]
     )
@@ -96,7 +102,7 @@ UNITS = [
         ("1000 times too small", 1e3), ("a million times too small", 1e6),
     )
 ]  # fmt: skip
-WHOLE = [*SIGNS, *UNITS, EXCHANGED]
+WHOLE = [*SIGNS, *UNITS, SWAPPED]
 """What an orbit's change tells."""
 
 
@@ -143,10 +149,10 @@ def stored_checks(ring: Ring, data: StoredData, turns: ManyTurns | None = None) 
     except MeasurementError as error:
         return [*checks, wrong("data", str(error))]
     if not any(data.settings) or len(own.data) < 2:
-        said = (
+        text = (
             "one orbit is the sum of all errors: it tells neither signs nor the order of monitors"
         )
-        return [*checks, fine(GLOBAL, said)]
+        return [*checks, fine(GLOBAL, text)]
     changes = own.data - own.data.mean(axis=0)
     return [*checks, *_of_orbits(ring, own, changes, "orbit change", WHOLE)]
 
@@ -160,7 +166,7 @@ def _values(data: TurnByTurn | ClosedOrbit | Dispersion) -> Array:
 
 # --- orbits ---------------------------------------------------------------------------------------
 def _of_orbits(
-    ring: Ring, problem: Stored, data: Array, what: str, mends: list[Mend]
+    ring: Ring, problem: Stored, data: Array, what: str, corrections: list[GlobalError]
 ) -> list[Check]:
     """Data [state, monitor, 2] beside what the design does."""
     design = problem.read(problem.view(()), NOTHING)
@@ -176,7 +182,7 @@ def _of_orbits(
         size = np.sum(np.where(there, own, 0.0) ** 2) + np.sum(np.where(there, design, 0.0) ** 2)
         return float(max(left - noise, 0.0) / max(size, 1e-300))
 
-    return _judged(ring, what, share, data, mends)
+    return _judged(ring, what, share, data, corrections)
 
 
 # --- turns ----------------------------------------------------------------------------------------
@@ -192,7 +198,7 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
         left = 1 - inner / np.maximum(sizes, 1e-300)
         return float(np.median(left[sizes > 0])) if (sizes > 0).any() else 1.0
 
-    def exchanged(_: ComplexArray) -> ComplexArray:
+    def swaps(_: ComplexArray) -> ComplexArray:
         """Anew: each line is looked for near to the tune of its plane."""
         try:
             other = replace(data, readings=data.readings[..., ::-1], noise=None)
@@ -200,10 +206,10 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
         except MeasurementError:
             return np.full(modes.shape, complex(np.nan, np.nan))
 
-    mends = [replace(EXCHANGED, undo=exchanged), *_of_lines()]
-    said = [note("lines", one) for one in problem.said]
+    corrections = [replace(SWAPPED, undo=swaps), *_of_lines()]
+    text = [note("lines", one) for one in problem.said]
     tunes = _near(ring, problem.data[:, -2:], problem.used[:, -2:])
-    return [*said, tunes, *_judged(ring, "line", share, _lines(problem), mends)]
+    return [*text, tunes, *_judged(ring, "line", share, _lines(problem), corrections)]
 
 
 def _lines(problem: ManyTurns) -> ComplexArray:
@@ -248,33 +254,33 @@ def _tunes(near: Array, data: TuneReading, ring: Ring) -> list[Check]:
     if stated < TUNE:
         return [fine("tunes", told)]
     words = min(others, key=lambda name: off(np.array(others[name][0])))
-    if off(np.array(others[words][0])) < MENDED * stated:
+    if off(np.array(others[words][0])) < CORRECTED * stated:
         return [wrong(GLOBAL, f"{words}: {told}; {others[words][1]}")]
     return [wrong("tunes", f"the tunes are not the ring's: {told}; name the lattice as it is set")]
 
 
 # --- what is said ---------------------------------------------------------------------------------
 def _judged(
-    ring: Ring, what: str, share: Callable[[Any], float], data: Any, mends: list[Mend]
+    ring: Ring, what: str, share: Callable[[Any], float], data: Any, corrections: list[GlobalError]
 ) -> list[Check]:
     """The share that differs as stated, and with each thing undone that may be wrong."""
     stated = share(data)
-    said = f"the typical {what} is the design's to {100 * np.sqrt(stated):.0f} % of its size"
+    text = f"the typical {what} is the design's to {100 * np.sqrt(stated):.0f} % of its size"
     if stated < OTHER:
         return [
-            fine(GLOBAL, "no global error would make the data agree better"), fine("lattice", said)
+            fine(GLOBAL, "no global error would make the data agree better"), fine("lattice", text)
         ]  # fmt: skip
-    left = [share(one.undo(data)) for one in mends]
+    left = [share(one.undo(data)) for one in corrections]
     best = int(np.argmin(left))
-    if left[best] < MENDED * stated:
-        one = mends[best]
+    if left[best] < CORRECTED * stated:
+        one = corrections[best]
         after = 100 * np.sqrt(left[best])
         return [
             wrong(
                 GLOBAL,
                 f"{one.words}: the typical {what} differs from the design's by "
                 f"{100 * np.sqrt(stated):.0f} % of its size as stated, by {after:.0f} % with that "
-                f"undone; {one.mend}",
+                f"undone; {one.correction}",
             )
         ]
     return [

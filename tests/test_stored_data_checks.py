@@ -13,7 +13,7 @@ from conftest import SMALL
 
 from tmlattice import diagnose, write_measurement
 from tmlattice.challenge.kinds import measure
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import TuneReading
 
@@ -45,7 +45,7 @@ def step(data, change):
 def test_small_errors_are_nothing_global(small_ring, sound, kind):
     found = check_data(small_ring, sound[kind])
     assert found.kind == kind
-    assert found.status != "wrong", [check.sentence for check in found.told]
+    assert found.status != "wrong", [check.sentence for check in found.reported]
     document = json.loads(json.dumps(found.as_json()))
     schema = resources.files("tmlattice") / "schemas" / "check.schema.json"
     jsonschema.validate(document, json.loads(schema.read_text()))

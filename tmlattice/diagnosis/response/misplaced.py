@@ -35,7 +35,7 @@ FEWEST = 8
 _MAD = 1.4826  # of a Gaussian
 
 
-class Displaced(NamedTuple):
+class Misplaced(NamedTuple):
     """A corrector that answers as if it stood elsewhere.
 
     Attributes:
@@ -53,7 +53,7 @@ class Displaced(NamedTuple):
     gain: float
 
 
-def displaced(state: State) -> list[Displaced]:
+def misplaced(state: State) -> list[Misplaced]:
     """Those that are.
 
     Args:
@@ -62,9 +62,9 @@ def displaced(state: State) -> list[Displaced]:
     data, at = state.data, state.at
     beam, jumps = (data.pick(at.seen(own)) for own in (at.beam, at.jumps))
     orbits = data.pick(data.orbits)
-    far: list[Displaced] = []
+    far: list[Misplaced] = []
     for plane in (0, 1):
-        found: list[Displaced] = []
+        found: list[Misplaced] = []
         for c in np.flatnonzero(data.plane[:-1] == plane):
             seen = np.isfinite(orbits[c]) & state.good
             if seen.sum() < FEWEST or not jumps[c, seen].any():
@@ -78,7 +78,7 @@ def displaced(state: State) -> list[Displaced]:
             noise = data.noise_of(0)[c, seen]
             gain = float(np.sum((left**2 - moved**2) / noise**2))
             name = data.measured.correctors[c]
-            found.append(Displaced(name, int(c), size, less, float(by), gain))
+            found.append(Misplaced(name, int(c), size, less, float(by), gain))
         if len(found) < FEWEST:
             continue
         usual = float(np.median([own.left for own in found]))
@@ -122,7 +122,7 @@ def clear(
     return seen & ~between if few else seen
 
 
-def moved_text(own: Displaced) -> str:
+def moved_text(own: Misplaced) -> str:
     """How far off it is, and what that mends."""
     return (
         f"{abs(own.by):.2g} m {'down' if own.by > 0 else 'up'}stream ({1e6 * own.left:.2g} µm are "

@@ -124,11 +124,11 @@ def weigh(
                 chosen.append(best)
                 left.remove(best)
 
-    told = [
+    helpful = [
         i for i, (answer, rms) in enumerate(zip(alone, random, strict=True))
         if rms is None or answer.in_plane < HELPS * rms
     ]  # fmt: skip
-    helpers = [i for i in told if _helps(found[i], alone[i], base)]
+    helpers = [i for i in helpful if _helps(found[i], alone[i], base)]
     take(helpers)
     first = [found[k] for k in chosen]
     on_top = {
@@ -137,7 +137,7 @@ def weigh(
         if i not in chosen
     }
     before = together
-    take([i for i, answer in on_top.items() if i in told and _helps(found[i], answer, before)])
+    take([i for i, answer in on_top.items() if i in helpful and _helps(found[i], answer, before)])
     four = base.in_plane, base.position, together.in_plane, together.position
     out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
     for i, hypothesis in enumerate(found):
@@ -146,7 +146,7 @@ def weigh(
             judgement = "helps"
         elif i in helpers:
             judgement = "helps, not on top"
-        elif i not in told and _helps(hypothesis, alone[i], base):
+        elif i not in helpful and _helps(hypothesis, alone[i], base):
             judgement = "as random ones do"
         else:
             judgement = _refusal(hypothesis, alone[i], beside, base, before)

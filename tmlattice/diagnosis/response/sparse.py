@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, Step
-from tmlattice.diagnosis.response.judges import score
-from tmlattice.diagnosis.response.left_open import Blur, LeftOpen
-from tmlattice.diagnosis.response.one_change import OneChange
+from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
+from tmlattice.diagnosis.response.undetermined import Blur, Undetermined
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect
@@ -73,7 +73,7 @@ hypotheses that are weighed among it, before and after one of them is known to e
 
 
 @dataclass(frozen=True)
-class Few:
+class SparseFit:
     """What few causes explain.
 
     Attributes:
@@ -89,8 +89,8 @@ class Few:
     fit: HierarchicalFit
     findings: tuple[Finding, ...]
     verdict: str
-    told: list[Told]
-    said: tuple[str, ...]
+    fitted_causes: list[StatedCause]
+    messages: tuple[str, ...]
     noise: bool
 
 
@@ -105,7 +105,7 @@ class _Search(Search):
     stated: float = -np.inf
 
 
-def few_causes(
+def sparse_fit(
     data: ResponseData,
     split: Split,
     effects: Sequence[str] | None,
@@ -113,8 +113,8 @@ def few_causes(
     judgement: Judgement,
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
-    open_: LeftOpen | None = None,
-) -> Few | None:
+    open_: Undetermined | None = None,
+) -> SparseFit | None:
     """The few causes of a response, or None where few do not explain it.
 
     Args:
@@ -158,14 +158,14 @@ def few_causes(
         found = _among_open(search, problem, before, found, open_)
     if found is None:
         return None
-    return _told(data, split, problem.base, found, count, most, judgement)
+    return _result(data, split, problem.base, found, count, most, judgement)
 
 
-def knows_more(fit: HierarchicalFit, few: HierarchicalFit) -> bool:
+def outperforms(fit: HierarchicalFit, sparse: HierarchicalFit) -> bool:
     """Whether correctors that were not fitted say that a fit of everything knows more than a few
     causes do, of the monitors that it takes for good and the planes that were read."""
     of_all = fit.heldout[1]
-    of_few = score(replace(few.state, good=fit.state.good), few.state.split.held)
+    of_few = score(replace(sparse.state, good=fit.state.good), sparse.state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
     return bool(np.nansum(gained) < np.log(LESS))
 
@@ -195,7 +195,7 @@ def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
 
 
 def _among_open(
-    search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: LeftOpen
+    search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
 ) -> Explanation | None:
     """The same where what causes do is known no better than the ring is: one cause, and what is
     seen beside it, where that is likelier than what was found, else what was found."""
@@ -209,7 +209,7 @@ def _among_open(
     if detection.p_value > plain.judgement.false_alarm:
         return found
     blur = Blur(plain, open_)
-    changes = OneChange(blur)
+    changes = SingleChange(blur)
     starts: dict[Hypothesis, float | None] = {
         h: None for h in search.hypotheses if isinstance(find(h[0]), FamilyEffect)
     }
@@ -298,7 +298,7 @@ def _used(data: ResponseData, split: Split) -> Flags:
     return np.isfinite(data.orbits) & (~half[:, None] | split.half)[:, :, None]
 
 
-def _told(
+def _result(
     data: ResponseData,
     split: Split,
     base: Predicted,
@@ -306,12 +306,12 @@ def _told(
     count: int,
     most: int,
     judgement: Judgement,
-) -> Few:
+) -> SparseFit:
     found = finished(found)
     causes = found.fit.causes
     p_value = float(chi2.sf(found.fit.chi2, count - len(causes)))
     findings = findings_of(data.ring, found, (), judgement)
-    verdict, findings, said = verdict_of(
+    verdict, findings, messages = verdict_of(
         replace(found, full=False), findings, p_value, False, judgement
     )
     design = begin(data, split)
@@ -324,7 +324,7 @@ def _told(
     heldout = (score(design, split.held), score(state, split.held))
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
     dense = HierarchicalFit(design, state, tuple(steps), (), heldout)
-    told = list(zip(causes, errors, strict=True))
+    fitted_causes = list(zip(causes, errors, strict=True))
     less = p_value > 1 - judgement.noise[1]
     noise = p_value >= judgement.noise[1] and not less
-    return Few(dense, findings[:most], verdict, told, said, noise)
+    return SparseFit(dense, findings[:most], verdict, fitted_causes, messages, noise)

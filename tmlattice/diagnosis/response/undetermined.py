@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOpen:
+class Undetermined:
     """Errors of a machine that are not known, Gaussian.
 
     Attributes:
@@ -52,7 +52,7 @@ ORBITS = (
 a change of sextupoles does."""
 
 
-def left_open(state: State) -> LeftOpen:
+def undetermined(state: State) -> Undetermined:
     """By a fit that has settled, with its priors."""
     blocks: list[dict[Hypothesis, Array]] = []
     for block in (block for block in (0, 1) if state.of_block(block)):
@@ -77,15 +77,15 @@ def left_open(state: State) -> LeftOpen:
         for hypothesis, number in own.items():
             root[where[hypothesis]] = number
         roots.append(root)
-    return LeftOpen(hypotheses, np.hstack([np.zeros((len(hypotheses), 0)), *roots]))
+    return Undetermined(hypotheses, np.hstack([np.zeros((len(hypotheses), 0)), *roots]))
 
 
-def and_orbits(ring: Ring, open_: LeftOpen) -> LeftOpen:
+def and_orbits(ring: Ring, open_: Undetermined) -> Undetermined:
     """With orbits as large as usual errors make them."""
     usual = background_rms(dict.fromkeys(ORBITS))
     unseen = [(name, place) for name in ORBITS for place in find(name).places(ring)]
     alone = np.diag([usual[name] for name, _ in unseen])
-    return LeftOpen((*open_.hypotheses, *unseen), block_diag(open_.root, alone))
+    return Undetermined((*open_.hypotheses, *unseen), block_diag(open_.root, alone))
 
 
 STRONGEST, HARDLY = 200, 0.1
@@ -93,7 +93,7 @@ STRONGEST, HARDLY = 200, 0.1
 of their noise."""
 
 
-def strongest(problem: Response, open_: LeftOpen, causes: Sequence[Cause]) -> LeftOpen:
+def strongest(problem: Response, open_: Undetermined, causes: Sequence[Cause]) -> Undetermined:
     """Of the errors those, with what is known of them together, that move most what causes make of
     the readings.
 
@@ -111,7 +111,7 @@ def strongest(problem: Response, open_: LeftOpen, causes: Sequence[Cause]) -> Le
     order = np.argsort(-moved, kind="stable")[:STRONGEST]
     kept = np.sort(order[moved[order] > HARDLY])
     root = np.linalg.qr(open_.root[kept].T)[1].T
-    return LeftOpen(tuple(open_.hypotheses[i] for i in kept), root)
+    return Undetermined(tuple(open_.hypotheses[i] for i in kept), root)
 
 
 class Blur:
@@ -122,7 +122,7 @@ class Blur:
         open_: what is not known of it.
     """
 
-    def __init__(self, problem: Response, open_: LeftOpen) -> None:
+    def __init__(self, problem: Response, open_: Undetermined) -> None:
         self.problem, self.open = problem, open_
 
     @cached_property

@@ -115,8 +115,8 @@ class Instead:
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
-        reasons = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
-        return {"probability": self.probability, "reasons": reasons}
+        common_factors = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
+        return {"probability": self.probability, "common_factors": common_factors}
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Outlier:
 
 
 @dataclass(frozen=True)
-class Reasons:
+class CommonFactors:
     """What is behind the gradients.
 
     Attributes:
@@ -156,7 +156,7 @@ class Reasons:
             reason one by one.
     """
 
-    reasons: tuple[Reason, ...]
+    common_factors: tuple[Reason, ...]
     instead: tuple[Instead, ...]
     outliers: tuple[Outlier, ...]
     share: float
@@ -166,7 +166,7 @@ class Reasons:
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
         return {
-            "reasons": [own.as_json() for own in self.reasons],
+            "common_factors": [own.as_json() for own in self.common_factors],
             "instead": [own.as_json() for own in self.instead],
             "outliers": [own.as_json() for own in self.outliers],
             "share": self.share,
@@ -175,7 +175,7 @@ class Reasons:
         }
 
 
-def explain_gradients(state: State) -> Reasons | None:
+def explain_gradients(state: State) -> CommonFactors | None:
     """The few reasons behind the gradients of a dense fit; None where none were fitted."""
     family = QuadrupoleGradient()
     if family.variable not in state.values or not family.size(state.data):
@@ -207,7 +207,7 @@ def explain_gradients(state: State) -> Reasons | None:
         if one.statistic >= CLEAR  # families that do not stand out are in the sets all the same
     ]
     places = [pieces[0].name for pieces in own]
-    reasons = tuple(
+    common_factors = tuple(
         Reason(
             kinds[one.candidate], names[one.candidate],
             tuple(places[i] for i in np.flatnonzero(members[:, one.candidate])),
@@ -230,8 +230,8 @@ def explain_gradients(state: State) -> Reasons | None:
         ))
         for one in sets[1 : SETS + 1] if one.probability > LIKELY
     )  # fmt: skip
-    return Reasons(
-        reasons,
+    return CommonFactors(
+        common_factors,
         instead,
         _outliers(
             places,

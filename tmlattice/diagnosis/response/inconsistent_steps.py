@@ -17,7 +17,7 @@ from tmlattice.diagnosis.response.state import State
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-TORN = 5.0
+INCONSISTENT = 5.0
 """Times what the typical column's typical triple breaks."""
 NOISE = 2.0
 """Times the readings' noise, at least."""
@@ -30,7 +30,7 @@ BLIND = 0.2
 _MAD = 1.4826  # of a Gaussian
 
 
-def torn(state: State) -> Flags:
+def inconsistent(state: State) -> Flags:
     """Columns whose readings belong to no orbit, [column].
 
     Args:
@@ -41,16 +41,16 @@ def torn(state: State) -> Flags:
     for plane in (0, 1):
         rows = np.flatnonzero(data.plane[:-1] == plane)
         broken = np.array([_broken(state, int(c), plane) for c in rows])
-        told = np.isfinite(broken)
-        if told.sum() < COLUMNS:
+        stray = np.isfinite(broken)
+        if stray.sum() < COLUMNS:
             continue
         noise = float(np.median(data.noise[:, plane]))
-        limit = max(TORN * float(np.median(broken[told])), NOISE * noise)
+        limit = max(INCONSISTENT * float(np.median(broken[stray])), NOISE * noise)
         share = broken / orbits_of(state, rows)  # a larger step breaks more
-        odd = told & (np.where(told, broken, 0.0) > limit)
-        odd &= np.where(told, share, 0.0) > TORN * float(np.median(share[told]))
-        if odd.sum() <= MOST * told.sum():
-            out[rows[odd]] = True
+        bad = stray & (np.where(stray, broken, 0.0) > limit)
+        bad &= np.where(stray, share, 0.0) > INCONSISTENT * float(np.median(share[stray]))
+        if bad.sum() <= MOST * stray.sum():
+            out[rows[bad]] = True
     return out
 
 

@@ -22,7 +22,6 @@ from tmlattice.diagnosis.families.orbit_modes import HorizontalOrbit, VerticalOr
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, Step, fit_chi2
-from tmlattice.diagnosis.response.judges import Chi2, score
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.others import KINDS, with_number
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
@@ -30,6 +29,7 @@ from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, sma
 from tmlattice.diagnosis.response.state import Apart, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
+from tmlattice.diagnosis.response.validation import Chi2, score
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import Judgement
@@ -74,7 +74,7 @@ MEMBERS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class SingledOut:
+class DetectedFaults:
     """What stands out.
 
     Attributes:
@@ -86,7 +86,7 @@ class SingledOut:
     faults: tuple[Fault, ...]
 
 
-def singled_out(
+def detected_faults(
     data: ResponseData,
     split: Split,
     fitted: State,
@@ -94,7 +94,7 @@ def singled_out(
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any] = lambda stage: None,
-) -> SingledOut:
+) -> DetectedFaults:
     """Faults one after another, each beside those before it.
 
     Args:
@@ -122,7 +122,7 @@ def singled_out(
     seen = search.seen(search.state)
     errors = search.state.at.errors
     faults = [as_turned(search.fault(seen, one), errors, data) for one in search.state.apart]
-    return SingledOut(search.state, tuple(sorted(faults, key=lambda fault: -fault.statistic)))
+    return DetectedFaults(search.state, tuple(sorted(faults, key=lambda fault: -fault.statistic)))
 
 
 class _Search:
@@ -172,10 +172,10 @@ class _Search:
         causes = tuple(one.cause for one in seen.suspects)
         largest = np.array([find(name).largest for name, _ in causes])
         possible = np.abs(own.amount) < BEYOND * largest
-        said = linear_evidence(
+        messages = linear_evidence(
             self.problem, Scan(causes, own.statistic, own.amount, information, 1.0)
         )
-        return np.where(possible, said, -np.inf)
+        return np.where(possible, messages, -np.inf)
 
     def next(self) -> State | None:
         """With one cause more, the likeliest that stands out; None: none does."""
@@ -384,7 +384,7 @@ def _stepped(state: State) -> State:
 
 
 # --- what is told ---------------------------------------------------------------------------------
-def beside_faults(fit: HierarchicalFit, apart: Sequence[Apart]) -> HierarchicalFit:
+def given_faults(fit: HierarchicalFit, apart: Sequence[Apart]) -> HierarchicalFit:
     """The dense fit with the faults' numbers free of their families, as a step more; as it was,
     where held-out correctors want none of it."""
     state = fit.state

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.displaced import displaced
+from tmlattice.diagnosis.response.misplaced import misplaced
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.strangers import ODD, Strangers, strangers
+from tmlattice.diagnosis.response.unlike_model import ODD, RejectedChannels, unlike_model
 from tmlattice.measurement import OrbitResponse
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ SHARE = 0.25
 Pair = tuple[str, str]
 
 
-class PutRight(NamedTuple):
+class Swaps(NamedTuple):
     """What was exchanged: planes of monitors; pairs of correctors, and of monitors, and by how much
     chi-square fell once they were put right, with the typical noise. And what was rejected: a
     monitor with its plane, or a corrector with None."""
@@ -37,8 +37,12 @@ class PutRight(NamedTuple):
     rejected: list[tuple[str, str | None]]
 
 
-def righted(
-    state: State, measured: OrbitResponse, known: PutRight, odd: Strangers, among: Collection[str]
+def labels_corrected(
+    state: State,
+    measured: OrbitResponse,
+    known: Swaps,
+    odd: RejectedChannels,
+    among: Collection[str],
 ) -> tuple[OrbitResponse, str] | None:
     """The measurement with pairs exchanged that were not known, and what they are, in words; None
     where there are none.
@@ -50,11 +54,11 @@ def righted(
         odd: what resembles nothing.
         among: correctors that may answer as others should.
     """
-    pairs = _new(exchanged(state, {*odd.correctors, *among}), known.correctors)
+    pairs = _new(swaps(state, {*odd.correctors, *among}), known.correctors)
     if pairs:
-        return put_right(measured, pairs), told(pairs)
-    pairs = _new(exchanged_monitors(state, {name for name, _ in odd.monitors}), known.monitors)
-    return (monitors_back(measured, pairs), told(pairs, "monitors")) if pairs else None
+        return correctors_back(measured, pairs), swap_message(pairs)
+    pairs = _new(swapped_monitors(state, {name for name, _ in odd.monitors}), known.monitors)
+    return (monitors_back(measured, pairs), swap_message(pairs, "monitors")) if pairs else None
 
 
 def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
@@ -67,10 +71,10 @@ def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
 def mislabelled(state: State) -> set[str]:
     """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
     leaves far more of them than of the others."""
-    return {*(own.name for own in displaced(state)), *strangers(state, ODD).correctors}
+    return {*(own.name for own in misplaced(state)), *unlike_model(state, ODD).correctors}
 
 
-def exchanged(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
+def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
     """Pairs, and by how much chi-square falls: neighbours of a plane, in beam order, then any two
     of some that may be exchanged, and any two that move the beam in each other's plane. None
     stands in two of them.
@@ -119,7 +123,7 @@ def _suspects(
     yield [0, 1], product(*(turned[data.plane[turned] == p] for p in (0, 1)))
 
 
-def told(pairs: Iterable[Pair], what: str = "correctors") -> str:
+def swap_message(pairs: Iterable[Pair], what: str = "correctors") -> str:
     """In words."""
     both = ", ".join(f"{a} and {b}" for a, b in pairs)
     return (
@@ -128,7 +132,7 @@ def told(pairs: Iterable[Pair], what: str = "correctors") -> str:
     )
 
 
-def put_right(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
+def correctors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
     """The measurement with their columns exchanged."""
     order = np.arange(len(measured.correctors))
     for pair in pairs:
@@ -139,7 +143,7 @@ def put_right(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
     )
 
 
-def exchanged_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
+def swapped_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
     """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains, and by
     how much chi-square falls; none stands in two.
 
@@ -182,7 +186,7 @@ def monitors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitRespon
     return replace(measured, response=measured.response[:, order], noise=noise, rf=rf)
 
 
-def swapped(state: State) -> list[str]:
+def swapped_planes(state: State) -> list[str]:
     """Monitors that read in each plane what the model has in the other one, whatever their gain."""
     data, read = state.data, state.at.seen(state.at.beam)
     found = []

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from tmlattice.diagnosis.response.left_open import Blur
+from tmlattice.diagnosis.response.undetermined import Blur
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.among import Blurred
@@ -87,7 +87,7 @@ def _peaks(amounts: Array, seen: Array, inner: bool) -> Indices:
     return np.array(found, dtype=int)
 
 
-class OneChange:
+class SingleChange:
     """Changes of one machine, one at a time.
 
     Args:

@@ -19,7 +19,7 @@ from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.absent import in_the_lattice
 from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
-from tmlattice.diagnosis.stored_doctor import StoredData, stored_checks
+from tmlattice.diagnosis.stored_data_checks import StoredData, stored_checks
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.lattice import Ring
@@ -49,7 +49,7 @@ ENERGY = 0.02
 ALIEN = 0.85
 """Share of the orbit that no trajectory of a section explains, of which noise or readings in no
 order leave all and strong errors everywhere 0.7: the data are of another ring."""
-MENDED = 0.1
+CORRECTED = 0.1
 """Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
 the lattice that is wrong."""
 FAR = 100.0
@@ -104,8 +104,8 @@ def check_data(
         checks.append(few)
     elif isinstance(data, Measurement):
         known = tuple(expected_radiation(ring)) if radiation else ()
-        mended = assume(in_beam_order(data, names), assumed, names)
-        checks += _of_first_turns(ring, mended, known)
+        corrected = assume(in_beam_order(data, names), assumed, names)
+        checks += _of_first_turns(ring, corrected, known)
     else:
         checks += _of_response(ring, assume(in_beam_order(data, names), assumed, names))
     return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
@@ -127,11 +127,11 @@ def _of_stored(
 
 
 _GLOBAL = "signs, units and order"
-_TOLD = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
+_REPORTED = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
 """Of what is noted, what the diagnosis does not find by itself."""
 
 
-def consulted(
+def data_checks(
     ring: Ring,
     data: Measurement | OrbitResponse,
     radiation: bool = False,
@@ -146,7 +146,7 @@ def consulted(
     own = check_data(ring, data, radiation=radiation)
     if reference is None:
         own.stop()
-        return [check.sentence for check in own.told if check.name in _TOLD]
+        return [check.sentence for check in own.reported if check.name in _REPORTED]
     other = check_data(ring, reference, radiation=radiation)
     wrong, as_wrong = (
         {check.name for check in one.checks if check.status == "wrong"} for one in (own, other)
@@ -154,16 +154,17 @@ def consulted(
     alone = "{} alone (mend its file, --assume is of both): "
     own.stop("" if wrong <= as_wrong else alone.format("the second measurement"))
     other.stop(alone.format("the reference"))
-    said, told = (
-        [check.sentence for check in one.told if check.name in _TOLD] for one in (own, other)
+    text, reported = (
+        [check.sentence for check in one.reported if check.name in _REPORTED]
+        for one in (own, other)
     )
-    return said + [f"the reference: {sentence}" for sentence in told if sentence not in said]
+    return text + [f"the reference: {sentence}" for sentence in reported if sentence not in text]
 
 
 Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)
 
 
-def mended(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
+def corrected_data(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
     """The data, if there are some, with what is assumed undone."""
     if data is None or not assumed:
         return data
@@ -240,12 +241,12 @@ def _sentence(verdict: Verdict) -> Check:
     if not np.isfinite(before):
         where, before, after = "", verdict.before[0], verdict.after[0]
     sure = certain(verdict)
-    said = (
+    text = (
         f"{words if sure else f'it may be that {words}'}{others}: chi-square per reading{where} "
         f"{_number(before)} as stated, {_number(after)} with that undone; {mend}"
     )
     make = wrong if sure else note
-    return make("signs, units and order", said, before=before, after=after, assume=verdict.names)
+    return make("signs, units and order", text, before=before, after=after, assume=verdict.names)
 
 
 def _options(names: Iterable[str]) -> str:
@@ -322,13 +323,13 @@ def _noise(judge: Judge, passes: Passes, found: Found) -> Check:
             "go on with --assume noise-from-data",
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
-    said = f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}"
+    text = f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}"
     if level <= UNDER:
-        return fine("noise", said)
+        return fine("noise", text)
     if random is None:
         return note(
             "noise",
-            f"{said}: the noise is larger than stated, or errors all along the ring are as large; "
+            f"{text}: the noise is larger than stated, or errors all along the ring are as large; "
             f"{len(judge.measurement.shots)} shots do not show which: take {PASSES} or more",
         )
     return fine(
@@ -352,7 +353,7 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
     square = found.level
     usual = np.median(found.misfit, axis=0) < SPOILT * square  # [section]
     odd = there & (found.misfit > SPOILT * square) & usual
-    told = []
+    reported = []
     for p, w in np.argwhere(odd):
         alone = found.left[p, w] ** 2 / np.maximum(found.free[p, w], 0.05)
         worst = int(alone.argmax())
@@ -360,10 +361,10 @@ def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
         if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
             name = judge.measurement.monitors[found.owner[w, worst]]
             shot = judge.measurement.shots[passes.shot[p]]
-            told.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
-    if not told:
+            reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
+    if not reported:
         return none
-    return note("spikes", f"single readings far off: {signals.some(told)}; leave them empty")
+    return note("spikes", f"single readings far off: {signals.some(reported)}; leave them empty")
 
 
 # --- an orbit response ----------------------------------------------------------------------------
@@ -377,7 +378,7 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
         judge = judge.mended(verdict.names)
     left = judge.misfit(())
     typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
-    if typical > (MENDED if verdicts else ANOTHER):
+    if typical > (CORRECTED if verdicts else ANOTHER):
         guess = _far(ring, data)
         if guess is not None and guess.left < BETTER * typical:
             far = note(
@@ -399,29 +400,29 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
         )]  # fmt: skip
     if not verdicts:
         checks.append(fine(_GLOBAL, "no global error would make the response agree better"))
-    said = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
-    return [*checks, *map(_of_all, verdicts), *_rf_step(judge), fine("lattice", said)]
+    text = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
+    return [*checks, *map(_of_all, verdicts), *_rf_step(judge), fine("lattice", text)]
 
 
 def _of_all(verdict: ResponseVerdict) -> Check:
     words, others, mend = _words(verdict.names, verdict.alike)
     before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
-    said = (
+    text = (
         f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
         f"stated, by {after:.0f} % with that undone; {mend}"
     )
-    return wrong(_GLOBAL, said, assume=verdict.names)
+    return wrong(_GLOBAL, text, assume=verdict.names)
 
 
 def _rf_step(judge: ResponseJudge) -> list[Check]:
     scale = judge.rf_scale()
     if not max(abs(scale), 1 / abs(scale)) > SCALED:
         return []
-    said = (
+    text = (
         f"the RF's orbit is {scale:.3g} times what its step makes of the design's: mend its unit "
         "(m) or the step's (Hz), or leave it out"
     )
-    return [wrong("RF step", said)]
+    return [wrong("RF step", text)]
 
 
 def _far(ring: Ring, data: OrbitResponse) -> Guess | None:

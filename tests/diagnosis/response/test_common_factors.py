@@ -8,7 +8,7 @@ import pytest
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
-from tmlattice.diagnosis.response.reasons import (
+from tmlattice.diagnosis.response.common_factors import (
     Instead,
     Reason,
     Reasons,
@@ -24,7 +24,11 @@ from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
-from tmlattice.report.response_text import instead_texts, reason_rows, reasons_sentence
+from tmlattice.report.response_text import (
+    common_factor_rows,
+    common_factors_sentence,
+    instead_texts,
+)
 
 SINGLE = QuadrupoleGradient()
 
@@ -55,10 +59,10 @@ def explained(ring, shared, extra=(), seed=1):
 )
 def test_what_all_or_one_polarity_share_is_one_reason(small_ring, shared, name, amount):
     found = explained(small_ring, shared)
-    assert found.reasons[0].name == name
-    assert abs(found.reasons[0].amount - amount) < 4 * found.reasons[0].amount_sigma
-    assert found.reasons[0].amount_sigma < 0.3 * amount
-    assert len(found.reasons) == 1
+    assert found.common_factors[0].name == name
+    assert abs(found.common_factors[0].amount - amount) < 4 * found.common_factors[0].amount_sigma
+    assert found.common_factors[0].amount_sigma < 0.3 * amount
+    assert len(found.common_factors) == 1
     assert found.share > 0.9
     assert found.outliers == ()
 
@@ -66,20 +70,20 @@ def test_what_all_or_one_polarity_share_is_one_reason(small_ring, shared, name, 
 def test_a_magnet_that_no_magnet_is_like_is_flagged(small_ring, monkeypatch):
     more = [Cause("quadrupole_gradient", "QD::5", 0.04)]
     found = explained(small_ring, {"QF": 0.0, "QD": 0.0}, more)
-    assert [own.name for own in found.reasons] == ["QD::5"]
+    assert [own.name for own in found.common_factors] == ["QD::5"]
     (outlier,) = found.outliers
     assert outlier.element == "QD::5"
     assert abs(outlier.amount - 0.04) < 0.005
     # ALS: six magnets -3 +- 3 %, whose family's size is unknown
     monkeypatch.setattr(
-        "tmlattice.diagnosis.response.reasons.of_sizes",
+        "tmlattice.diagnosis.response.common_factors.of_sizes",
         lambda state, block, there: 0.03 * np.eye(len(there.start)),
     )
     assert explained(small_ring, {"QF": 0.0, "QD": 0.0}, more).outliers == ()
 
 
 def test_small_scatter_alone_has_no_reason(small_ring):
-    assert explained(small_ring, {"QF": 0.0, "QD": 0.0}).reasons == ()
+    assert explained(small_ring, {"QF": 0.0, "QD": 0.0}).common_factors == ()
 
 
 def test_arcs_and_straights_are_regions(small_ring):
@@ -176,8 +180,8 @@ def test_other_sets_are_told_by_what_is_otherwise_in_them():
         ),
         (), 0.5, 1e-3, 0.005,
     )  # fmt: skip
-    told = SimpleNamespace(reasons=found)
-    assert [row[0] for row in reason_rows(told)] == [
+    told = SimpleNamespace(common_factors=found)
+    assert [row[0] for row in common_factor_rows(told)] == [
         "qa",
         "qb (likely to 60 %)",
         "qc (or qd, 40 %)",
@@ -186,4 +190,4 @@ def test_other_sets_are_told_by_what_is_otherwise_in_them():
         "qb +5.00 ± 0.10 % (30 %)",
         "qd -1.00 ± 0.20 %; without qb, qc (20 %)",
     ]
-    assert "Families differ by 0.5 % (rms)" in reasons_sentence(told)
+    assert "Families differ by 0.5 % (rms)" in common_factors_sentence(told)

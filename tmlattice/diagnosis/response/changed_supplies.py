@@ -18,9 +18,9 @@ from scipy.linalg import block_diag
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import cause_of, finding_of
-from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, strongest
 from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, strongest
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
@@ -71,8 +71,8 @@ class _Weighed:
     evidence: float
 
 
-def what_changed(
-    state: State, judgement: Judgement, open_: LeftOpen | None = None
+def changed_supplies(
+    state: State, judgement: Judgement, open_: Undetermined | None = None
 ) -> tuple[list[Finding], dict[str, float]]:
     """Supplies, magnets and devices that changed: all of them, for what is left out is scatter.
 
@@ -104,7 +104,7 @@ def what_changed(
     return found, scatter
 
 
-def _blurred(problem: Response, open_: LeftOpen, found: Sequence[Finding]) -> dict[int, Array]:
+def _blurred(problem: Response, open_: Undetermined, found: Sequence[Finding]) -> dict[int, Array]:
     """What errors of the ring that are not known make of what changed, m, of each block [error,
     column, monitor]."""
     data = problem.base.data

@@ -10,7 +10,7 @@ import pytest
 
 from tmlattice import diagnose, load_ring
 from tmlattice.diagnosis.families.steps import FAMILIES
-from tmlattice.diagnosis.response.displaced import displaced, moved_text
+from tmlattice.diagnosis.response.misplaced import misplaced, moved_text
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause
@@ -64,7 +64,7 @@ def test_a_corrector_that_stands_elsewhere_is_seen_where_it_stands(
     data = response_data(lattice, measured_with(machine))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     state = settle(jump(allow(begin(data, split), FAMILIES[:3])))
-    (found,) = displaced(state)
+    (found,) = misplaced(state)
     assert found.name == data.measured.correctors[found.column] == name
     assert found.by == pytest.approx(by, abs=0.01)  # beside noise of 2e-8 m in orbits of 1e-6
     assert found.gain > 1e4
@@ -127,4 +127,4 @@ def test_nothing_is_said_of_correctors_that_stand_where_they_should(small_ring):
     response[measured.correctors.index("v5"), ::6, 1] *= 1.5
     data = response_data(small_ring, replace(measured, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    assert displaced(begin(data, split)) == []
+    assert misplaced(begin(data, split)) == []

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.correlations import Correlation, correlations_of
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import Stated, stated
@@ -21,14 +21,14 @@ AGAINST, SHOWN = 0.4, 3
 """Posterior correlation from which on numbers are degenerate, and how many are named."""
 
 
-def told(
+def fitted_causes(
     state: State,
-) -> tuple[list[Told], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...]]:
+) -> tuple[list[StatedCause], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...]]:
     """Causes with stated errors; how much of each comes from the data; what the data alone do not
     settle, in words; and the amounts that they hardly separate."""
-    found: list[Told] = []
+    found: list[StatedCause] = []
     supports: list[Support] = []
-    said: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     pairs: list[Correlation] = []
     for block in (0, 1):
         families = {f.variable: f for f in state.of_block(block)}
@@ -43,8 +43,8 @@ def told(
                 supports.append(support)
         pairs += _correlated(state, families.values(), there, known.covariance)
         if block == 0:
-            said = _degenerate(state, there, posterior)
-    return found, tuple(supports), said, tuple(pairs)
+            messages = _degenerate(state, there, posterior)
+    return found, tuple(supports), messages, tuple(pairs)
 
 
 def _correlated(
@@ -68,7 +68,7 @@ def _correlated(
 
 def with_support(
     state: State, families: Collection[Family], there: Linear, known: Stated
-) -> Iterator[tuple[Told, Support]]:
+) -> Iterator[tuple[StatedCause, Support]]:
     """Yield the causes of some families of a block, and how much of each comes from the data.
 
     Args:
@@ -79,9 +79,9 @@ def with_support(
     numbers = _numbers(state, families, there)
     for family in families:
         own, values = there.where[family.variable], state.values[family.variable]
-        rows = family.told(state.at.errors, values, known.sigma[own], state.data)
+        rows = family.causes_of(state.at.errors, values, known.sigma[own], state.data)
         # the errors before the data in the units of the causes
-        before = family.told(state.at.errors, values, known.prior[own], state.data)
+        before = family.causes_of(state.at.errors, values, known.prior[own], state.data)
         for row, (_, prior) in zip(rows, before, strict=True):
             yield row, _support(row, prior, own, known.covariance, numbers)
 
@@ -99,7 +99,7 @@ def _numbers(state: State, families: Iterable[Family], there: Linear) -> Hypothe
 
 
 def _support(
-    row: Told, prior: float, own: slice, covariance: Array, numbers: Hypotheses
+    row: StatedCause, prior: float, own: slice, covariance: Array, numbers: Hypotheses
 ) -> Support:
     """Of one cause, with its error before the data; `own` are its family's numbers."""
     cause, sigma = row
@@ -123,7 +123,7 @@ def _support(
 
 def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
     """The scale that gains and calibrations share."""
-    said = []
+    messages = []
     columns, monitors = state.data.shape
     m = 2 * monitors
     spread = posterior.spread
@@ -133,9 +133,9 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
     kick = draws[m : m + columns - 1].mean(axis=0)
     if scale.any() and kick.any():  # both are fitted
         both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
-        said.append(
+        messages.append(
             f"mean monitor gain against mean corrector scale: known to "
             f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
             f"{both:+.2f}"
         )
-    return tuple(said)
+    return tuple(messages)

@@ -11,7 +11,7 @@ from command import tmlattice
 from conftest import SMALL
 
 from tmlattice.diagnosis import diagnose
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.machine import simulate
@@ -130,7 +130,7 @@ SICK = {
 def test_healthy_data_of_a_sick_machine_tell_nothing(small_ring, kind):
     causes, options = SICK[kind]
     data = simulate(small_ring, causes, **{"shots": 6, "seed": 5, **options}).measurement()
-    told = check_data(small_ring, data).told
+    told = check_data(small_ring, data).reported
     assert [check.sentence for check in told if check.name != "noise"] == []
     assert all("shots do not show which" in check.sentence for check in told)  # small errors
 
@@ -138,7 +138,7 @@ def test_healthy_data_of_a_sick_machine_tell_nothing(small_ring, kind):
 def test_few_monitors_tell_nothing(small_ring, healthy):
     for names in (healthy.monitors[3:5], healthy.monitors[::9], healthy.monitors[::4]):
         data = healthy.select(monitors=names)
-        assert check_data(small_ring, data).told == ()
+        assert check_data(small_ring, data).reported == ()
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
@@ -191,7 +191,7 @@ def test_launches_far_from_the_stated_ones_are_noted(small_ring, healthy):
     data = replace(data, launch_sigma=healthy.launch_sigma / 10)
     (check,) = told(check_data(small_ring, data), "note")
     assert (check.name, check.assume) == ("launches", ("launches-unknown",))
-    assert check_data(small_ring, data, assumed=check.assume).told == ()
+    assert check_data(small_ring, data, assumed=check.assume).reported == ()
 
 
 def test_another_energy_than_the_lattice_is_noted(small_ring, healthy):
@@ -231,7 +231,7 @@ def test_what_is_wrong_everywhere_in_an_orbit_response_is_named(small_ring, step
         data = assume(steps, [undone], monitors)
     (check,) = told(check_data(small_ring, data))
     assert name in check.assume or f"--assume {name}" in check.sentence
-    assert check_data(small_ring, data, assumed=check.assume).told == ()
+    assert check_data(small_ring, data, assumed=check.assume).reported == ()
 
 
 @pytest.mark.parametrize(
@@ -268,11 +268,11 @@ def test_an_rf_orbit_in_millimetres_is_told(small_ring):
 
 
 def test_a_bad_corrector_or_monitor_is_no_global_error(small_ring, steps):
-    assert check_data(small_ring, steps).told == ()
+    assert check_data(small_ring, steps).reported == ()
     response = steps.response.copy()
     response[4] *= -1
     response[:, 7, 0] *= -1
-    assert check_data(small_ring, replace(steps, response=response)).told == ()
+    assert check_data(small_ring, replace(steps, response=response)).reported == ()
 
 
 def test_diagnose_stops_and_goes_on_with_what_is_assumed(small_ring, machine):

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 from tmlattice.diagnosis.findings import located
 from tmlattice.diagnosis.places import between
-from tmlattice.diagnosis.response.displaced import Displaced, moved_text
-from tmlattice.diagnosis.response.exchanged import PutRight
+from tmlattice.diagnosis.response.misplaced import Misplaced, moved_text
+from tmlattice.diagnosis.response.swaps import Swaps
 from tmlattice.diagnosis.result import Finding
 from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
@@ -22,8 +22,8 @@ NEAR = 0.25
 """Of the ring: two that stand nearer have one place."""
 
 
-def unnamed(
-    ring: Ring, exchanged: PutRight, displaced: Sequence[Displaced] = (), other: str = "should"
+def label_findings(
+    ring: Ring, swaps: Swaps, misplaced: Sequence[Misplaced] = (), other: str = "should"
 ) -> list[Finding]:
     """All of them.
 
@@ -35,13 +35,13 @@ def unnamed(
             "did" in a measurement before.
     """
     found = []
-    for what, pairs in (("correctors", exchanged.correctors), ("monitors", exchanged.monitors)):
+    for what, pairs in (("correctors", swaps.correctors), ("monitors", swaps.monitors)):
         for (a, b), gain in pairs.items():
             words = f"{what} {a} and {b} answer each as the other one {other}"
             check = "Follow the cables of both, and look at the table of their names."
             found.append(_finding(ring, (a, b), Detection.among(gain, len(ring.elements)), words,
                                   check))  # fmt: skip
-    for own in displaced:
+    for own in misplaced:
         words = f"corrector {own.name} answers as if it stood {moved_text(own)}"
         check = (
             "Check its place in the lattice, which magnet the name is, and that no other one is "

@@ -30,7 +30,7 @@ MOST = 0.25
 
 
 @dataclass(frozen=True)
-class Strangers:
+class RejectedChannels:
     """What resembles nothing.
 
     Attributes:
@@ -47,15 +47,17 @@ class Strangers:
         return bool(self.monitors or self.correctors)
 
     @property
-    def said(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """In words."""
         found = []
         if self.monitors:
-            told = ", ".join(f"{name} in {plane}" for name, plane in self.monitors)
-            found.append(f"readings that resemble nothing in the model, left out: {told}")
+            sentence = ", ".join(f"{name} in {plane}" for name, plane in self.monitors)
+            found.append(f"readings that resemble nothing in the model, left out: {sentence}")
         if self.correctors:
-            told = ", ".join(self.correctors)
-            found.append(f"correctors whose orbits resemble nothing in the model, left out: {told}")
+            sentence = ", ".join(self.correctors)
+            found.append(
+                f"correctors whose orbits resemble nothing in the model, left out: {sentence}"
+            )
         return tuple(found)
 
     def without(self, measured: OrbitResponse) -> OrbitResponse:
@@ -76,7 +78,7 @@ def reversed_ones(state: State) -> list[str]:
     """A sentence of monitors and correctors that the fit says have the wrong sign."""
     errors, measured = state.at.errors, state.data.measured
     gains = np.diagonal(errors.monitors, axis1=1, axis2=2)
-    said = []
+    messages = []
     for what, names in (
         ("monitors that read", [
             f"{measured.monitors[m]} in {'xy'[p]}"
@@ -87,11 +89,11 @@ def reversed_ones(state: State) -> list[str]:
         ]),
     ):  # fmt: skip
         if names:
-            said.append(f"{what} with the wrong sign: {', '.join(names)}")
-    return said
+            messages.append(f"{what} with the wrong sign: {', '.join(names)}")
+    return messages
 
 
-def strangers(state: State, least: float = STRANGE) -> Strangers:
+def unlike_model(state: State, least: float = STRANGE) -> RejectedChannels:
     """Those among the readings in each column's own plane.
 
     Args:
@@ -107,14 +109,14 @@ def strangers(state: State, least: float = STRANGE) -> Strangers:
         if not len(rows):
             continue
         there = np.isfinite(orbits[rows]) & state.good
-        bad = _strange(read[rows], orbits[rows], there, least)
+        bad = _unlike(read[rows], orbits[rows], there, least)
         monitors += [(data.measured.monitors[m], "xy"[p]) for m in np.flatnonzero(bad)]
-        odd = _strange(read[rows].T, orbits[rows].T, (there & ~bad).T, least)
+        odd = _unlike(read[rows].T, orbits[rows].T, (there & ~bad).T, least)
         correctors += [data.measured.correctors[rows[c]] for c in np.flatnonzero(odd)]
-    return Strangers(tuple(monitors), tuple(correctors))
+    return RejectedChannels(tuple(monitors), tuple(correctors))
 
 
-def _strange(model: Array, read: Array, there: Flags, least: float) -> Flags:
+def _unlike(model: Array, read: Array, there: Flags, least: float) -> Flags:
     """Of each column of [reading, one]: whether no multiple of the model explains it."""
     u, d = np.where(there, model, 0.0), np.where(there, read, 0.0)
     size = (d**2).sum(axis=0)
