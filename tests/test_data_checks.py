@@ -1,4 +1,4 @@
-"""The data doctor: what is wrong everywhere is named, and healthy data of sick machines are not."""
+"""The data checks: what is wrong everywhere is named, and healthy data of sick machines are not."""
 
 import json
 from dataclasses import replace

@@ -65,7 +65,7 @@ def test_of_a_reference_too(small_ring, response):
     assert sum("not in the lattice" in said for said in found.warnings) == 2
 
 
-def test_the_doctor_notes_it(small_ring, response):
+def test_the_data_checks_note_it(small_ring, response):
     notes = [check for check in check_data(small_ring, with_more(response)).reported
              if check.name == "names"]  # fmt: skip
     assert len(notes) == 2

@@ -1,4 +1,4 @@
-"""What the data doctor says: one sentence for each thing that was looked at."""
+"""The result of the data checks: one sentence for each thing that was looked at."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

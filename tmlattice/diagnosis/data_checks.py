@@ -1,4 +1,4 @@
-"""The data doctor: what is wrong with a measurement as a whole, before any fault is sought.
+"""The data checks: what is wrong with a measurement as a whole, before any fault is sought.
 
 >>> checkup = check_data(load_ring("petra3"), read_measurement("day_1"))
 >>> [check.sentence for check in checkup.told]
@@ -53,7 +53,7 @@ CORRECTED = 0.1
 """Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
 the lattice that is wrong."""
 FAR = 100.0
-"""Square of the sigma by which launches may differ from the stated ones: benchmarks/doctor.py."""
+"""Square of the sigma by which launches may differ from the stated ones: benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first monitors spoil them by."""
 SECTIONS = 4

@@ -1,4 +1,4 @@
-"""The data doctor of a stored beam: turns, closed orbits, dispersion and tunes, as a whole.
+"""The data checks of a stored beam: turns, closed orbits, dispersion and tunes, as a whole.
 
 Small errors of a ring leave its lines, its dispersion and its orbits' changes nearly those of the
 design; exchanged planes, a wrong sign or unit, monitors in another order do not, and another ring

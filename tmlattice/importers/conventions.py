@@ -1,6 +1,6 @@
 """What a measured response says of how it was made and written down, beside the design's.
 
-A wrong sign, unit or order everywhere is the data doctor's to find (`diagnosis.doctor`). Here each
+A wrong sign, unit or order everywhere is found by the data checks (`diagnosis.data_checks`). Here each
 corrector and each monitor is set beside the design's own, and it is asked whether the RF frequency
 stood still or the momentum did. Nothing is mended.
 """

@@ -10,7 +10,7 @@ Names = tuple[str, ...]
 
 GAIN, CERTAIN = 12.0, 15.0
 """Log evidence from which a global error is told, and from which it is certain: no healthy
-measurement of `benchmarks/doctor.py` gains as much."""
+measurement of `benchmarks/data_checks.py` gains as much."""
 SHARE = 0.65
 """Of all that it changes, how much it has to change for the better: a fault's section may win much
 by chance, but then many others lose."""

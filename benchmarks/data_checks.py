@@ -1,4 +1,4 @@
-"""How well the data doctor judges: `python benchmarks/doctor.py [RING ...]`.
+"""How often the data checks are right: `python benchmarks/data_checks.py [RING ...]`.
 
 Two tables for each ring, on first turns of the virtual machine. Data that are wrong everywhere: is
 it named, and nothing else, in how many seconds? Healthy data of sick and of real machines: is
