@@ -70,7 +70,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         lines += wrapped(diagnosis.assessment.sentence(topic), "", width)
     small = small_rows(diagnosis)
     if small:
-        lines += ["", "Small errors everywhere:"]
+        lines += ["", "Distributed errors:"]
         size = max(len(name) for name, _ in small)
         for name, text in small:
             lines += wrapped(text, f"   {name:<{size}}   ", width)
@@ -81,7 +81,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
     if diagnosis.verdict == "none":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
         if rows:
-            lines += ["", "Would have been seen, at half of the places where it can sit, from:"]
+            lines += ["", "Detection limits, at half of the places of each effect:"]
             lines += columns(rows, "   ")
     if large := large_text(diagnosis):
         lines += ["", *wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width)]
