@@ -67,7 +67,7 @@ FILES = {path: taken for glob, taken in TEXTS.items() for path in sorted(ROOT.gl
 def test_words_are_the_fields(path):
     text = FILES[path](path)
     wrong = [
-        f"'{found[0]}' in '...{text[max(found.start() - 40, 0) : found.end() + 20]}...' -> {instead}"
+        f"'{found[0]}' in '{text[max(found.start() - 40, 0) : found.end() + 20]}' -> {instead}"
         for words, instead in WORDS
         for found in re.finditer(rf"\b(?:{words})\b", text, re.IGNORECASE)
     ]
