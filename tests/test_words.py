@@ -58,7 +58,7 @@ def prose(path):
     return re.sub(r"\]\([^)]*\)", "]", text)
 
 
-TEXTS = {"README.md": prose, "CHANGELOG.md": prose, "docs/**/*.md": prose}
+TEXTS = dict.fromkeys(("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**/*.md"), prose)
 """Files by glob, and how their prose is taken from them."""
 FILES = {path: taken for glob, taken in TEXTS.items() for path in sorted(ROOT.glob(glob))}
 
