@@ -4,6 +4,7 @@ To extend it: a pair in `WORDS` (a word that is looked for, whatever its case, a
 its place), or a glob in `TEXTS` with how its prose is taken from the file.
 """
 
+import json
 import re
 from pathlib import Path
 
@@ -48,9 +49,20 @@ WORDS = (
 """Words (without the letters about them, in any case), and what to say instead."""
 
 
-def prose(path):
-    """The text of a Markdown page without code, links' addresses, and generated tables."""
-    text = path.read_text(encoding="utf-8")
+def page(path):
+    """The prose of a Markdown page."""
+    return prose(path.read_text(encoding="utf-8"))
+
+
+def notebook(path):
+    """The prose of the Markdown cells of a notebook."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    own = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
+    return prose("\n\n".join(own))
+
+
+def prose(text):
+    """Markdown without code, links' addresses, and what is generated."""
     text = re.sub(r"^(```|~~~).*?^\1\s*$", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!--.*?-->|\$\$.*?\$\$", "", text, flags=re.DOTALL)
     text = re.sub(r"`[^`\n]*`", "`code`", text)
@@ -58,7 +70,10 @@ def prose(path):
     return re.sub(r"\]\([^)]*\)", "]", text)
 
 
-TEXTS = dict.fromkeys(("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**/*.md"), prose)
+TEXTS = {
+    "README.md": page, "CHANGELOG.md": page, "CONTRIBUTING.md": page, "docs/**/*.md": page,
+    "notebooks/*.ipynb": notebook,
+}  # fmt: skip
 """Files by glob, and how their prose is taken from them."""
 FILES = {path: taken for glob, taken in TEXTS.items() for path in sorted(ROOT.glob(glob))}
 
