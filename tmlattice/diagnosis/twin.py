@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 PRODUCTS = 2e12
 """Readings times errors squared up to which the covariance of all small errors is taken from a
-response: some six minutes of processor (`docs/results/together.md`)."""
+response: some six minutes of processor (`docs/together.md`)."""
 HARDLY = 0.3
 """Relative error of a family's size from which on the usual one is not made smaller: a response
 sees kicks by the orbit in the sextupoles alone, of which it is not linear."""
