@@ -53,7 +53,8 @@ CORRECTED = 0.1
 """Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
 the lattice that is wrong."""
 FAR = 100.0
-"""Square of the sigma by which launches may differ from the stated ones: benchmarks/data_checks.py."""
+"""Square of the sigma by which launches may differ from the stated ones, by
+benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first monitors spoil them by."""
 SECTIONS = 4

@@ -9,9 +9,9 @@ import pytest
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
 from tmlattice.diagnosis.response.common_factors import (
+    CommonFactors,
     Instead,
     Reason,
-    Reasons,
     explain_gradients,
     weighed,
 )
@@ -171,7 +171,7 @@ def test_other_sets_are_told_by_what_is_otherwise_in_them():
     def reason(name, amount, probability, rivals=()):
         return Reason("family", name, (), amount, 1e-3, probability, 30.0, "", rivals)
 
-    found = Reasons(
+    found = CommonFactors(
         (reason("qa", 0.01, 1.0), reason("qb", 0.02, 0.6), reason("qc", 0.03, 0.5, (("qd", 0.4),))),
         (
             Instead(0.3, (("qa", 0.0102, 1e-3), ("qb", 0.05, 1e-3), ("qc", 0.03, 1e-3))),
