@@ -53,7 +53,7 @@ KICK = 2e-5
 """rad; of AT's steps, small enough for orbits in proportion to them."""
 
 
-class Known(NamedTuple):
+class DistributedErrors(NamedTuple):
     """What was fitted to the first day: causes, and kicks that only the dispersion has."""
 
     causes: list[Cause]
@@ -113,7 +113,7 @@ def first_day(ring, measured):
     causes = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
     data = response_data(ring, measured)
     fitted = Predicted(data, errors_beside(data, found.dispersion).with_causes(data, causes))
-    known = Known(causes, kicks_astray(fitted))
+    known = DistributedErrors(causes, kicks_astray(fitted))
     model = simulated(ring, known, measured)
     read, told, kicks = as_kicked(measured, model)
     good = stranger(read, told, 1) < STRANGE

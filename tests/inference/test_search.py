@@ -10,9 +10,9 @@ import pytest
 from tmlattice import diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.inference import search as own
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.newton import fit
 from tmlattice.inference.options import Option
-from tmlattice.inference.rivals import Detection
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 

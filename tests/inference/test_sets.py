@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from tmlattice.inference.levels import Levels
+from tmlattice.inference.common_factors import FactorModel
 from tmlattice.inference.sets import likely_sets, over_sets
 
 FAMILIES = np.kron(np.eye(4), np.ones((10, 1)))
@@ -20,7 +20,7 @@ def levels(means, noise=0.1, candidates=CANDIDATES, seed=0):
     values = FAMILIES @ np.array(means, dtype=float)
     values = values + noise * np.random.default_rng(seed).standard_normal(40)
     information = np.eye(40) / noise**2
-    return Levels(
+    return FactorModel(
         information,
         information @ values,
         candidates,
@@ -101,7 +101,7 @@ def test_sets_are_told_though_likelier_ones_are_not_clear():
     values[17] += 4.7 * noise - (values[17] - 1)
     information = np.eye(40) / noise**2
     slab = np.append(np.full(5, 3.0), 0.5)
-    other = Levels(information, information @ values, more, np.full(40, 1e-12), slab)
+    other = FactorModel(information, information @ values, more, np.full(40, 1e-12), slab)
     other.cost[:5] = own.cost
     other.cost[5] = -8.0
     sets = likely_sets(other, 5)
@@ -134,7 +134,7 @@ def test_where_nothing_is_there_the_empty_set_is_told():
 def test_amounts_are_told_over_whether_a_neighbour_is_there():
     """Two numbers that are hardly told apart, one of which is clear: by enumeration."""
     information = np.array([[4.0, 3.9], [3.9, 4.0]]) * 1e2
-    own = Levels(
+    own = FactorModel(
         information, information @ [0.8, 0.5], np.eye(2), np.full(2, 1e-12), np.full(2, 3.0)
     )
     alone, both = own.fitted([0]), own.fitted([0, 1])

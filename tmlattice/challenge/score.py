@@ -43,7 +43,7 @@ from tmlattice.challenge.record import (
 )
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError, plain
-from tmlattice.inference.judge import held_out_gap
+from tmlattice.inference.validation import held_out_gap
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns, judged

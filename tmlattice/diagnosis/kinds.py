@@ -15,9 +15,9 @@ from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.prepare import batch, prepare
 from tmlattice.diagnosis.stored_doctor import refused
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     ClosedOrbit,
@@ -115,7 +115,7 @@ def part_of(label: str, measured: Measured, how: How) -> Part:
     raise TypeError(f"{type(measured).__name__} is no measurement")
 
 
-def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together:
+def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> CombinedProblem:
     """Measurements as one problem, beside those of a reference; stored beams of the same machine
     share the models made of it."""
     kept = Kept()
@@ -130,7 +130,7 @@ def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together
         own.first if part.start is None else part.start
         for part, own in zip((*parts, *before), (*first, *then), strict=True)
     )
-    whole = Together.of(first, then)
+    whole = CombinedProblem.of(first, then)
     return replace(whole, places=how.places, judgement=how.judgement, starts=starts)
 
 

@@ -16,22 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from tmlattice.inference.common import beside
+from tmlattice.inference.common import times_precision
 from tmlattice.inference.normal import shared_by
 from tmlattice.inference.slopes import Slopes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-ALONE = 0.75
+MAX_LEVERAGE = 0.75
 """Share of what is known of a number from which a cluster is not held against the others: they know
 too little of it. The cluster is then taken for as far off as it is elsewhere."""
 
-MOST = 64
+MAX_CLUSTERS = 64
 """Columns, and monitors, that are taken out, drawn at random where there are more: what is sought
 is how much they contradict one another in the mean."""
 
-LEAST = 1e-11
+MIN_SHARE = 1e-11
 """What others know of a number beside a cluster, at least, as a share."""
 
 
@@ -60,7 +60,7 @@ class Rows(NamedTuple):
         return np.asarray(out)
 
 
-class Found(NamedTuple):
+class LinearFit(NamedTuple):
     """A linear fit, and quantities that are linear in its parameters.
 
     Attributes:
@@ -76,13 +76,13 @@ class Found(NamedTuple):
     variance: Array
 
     @classmethod
-    def of(cls, matrix: Array, covariance: Array) -> "Found":
+    def of(cls, matrix: Array, covariance: Array) -> "LinearFit":
         """Of the parameters themselves."""
         return cls(matrix, covariance, covariance, np.diag(covariance))
 
 
-def widened(
-    rows: Rows, weight: Array, residual: Array, found: Found, taken: Array | None = None
+def cluster_robust_errors(
+    rows: Rows, weight: Array, residual: Array, found: LinearFit, taken: Array | None = None
 ) -> Array:
     """Errors of a fit's quantities, widened where clusters of readings contradict one another.
 
@@ -100,21 +100,21 @@ def widened(
         Standard deviations, [quantity].
     """
     # what the readings' noise makes of the variance; the rest is the prior's
-    told = (found.along * (found.matrix @ found.along)).sum(axis=0)
-    more = np.zeros_like(told)
+    noise_variance = (found.along * (found.matrix @ found.along)).sum(axis=0)
+    more = np.zeros_like(noise_variance)
     for clusters in (_of_columns, _of_monitors):
         shares, mismatch = _mismatches(clusters(rows, weight, residual, taken), found)
         size = np.maximum(shares.sum(axis=0), 1e-300)
         more += np.maximum((shares * mismatch).sum(axis=0) / size - 1, 0)
-    return np.asarray(np.sqrt(np.maximum(found.variance + told * more, 0)))
+    return np.asarray(np.sqrt(np.maximum(found.variance + noise_variance * more, 0)))
 
 
 def _drawn(weight: Array, axis: int) -> Indices:
     """Clusters that are taken out, of those that have readings along an axis."""
     found = np.flatnonzero(weight.sum(axis))
-    if len(found) <= MOST:
+    if len(found) <= MAX_CLUSTERS:
         return found
-    return np.sort(np.random.default_rng(0).permutation(found)[:MOST])
+    return np.sort(np.random.default_rng(0).permutation(found)[:MAX_CLUSTERS])
 
 
 class _Cluster(NamedTuple):
@@ -162,7 +162,7 @@ def _of_monitors(
 ) -> Iterator[_Cluster]:
     """Of one monitor each, one reading of a column: by the inverse covariance of the column, less
     what its other readings tell."""
-    pulled = weight * residual if taken is None else beside(weight, taken, residual)
+    weighted = weight * residual if taken is None else times_precision(weight, taken, residual)
     shared = (
         None if taken is None else (taken, shared_by(*rows[:3], (Slopes(rows.by_ring),), taken))
     )
@@ -171,14 +171,14 @@ def _of_monitors(
         monitor, alone, others = np.full(len(column), own), weight[column, own], None
         root = np.sqrt(alone)
         if shared is not None:
-            here, told = shared[0][column, own], shared[1][:, column]
+            here, noise_variance = shared[0][column, own], shared[1][:, column]
             root = np.sqrt(alone - np.sum(here**2, axis=1))
-            others = np.einsum("ck,pck->cp", here / root[:, None], told)
-        left = pulled[column, own] / root
+            others = np.einsum("ck,pck->cp", here / root[:, None], noise_variance)
+        left = weighted[column, own] / root
         yield _Cluster(rows, column, monitor, alone / root, others, left)
 
 
-def _mismatches(clusters: Iterable[_Cluster], found: Found) -> tuple[Array, Array]:
+def _mismatches(clusters: Iterable[_Cluster], found: LinearFit) -> tuple[Array, Array]:
     """Of each cluster its share of what is known of every quantity, and the square of what it says
     beside all others over what is expected of that, [cluster, quantity]."""
     known = found.variance > 0
@@ -194,18 +194,18 @@ def _mismatches(clusters: Iterable[_Cluster], found: Found) -> tuple[Array, Arra
         whole = np.where(known, found.variance + grown, 1.0)
         share = np.where(known, grown / whole, 0.0)
         own = moved**2 / grown
-        judged = np.where(share < ALONE, share, 0.0)
-        elsewhere = float(judged @ own) / max(float(judged.sum()), 1e-300)
+        leverage = np.where(share < MAX_LEVERAGE, share, 0.0)
+        elsewhere = float(leverage @ own) / max(float(leverage.sum()), 1e-300)
         shares.append(share)
-        mismatch.append(np.where(share < ALONE, own, elsewhere))
+        mismatch.append(np.where(share < MAX_LEVERAGE, own, elsewhere))
     return np.array(shares), np.array(mismatch)
 
 
 def _apart(inside: Array, right: Array) -> Array:
     """(1 - inside)^-1 right; what a cluster knows alone is limited to what can be told from 1."""
-    matrix = (1 + LEAST) * np.eye(len(inside)) - inside
+    matrix = (1 + MIN_SHARE) * np.eye(len(inside)) - inside
     try:
         return np.asarray(cho_solve(cho_factor(matrix), right))
     except np.linalg.LinAlgError:  # lost in rounding: readings far above their noise
         size, vectors = np.linalg.eigh(matrix)
-        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, LEAST)[:, None]))
+        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, MIN_SHARE)[:, None]))

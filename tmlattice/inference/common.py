@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 
 def _root(weight: Array, patterns: Array) -> tuple[Array, Array]:
     """P W [column, pattern, monitor], and R [column, pattern, pattern]."""
-    pulled = patterns * weight[:, None]
-    inside = pulled @ patterns.transpose(0, 2, 1) + np.eye(patterns.shape[1])
-    return pulled, np.asarray(np.linalg.cholesky(inside))
+    weighted = patterns * weight[:, None]
+    inside = weighted @ patterns.transpose(0, 2, 1) + np.eye(patterns.shape[1])
+    return weighted, np.asarray(np.linalg.cholesky(inside))
 
 
 def common(weight: Array, patterns: Array) -> tuple[Array, Array]:
@@ -30,12 +30,12 @@ def common(weight: Array, patterns: Array) -> tuple[Array, Array]:
         L, [column, monitor, pattern]: diag(weight) - L L^T is the inverse covariance of a column.
         Logarithm of the determinant of W^-1 + P^T P over that of W^-1, [column].
     """
-    pulled, root = _root(weight, patterns)
-    taken = np.linalg.solve(root, pulled).transpose(0, 2, 1)
+    weighted, root = _root(weight, patterns)
+    taken = np.linalg.solve(root, weighted).transpose(0, 2, 1)
     return np.asarray(taken), 2 * np.log(np.einsum("ckk->ck", root)).sum(axis=1)
 
 
-def amounts(weight: Array, patterns: Array, left: Array) -> tuple[Array, Array]:
+def amounts(weight: Array, patterns: Array, residual: Array) -> tuple[Array, Array]:
     """The likeliest amounts of patterns in common, [column, pattern], and their covariances,
     [column, pattern, pattern].
 
@@ -43,14 +43,14 @@ def amounts(weight: Array, patterns: Array, left: Array) -> tuple[Array, Array]:
         weight, patterns: as in `common`.
         left: what is to be explained, [column, monitor]; it counts where it has a weight.
     """
-    pulled, root = _root(weight, patterns)
+    weighted, root = _root(weight, patterns)
     half = np.linalg.inv(root)
     covariance = half.transpose(0, 2, 1) @ half
-    said = np.einsum("ckm,cm->ck", pulled, np.where(weight > 0, left, 0.0))
-    return np.einsum("ckl,cl->ck", covariance, said), covariance
+    score = np.einsum("ckm,cm->ck", weighted, np.where(weight > 0, residual, 0.0))
+    return np.einsum("ckl,cl->ck", covariance, score), covariance
 
 
-def beside(weight: Array, taken: Array, left: Array) -> Array:
+def times_precision(weight: Array, taken: Array, residual: Array) -> Array:
     """Inverse covariance times what is left, [column, monitor].
 
     Args:
@@ -58,6 +58,6 @@ def beside(weight: Array, taken: Array, left: Array) -> Array:
         taken: L of `common`, [column, monitor, pattern].
         left: [column, monitor].
     """
-    left = np.where(weight > 0, left, 0.0)
-    shared = np.einsum("cmk,cm->ck", taken, left)
-    return np.asarray(weight * left - np.einsum("cmk,ck->cm", taken, shared))
+    residual = np.where(weight > 0, residual, 0.0)
+    shared = np.einsum("cmk,cm->ck", taken, residual)
+    return np.asarray(weight * residual - np.einsum("cmk,ck->cm", taken, shared))

@@ -18,7 +18,7 @@ from tmlattice.inference.priors import Student
 
 Array = NDArray[np.float64]
 
-FIRST_TRUST = 30.0
+INITIAL_NOISE = 30.0
 """The fit begins with a noise of the residual's rms over this, and ends with the readings' own: a
 linear model is worth no more, and a fit that believes it exactly runs away."""
 
@@ -26,10 +26,10 @@ WIDEST, NARROWING = 1000.0, 1.78
 """Tails have many local maxima: they begin this much wider, near a Gaussian, and every time that
 the variances are found anew they are narrower by the second figure."""
 
-HALVES = 8
+MAX_HALVINGS = 8
 """A step is halved so often at most, where the linear model does not reach."""
 
-CHOOSING = 4
+SCALE_ITERATIONS = 4
 """Iterations in which the scale of the prior follows the evidence."""
 
 SCALES = np.logspace(-4, 3, 141)
@@ -52,7 +52,7 @@ class Slopes(Protocol):
         """J P J^T for variances P [amount], [row, row]."""
 
 
-class Many(Protocol):
+class AmountProblem(Protocol):
     """Readings as a function of many amounts."""
 
     @property
@@ -89,11 +89,11 @@ class MostProbable:
     residual: Array
     prior: Student
     chi2: tuple[float, ...]
-    settled: bool = False
+    converged: bool = False
 
 
 def most_probable(
-    problem: Many,
+    problem: AmountProblem,
     prior: Student,
     start: Array,
     *,
@@ -114,36 +114,38 @@ def most_probable(
     residual = problem.residual(start)
     now = MostProbable(start, residual, prior, (_chi2(problem, residual),))
     widening = WIDEST if wide and np.isfinite(prior.freedom) else 1.0
-    trust = float(np.sqrt(np.mean(residual**2))) / FIRST_TRUST
+    added_noise = float(np.sqrt(np.mean(residual**2))) / INITIAL_NOISE
     least = float(problem.sigma.min())
     while True:
-        trust = 0.0 if trust < least else trust
+        added_noise = 0.0 if added_noise < least else added_noise
         for i in range(iterations):
-            now, widening = _iterated(problem, now, trust, widening, choose and i < CHOOSING)
-            if now.settled:
+            now, widening = _iterated(
+                problem, now, added_noise, widening, choose and i < SCALE_ITERATIONS
+            )
+            if now.converged:
                 break
-        if trust == 0.0:
+        if added_noise == 0.0:
             return now
-        trust /= 10
+        added_noise /= 10
 
 
-def cost(problem: Many, found: MostProbable) -> float:
+def cost(problem: AmountProblem, found: MostProbable) -> float:
     """- log of likelihood and prior, up to constants, with the readings' own noise."""
     half = cho_factor(_base(problem, found.amounts, 0.0))
     return _cost(half, found.residual, found.prior, found.amounts)
 
 
-def posterior_base(problem: Many, found: MostProbable) -> Array:
+def posterior_base(problem: AmountProblem, found: MostProbable) -> Array:
     """Covariance of the readings without the amounts, m^2, [row, row]."""
     return _base(problem, found.amounts, 0.0)
 
 
-def _chi2(problem: Many, residual: Array) -> float:
+def _chi2(problem: AmountProblem, residual: Array) -> float:
     return float(np.sum((residual / problem.sigma) ** 2))
 
 
-def _base(problem: Many, amounts: Array, trust: float) -> Array:
-    return problem.nuisances(amounts) + np.diag(problem.sigma**2 + trust**2)
+def _base(problem: AmountProblem, amounts: Array, added_noise: float) -> Array:
+    return problem.nuisances(amounts) + np.diag(problem.sigma**2 + added_noise**2)
 
 
 def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Array) -> float:
@@ -151,24 +153,24 @@ def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Ar
 
 
 def _iterated(
-    problem: Many, now: MostProbable, trust: float, widening: float, choose: bool
+    problem: AmountProblem, now: MostProbable, added_noise: float, widening: float, choose: bool
 ) -> tuple[MostProbable, float]:
     """One step with noise `trust` added; settled where it was smaller than the noise."""
-    slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, trust)
+    slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, added_noise)
     target = now.residual + slopes.times(now.amounts)
     if choose:
         unit = slopes.kernel(np.ones(len(now.amounts)))
         now = replace(now, prior=replace(now.prior, width=best_scale(unit, base, target)))
     wanted, half = now.amounts, cho_factor(base)
     best = _linear(slopes, base, half, target, len(wanted))
-    for _ in range(HALVES if np.isfinite(now.prior.freedom) else 1):  # along one linear model
+    for _ in range(MAX_HALVINGS if np.isfinite(now.prior.freedom) else 1):  # along one linear model
         wide = replace(now.prior, width=now.prior.width * widening)
         wanted = best(wide.precision(wanted))
         widening = max(1.0, widening / NARROWING)
     wide = replace(now.prior, width=now.prior.width * widening)
     step = np.clip(wanted, -problem.largest, problem.largest) - now.amounts
     before = _cost(half, now.residual, wide, now.amounts)
-    for _ in range(HALVES):
+    for _ in range(MAX_HALVINGS):
         try:
             residual = problem.residual(now.amounts + step)
             if _cost(half, residual, wide, now.amounts + step) <= before:
@@ -178,12 +180,12 @@ def _iterated(
         step = step / 2
     else:
         chi2 = (*now.chi2, now.chi2[-1])
-        return replace(now, chi2=chi2, settled=widening == 1.0), widening
-    least = float(np.sqrt((problem.sigma**2).min() + trust**2))
+        return replace(now, chi2=chi2, converged=widening == 1.0), widening
+    least = float(np.sqrt((problem.sigma**2).min() + added_noise**2))
     small = bool(np.abs(slopes.times(step)).max() < 0.1 * least)
     chi2 = (*now.chi2, _chi2(problem, residual))
-    settled = small and widening == 1.0
-    return MostProbable(now.amounts + step, residual, now.prior, chi2, settled), widening
+    converged = small and widening == 1.0
+    return MostProbable(now.amounts + step, residual, now.prior, chi2, converged), widening
 
 
 def _linear(
@@ -221,6 +223,6 @@ def best_scale(kernel: Array, base: Array, target: Array) -> float:
     return float(SCALES[int(evidence.argmax())])
 
 
-def best_of(problem: Many, found: Sequence[MostProbable]) -> MostProbable:
+def best_of(problem: AmountProblem, found: Sequence[MostProbable]) -> MostProbable:
     """The one of least cost."""
     return min(found, key=lambda one: cost(problem, one))

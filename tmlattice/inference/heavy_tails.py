@@ -26,10 +26,10 @@ SWEEPS = 100
 DAMPING, LARGEST = 0.3, 0.5
 """Share of each update that is applied, of a precision in its logarithm, and the largest step of
 that: all members are updated at once, and two that stand for each other would oscillate."""
-CLEAR = 1e3
+DATA_ALONE = 1e3
 """Times what the narrowest component of a prior says of its member, from which on the data alone
 count."""
-SETTLED = 1e-2
+CONVERGED = 1e-2
 """Largest change of a mean, in standard deviations, or of the logarithm of a variance in a sweep
 after which none is made."""
 
@@ -94,7 +94,7 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
     priors.square /= priors.variance[:, None]
     precision, pull = np.ones(len(A)), np.zeros(len(A))
     rest = 1 / np.diag(_gaussian(A, b, precision, pull)[1]) - 1
-    open_ = rest * priors.square.min(axis=1) < CLEAR  # of the others no prior says anything
+    open_ = rest * priors.square.min(axis=1) < DATA_ALONE  # of the others no prior says anything
     if open_.any():
         follow = np.linalg.solve(
             A[np.ix_(~open_, ~open_)] + np.eye(int((~open_).sum())), A[np.ix_(~open_, open_)]
@@ -123,7 +123,7 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
             np.abs((center - mean) / np.sqrt(variance)).max(),
             np.abs(np.log((wanted + rest) * variance)).max(),
         )
-        if changed < SETTLED:
+        if changed < CONVERGED:
             break
         step = DAMPING * np.log(wanted / precision)
         precision = precision * np.exp(np.clip(step, -LARGEST, LARGEST))

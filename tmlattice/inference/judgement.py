@@ -41,13 +41,13 @@ class Judgement:
     shares: Mapping[str, float] = field(default_factory=_shares)
     mass: float = 0.95
     unknown: float = 0.05
-    rivals: int = 24
+    alternatives: int = 24
     window: float = 12.0
     drift: float = 0.03
     starts: tuple[float, ...] = (-1.0, -0.5, -0.2, 0.2, 0.5, 1.0)
     nearly: float = 0.5
-    spikes: int = 40
-    spike: float = -16.0
+    most_outliers: int = 40
+    outlier_prior: float = -16.0
     same: float = 0.02
     silent: float = 0.2
     alien: float = 0.35

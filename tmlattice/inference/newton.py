@@ -18,10 +18,10 @@ from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 
-SHRINK = (1.0, 0.5, 0.25, 0.0625)
+STEP_SHARES = (1.0, 0.5, 0.25, 0.0625)
 """Shares of a step that are tried, until one makes things better."""
 
-UNSEEN = 1e-12
+MIN_INFORMATION = 1e-12
 """Information about an amount below which these readings do not see it: its error would be a
 million, in any unit."""
 
@@ -46,7 +46,7 @@ class Slope:
     amount: float
     orbit: Array
 
-    def holds(self, amount: float, orbit: Array, same: float) -> bool:
+    def valid_at(self, amount: float, orbit: Array, same: float) -> bool:
         """Whether amount and orbit are still the same within a share."""
         if abs(amount - self.amount) > same * abs(amount):
             return False
@@ -155,28 +155,28 @@ def fit(
     slopes, rows = _with_slopes(problem, point, slopes)
     now = _cost(problem, point)
     for step in range(steps):
-        change, moved, promised = _step(problem, point, rows)
+        change, moved, expected_fall = _step(problem, point, rows)
         best = _best_move(problem, point, change, moved, now)
         if best is None:
-            outcome = Outcome.CONVERGED if promised < max(0.1, tolerance) else Outcome.STUCK
+            outcome = Outcome.CONVERGED if expected_fall < max(0.1, tolerance) else Outcome.STUCK
             break
         fell, point = now - _cost(problem, best), best
         now -= fell
-        if fell < tolerance and promised < tolerance:
+        if fell < tolerance and expected_fall < tolerance:
             outcome = Outcome.CONVERGED
             break
         slopes, rows = _with_slopes(problem, point, slopes)
-        if step == 1 and -0.5 * now < hopeless - 100 - 0.5 * promised:
+        if step == 1 and -0.5 * now < hopeless - 100 - 0.5 * expected_fall:
             outcome = Outcome.GIVEN_UP
             break
     return _finished(problem, point, slopes, rows, outcome)
 
 
-SETTLING = 3
+NUISANCE_STEPS = 3
 """Steps of Newton for nuisances alone: they are all but linear."""
 
 
-def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
+def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
     """The point of causes that stay as they are, at the best nuisances.
 
     Args:
@@ -185,7 +185,7 @@ def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Poin
         nuisances: first guess.
     """
     point = problem.at(causes, nuisances)
-    for _ in range(SETTLING):
+    for _ in range(NUISANCE_STEPS):
         if point.projection is None:
             break
         change = point.projection.coordinates(point.residual)
@@ -216,7 +216,7 @@ def _with_slopes(problem: Problem, point: Point, known: Slopes) -> tuple[Slopes,
         cause = point.causes[i]
         place = (cause.effect, cause.element)
         slope = known.get(place)
-        if slope is None or not slope.holds(cause.amount, point.orbit, problem.judgement.same):
+        if slope is None or not slope.valid_at(cause.amount, point.orbit, problem.judgement.same):
             slope = Slope(problem.slope(point, i), cause.amount, point.orbit)
         slopes[place] = slope
         rows.append(slope.row[None])
@@ -224,7 +224,7 @@ def _with_slopes(problem: Problem, point: Point, known: Slopes) -> tuple[Slopes,
     return slopes, np.concatenate(rows) if rows else np.zeros((0, len(point.residual)))
 
 
-def _pulls(problem: Problem, point: Point, count: int) -> tuple[Array, Array]:
+def _prior_terms(problem: Problem, point: Point, count: int) -> tuple[Array, Array]:
     """Precision of the prior of each parameter, and its amount; none of free kicks."""
     precision, amount = np.zeros((2, count))
     for row, i in enumerate(_continuous(point)):
@@ -238,27 +238,27 @@ def _step(problem: Problem, point: Point, rows: Array) -> tuple[Array, Array, fl
     assert point.projection is not None
     clean = point.projection.out(point.residual)
     change = np.zeros(len(rows))
-    promised = point.chi2 - float(clean @ clean)
+    expected_fall = point.chi2 - float(clean @ clean)
     if len(rows):
         own = point.projection.out(rows)
-        precision, amount = _pulls(problem, point, len(rows))
+        precision, amount = _prior_terms(problem, point, len(rows))
         size = np.sqrt(np.einsum("kr,kr->k", own, own) + precision)
         scale = np.where(size > 0, size, 1.0)
         unit = own / scale[:, None]
         gram = unit @ unit.T + np.diag(precision / scale**2 + 1e-10)
         inner = unit @ clean - precision * amount / scale
         solved = np.linalg.solve(gram, inner)
-        promised += float(inner @ solved)
+        expected_fall += float(inner @ solved)
         change = solved / np.where(size > 0, size, np.inf)
     left = point.residual - change @ rows
-    return change, point.projection.coordinates(left), promised
+    return change, point.projection.coordinates(left), expected_fall
 
 
 def _best_move(
     problem: Problem, point: Point, change: Array, moved: Array, now: float
 ) -> Point | None:
     """The point after the largest share of a step that makes things better."""
-    for shrink in SHRINK:
+    for shrink in STEP_SHARES:
         trial = _moved(problem, point, shrink * change, shrink * moved)
         cost = _cost(problem, trial)
         if trial.lost:  # nothing to go on from, even where the start is worth no more
@@ -293,8 +293,8 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         log_evidence += problem.prior((cause.effect, cause.element))
         log_evidence += problem.amounts.log_density(cause)
     if named:
-        full = gram + np.diag(_pulls(problem, point, len(rows))[0])
-        if (np.diagonal(full)[: len(named)] < UNSEEN).any():
+        full = gram + np.diag(_prior_terms(problem, point, len(rows))[0])
+        if (np.diagonal(full)[: len(named)] < MIN_INFORMATION).any():
             return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
         size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
         scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))

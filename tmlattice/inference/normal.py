@@ -163,7 +163,7 @@ def solve(
     normal: Normal,
     groups: Sequence[Group],
     start: Array | None = None,
-    trust: Array | None = None,
+    step_bound: Array | None = None,
     rounds: int = 2,
 ) -> Posterior:
     """One step of Gauss and Newton: the most probable parameters, and the groups' scales.
@@ -180,7 +180,7 @@ def solve(
     groups = tuple(groups)
     basis = csr_array(np.concatenate([g.basis for g in groups], axis=1))  # a few numbers a column
     edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
-    base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
+    base = normal.matrix if step_bound is None else normal.matrix + np.diag(step_bound**-2)
     A = basis.T @ (basis.T @ base).T
     b = basis.T @ (normal.vector + base @ known)
     for turn in range(max(rounds, 1)):

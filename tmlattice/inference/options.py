@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tmlattice.inference.alternatives import Alternative, Detection
 from tmlattice.inference.problem import Point, Problem
-from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, free_threshold, look_elsewhere
 
-AMONG = 10
+READINGS_PER_OUTLIER = 10
 """Readings for each one that is wrong for once: of a few, such as two tunes, none is."""
 
 Reading = tuple[int, ...]
@@ -26,7 +26,7 @@ class Option:
     detection: Detection
     where: int = -1
     reading: Reading = ()
-    rivals: tuple[Rival, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
 
 
 def unnamed(
@@ -60,7 +60,7 @@ def unnamed(
     return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
 
 
-def spike(problem: Problem, point: Point, already: int) -> list[Option]:
+def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
     """The reading that is least explained, left out, if that is clear.
 
     Args:
@@ -69,7 +69,7 @@ def spike(problem: Problem, point: Point, already: int) -> list[Option]:
         already: readings that were left out.
     """
     judge = problem.judgement
-    if int(problem.valid.sum()) < AMONG * (already + 1):
+    if int(problem.valid.sum()) < READINGS_PER_OUTLIER * (already + 1):
         return []
     clean, size = problem.left(point)
     statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
@@ -80,5 +80,5 @@ def spike(problem: Problem, point: Point, already: int) -> list[Option]:
     if not seen.p_value < rate:
         return []
     # an amount even over its logarithm, as for every other cause
-    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.spike
+    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.outlier_prior
     return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
 from tmlattice.effects import find
-from tmlattice.inference.among import (
-    LEAST,
-    ROUNDS,
-    Known,
-    chains,
+from tmlattice.inference.distributed import (
+    LINEARISATIONS,
+    MIN_SHARE,
+    DistributedErrors,
+    chain_factors,
+    components_of_rows,
     families_of,
-    kept,
-    near,
-    sizes_of,
+    linearise,
+    sampled_rows,
 )
 from tmlattice.inference.problem import Point, Problem
 
@@ -42,9 +42,9 @@ class Posterior:
         errors: relative error of each size by effect, where they were learnt.
     """
 
-    before: Known = field(repr=False)
+    before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
-    felt: NDArray[np.int64] = field(repr=False)
+    visible: NDArray[np.int64] = field(repr=False)
     spread: Array = field(repr=False)
     errors: Mapping[str, float]
 
@@ -55,14 +55,14 @@ class Posterior:
         return {name: rms for (name, _), rms in own}
 
     @cached_property
-    def known(self) -> Known:
+    def known(self) -> DistributedErrors:
         """What is known now."""
         values, vectors = eigh(
-            self.spread, subset_by_value=(LEAST / (1 - LEAST), np.inf), check_finite=False
+            self.spread, subset_by_value=(MIN_SHARE / (1 - MIN_SHARE), np.inf), check_finite=False
         )
         seen = np.zeros((len(values), len(self.amounts)))
-        seen[:, self.felt] = vectors.T
-        return self.before.since(self.amounts, values / (1 + values), seen)
+        seen[:, self.visible] = vectors.T
+        return self.before.updated(self.amounts, values / (1 + values), seen)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,11 @@ class Sums:
 
 
 def posterior(
-    problem: Problem, known: Known, *, learn: bool = True, about: Array | None = None
+    problem: Problem,
+    known: DistributedErrors,
+    *,
+    learn: bool = True,
+    linearised_at: Array | None = None,
 ) -> Posterior:
     """What is known of small errors since these readings, linear about the likeliest amounts.
 
@@ -95,36 +99,42 @@ def posterior(
         UnstableRingError: the likeliest small errors leave no stored beam.
     """
     names, belongs = families_of(known)
-    amounts = stored = known.amounts if about is None else about
+    amounts = stored = known.amounts if linearised_at is None else linearised_at
     nuisances, errors = problem.first, dict[str, float]()
-    for _ in range(ROUNDS):
-        inner, point, amounts = near(problem, known, amounts, stored, (), nuisances)
+    for _ in range(LINEARISATIONS):
+        inner, point, amounts = linearise(problem, known, amounts, stored, (), nuisances)
         assert point.projection is not None
         stored, nuisances = amounts, point.nuisances
-        keep = kept(len(point.residual))
-        sums = summed(inner, point, known, amounts, keep)
+        keep = sampled_rows(len(point.residual))
+        sums = sums_at(inner, point, known, amounts, keep)
         beyond = amounts - known.amounts
         if learn:
-            found = sizes_of(
+            found = components_of_rows(
                 point.residual[keep] + beyond @ sums.some, point.projection.matrix()[keep],
-                known.mixed(known.rms[:, None] * sums.some), belongs,
+                known.correlated(known.rms[:, None] * sums.some), belongs,
             )  # fmt: skip
             errors = dict(zip(names, found.error.tolist(), strict=True))
             known = replace(known, rms=known.rms * found.scale[belongs])
-        spread = known.mixed(known.mixed(known.rms[:, None] * sums.gram * known.rms).T)
-        felt = np.flatnonzero(np.diag(spread) > 0)
-        spread = spread[np.ix_(felt, felt)]
-        pull = known.mixed(known.rms * (sums.inner + sums.gram @ beyond))
+        spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
+        visible = np.flatnonzero(np.diag(spread) > 0)
+        spread = spread[np.ix_(visible, visible)]
+        pull = known.correlated(known.rms * (sums.inner + sums.gram @ beyond))
         likeliest = np.zeros(len(pull))
-        factor = cho_factor(spread + np.eye(len(felt)), overwrite_a=True, check_finite=False)
-        likeliest[felt] = cho_solve(factor, pull[felt], check_finite=False)
-        own = zip(known.hypotheses, known.amounts + known.rms * known.mixed(likeliest), strict=True)
+        factor = cho_factor(spread + np.eye(len(visible)), overwrite_a=True, check_finite=False)
+        likeliest[visible] = cho_solve(factor, pull[visible], check_finite=False)
+        own = zip(
+            known.hypotheses, known.amounts + known.rms * known.correlated(likeliest), strict=True
+        )
         amounts = np.array([find(name).some_left(amount) for (name, _), amount in own])
-    return Posterior(known, amounts, felt, spread, errors)
+    return Posterior(known, amounts, visible, spread, errors)
 
 
-def summed(
-    problem: Problem, point: Point, known: Known, amounts: Array, keep: NDArray[np.int64]
+def sums_at(
+    problem: Problem,
+    point: Point,
+    known: DistributedErrors,
+    amounts: Array,
+    keep: NDArray[np.int64],
 ) -> Sums:
     """The sums about a point.
 
@@ -138,19 +148,19 @@ def summed(
     assert point.projection is not None
     clean = point.projection.out(point.residual)
     directions = np.linalg.qr(point.projection.matrix())[0]
-    slope = chains(known, amounts)
+    slope = chain_factors(known, amounts)
     count = len(slope)
     gram, inner = np.zeros((count, count)), np.zeros(count)
     along, some = np.zeros((count, directions.shape[1])), np.zeros((count, len(keep)))
     column = np.full(len(clean), -1)
     column[keep] = np.arange(len(keep))
     for rows, signatures in problem.everywhere().metric(point).pieces(known.hypotheses):
-        felt = np.flatnonzero(signatures.any(axis=1))  # errors of other monitors are not
-        own = slope[felt, None] * signatures[felt]
-        gram[np.ix_(felt, felt)] += own @ own.T
-        inner[felt] += own @ clean[rows]
-        along[felt] += own @ directions[rows]
+        visible = np.flatnonzero(signatures.any(axis=1))  # errors of other monitors are not
+        own = slope[visible, None] * signatures[visible]
+        gram[np.ix_(visible, visible)] += own @ own.T
+        inner[visible] += own @ clean[rows]
+        along[visible] += own @ directions[rows]
         here = column[rows]
-        some[np.ix_(felt, here[here >= 0])] = own[:, here >= 0]
+        some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
     gram -= along @ along.T
     return Sums(gram, inner, some)

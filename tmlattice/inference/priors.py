@@ -94,26 +94,26 @@ class AmountPrior:
         return float(self.tails.precision(cause.amount))
 
 
-EVEN = AmountPrior()
+LOG_UNIFORM = AmountPrior()
 """Even in the logarithm: of a fault that may have any size."""
 
 
 SMALLEST = 1e-9
 """A prior's rms does not fall below."""
-GUESSED = 2.0
+SCALE_SPREAD = 2.0
 """rms of the logarithm of a scale about its first guess: a factor of seven."""
-BOLD = 1.5
+MAX_STEP = 1.5
 """Largest step of that logarithm."""
-COMMONEST = 0.01
+FAULTY_SHARE = 0.01
 """Share of the members of a large group that are faulty: one in a hundred. Of a smaller group one
 member is."""
-DECADE = 4
+SCALES_PER_DECADE = 4
 """Scales of faulty members in a power of ten, log-uniform."""
 CORE = 5
 """Scales that stand for the distribution of sound members."""
 SELECTED = 1e-3
 """Share of the largest fault from which on a selected fault has its scale."""
-BEYOND = 3.0
+FAULT_FROM = 3.0
 """Times the scale of sound members from which on an amount is a fault."""
 
 
@@ -142,7 +142,7 @@ class Group:
     most: float = np.inf
     each: Array | None = None
     first: float | None = None
-    guessed: float = GUESSED
+    guessed: float = SCALE_SPREAD
     largest: float = 0.0
 
     @property
@@ -171,13 +171,13 @@ class Group:
             quantiles = (np.arange(CORE) + 0.5) / CORE
             core = self.rms * np.sqrt(self.freedom / chi2.ppf(quantiles, self.freedom))
         chances = np.full(len(core), 1 / len(core))
-        members, least = self.basis.shape[1], BEYOND * self.rms
-        faulty = max(1 / max(members, 1), COMMONEST)
+        members, least = self.basis.shape[1], FAULT_FROM * self.rms
+        faulty = max(1 / max(members, 1), FAULTY_SHARE)
         if self.fixed and self.largest:
-            core, least, faulty = np.full(1, SMALLEST), self.largest * SELECTED, COMMONEST
+            core, least, faulty = np.full(1, SMALLEST), self.largest * SELECTED, FAULTY_SHARE
         elif self.fixed or members < 2 or not least < self.largest:
             return chances, core
-        count = int(np.ceil(DECADE * np.log10(self.largest / least))) + 1
+        count = int(np.ceil(SCALES_PER_DECADE * np.log10(self.largest / least))) + 1
         chances = np.concatenate([(1 - faulty) * chances, np.full(count, faulty / count)])
         return chances, np.concatenate([core, np.geomspace(least, self.largest, count)])
 
@@ -204,7 +204,7 @@ class Group:
             shown = float(np.sum(squares / now**2))
             own = float(np.log(rms / self.guess)) / self.guessed**2
             step = (shown - known - own) / (2 * known + self.guessed**-2)
-            rms = rms * float(np.exp(np.clip(step, -BOLD, BOLD)))
+            rms = rms * float(np.exp(np.clip(step, -MAX_STEP, MAX_STEP)))
             rms = min(max(rms, SMALLEST), self.most)
         each = rms / np.sqrt(self.share(squares + left * now**2, rms))
         return replace(self, rms=rms, each=np.minimum(each, self.most), first=self.guess)

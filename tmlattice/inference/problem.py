@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.metric import Metric
-from tmlattice.inference.priors import EVEN, AmountPrior
+from tmlattice.inference.priors import LOG_UNIFORM, AmountPrior
 from tmlattice.inference.root import Root
 from tmlattice.inference.whitening import Projection
 
@@ -74,7 +74,7 @@ class Problem(ABC):
     places: Mapping[str, float]
     rare: Mapping[Hypothesis, float] = field(default_factory=dict, repr=False)
     fixed: tuple[Cause, ...] = ()
-    amounts: AmountPrior = EVEN
+    amounts: AmountPrior = LOG_UNIFORM
     judgement: Judgement = DEFAULT
 
     def prior(self, hypothesis: Hypothesis) -> float:
@@ -125,7 +125,7 @@ class Problem(ABC):
         """The same with causes that act in all of its measurements, those of a reference too."""
         return self
 
-    def standing(self, causes: Sequence[Cause]) -> Self:
+    def with_fixed(self, causes: Sequence[Cause]) -> Self:
         """The same with further fixed causes: the kind may put them into its model once for all."""
         return replace(self, fixed=(*self.fixed, *causes))
 

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dtrtri
 
 Array = NDArray[np.float64]
 
-FELT = 1e-12
+ROUNDING = 1e-12
 """Of the largest variance: what is smaller is rounding, and changes nothing."""
 
 
@@ -116,6 +116,6 @@ def directions_of(spread: Array) -> tuple[Array, Array]:
         values, vectors = eigh(spread.T @ spread, overwrite_a=True, check_finite=False)
         return np.maximum(values, 0.0), vectors.T
     values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
-    felt = values > FELT * values.max(initial=1e-300)
-    values = values[felt]
-    return values, (vectors[:, felt] / np.sqrt(values)).T @ spread
+    kept = values > ROUNDING * values.max(initial=1e-300)
+    values = values[kept]
+    return values, (vectors[:, kept] / np.sqrt(values)).T @ spread

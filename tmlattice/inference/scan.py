@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 DRAWS = 64
 """Of pure noise, for the threshold: its effective number is known to 12 %."""
 
-BLIND = 1e-9
+MIN_VISIBLE = 1e-9
 """A signature of which launches leave less than this share (of its square) cannot be seen."""
 
-FAR = 100.0
+MAX_FAULTS = 100.0
 """What would not be seen at this many times its largest fault is not there to be seen."""
 
 
@@ -112,8 +112,10 @@ def scan(
     data = np.concatenate([metric.projection.out(residual)[None], draws])
     sums = metric.products(hypotheses, data)
     norm = sums.whole - sums.inside
-    reach = np.array([FAR * find(name).largest ** find(name).power for name, _ in hypotheses])
-    seen = (norm > BLIND * sums.whole) & (norm * reach**2 > 1.0)
+    reach = np.array(
+        [MAX_FAULTS * find(name).largest ** find(name).power for name, _ in hypotheses]
+    )
+    seen = (norm > MIN_VISIBLE * sums.whole) & (norm * reach**2 > 1.0)
     safe = np.where(seen, norm, 1.0)
     squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
     if effective is None:

@@ -20,15 +20,15 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.inference.levels import CLEAR, RIVAL, Levels, Reason
+from tmlattice.inference.common_factors import MAX_BEHIND, MIN_CHI2, CommonFactor, FactorModel
 
 Array = NDArray[np.float64]
 
-DEEP = 2
+MAX_EXCLUDED = 2
 """Candidates left out together, of those that were chosen, to end elsewhere."""
-STEPS = 300
+MAX_EXPANDED = 300
 """Sets whose neighbours are looked at. Of ESRF-EBS' 857 candidates 150 are needed."""
-BEHIND = 6.0
+NEGLIGIBLE = 6.0
 """Log probability behind the best by which a set is not counted: a four hundredth."""
 
 
@@ -58,7 +58,7 @@ class LikelySet:
         return float(self.covariance[at, at])
 
 
-def likely_sets(levels: Levels, most: int, clear: float = CLEAR) -> list[LikelySet]:
+def likely_sets(levels: FactorModel, most: int, clear: float = MIN_CHI2) -> list[LikelySet]:
     """Those in which every candidate explains `clear` of chi-square beside the others, likeliest
     first; never empty.
 
@@ -71,9 +71,9 @@ def likely_sets(levels: Levels, most: int, clear: float = CLEAR) -> list[LikelyS
     chances: dict[frozenset[int], float] = {}
     for one in _likely(levels, _starts(levels, most, clear), most, clear):
         parts = _in_parts(rests, one)
-        told = parts if (levels.squares(sorted(parts)) >= clear).all() else one
+        reported = parts if (levels.squares(sorted(parts)) >= clear).all() else one
         chance = levels.log_evidence(sorted(one))
-        chances[told] = max(chance, chances.get(told, -np.inf))
+        chances[reported] = max(chance, chances.get(reported, -np.inf))
     sets = list(chances)
     logs = np.array([chances[one] for one in sets])
     shares = np.exp(logs - logs.max())
@@ -85,7 +85,7 @@ def likely_sets(levels: Levels, most: int, clear: float = CLEAR) -> list[LikelyS
     ]
 
 
-def over_sets(levels: Levels, sets: Sequence[LikelySet]) -> list[tuple[Reason, float]]:
+def over_sets(levels: FactorModel, sets: Sequence[LikelySet]) -> list[tuple[CommonFactor, float]]:
     """The reasons of the first set, by falling chi-square, and the probability that each is there.
 
     Errors are those about all sets that hold a reason; its rivals are those of the sets that have
@@ -101,19 +101,21 @@ def over_sets(levels: Levels, sets: Sequence[LikelySet]) -> list[tuple[Reason, f
             one.probability * (one.variance(c) + (one.amount(c) - amount) ** 2) for one in there
         )
         others = frozenset(first.chosen) - {c}
-        rivals = [(c, first.probability)]
+        alternatives = [(c, first.probability)]
         for one in sets[1:]:
             (*more,) = frozenset(one.chosen) - others
-            likely = one.probability > np.exp(-RIVAL) * first.probability
+            likely = one.probability > np.exp(-MAX_BEHIND) * first.probability
             if likely and len(one.chosen) == len(first.chosen) and len(more) == 1:
-                rivals.append((more[0], one.probability))
-        total = sum(chance for _, chance in rivals)
-        told = tuple((candidate, chance / total) for candidate, chance in rivals)
-        found.append((replace(own, sigma=float(np.sqrt(square / share)), rivals=told), share))
+                alternatives.append((more[0], one.probability))
+        total = sum(chance for _, chance in alternatives)
+        reported = tuple((candidate, chance / total) for candidate, chance in alternatives)
+        found.append(
+            (replace(own, sigma=float(np.sqrt(square / share)), alternatives=reported), share)
+        )
     return found
 
 
-def _starts(levels: Levels, most: int, clear: float) -> list[frozenset[int]]:
+def _starts(levels: FactorModel, most: int, clear: float) -> list[frozenset[int]]:
     """What adding and exchanging ends in, with all candidates, and without each one of those that
     were chosen so; of a likely end each of its own in turn. Likeliest first."""
     ends = {frozenset[int](): 0.0}
@@ -123,17 +125,17 @@ def _starts(levels: Levels, most: int, clear: float) -> list[frozenset[int]]:
         without = waiting.pop(0)
         end = frozenset(levels.choose(most, clear, without))
         ends[end] = levels.log_evidence(sorted(end))
-        if len(without) < DEEP and ends[end] > max(ends.values()) - BEHIND:
+        if len(without) < MAX_EXCLUDED and ends[end] > max(ends.values()) - NEGLIGIBLE:
             more = [without | {own} for own in sorted(end)]
             waiting += [one for one in more if one not in tried]
             tried.update(more)
     best = max(ends.values())
-    likely = [one for one, value in ends.items() if value > best - BEHIND]
+    likely = [one for one, value in ends.items() if value > best - NEGLIGIBLE]
     return sorted(likely, key=lambda one: (-ends[one], sorted(one)))
 
 
 def _likely(
-    levels: Levels, starts: Sequence[frozenset[int]], most: int, clear: float
+    levels: FactorModel, starts: Sequence[frozenset[int]], most: int, clear: float
 ) -> list[frozenset[int]]:
     """All that are reached from the starts over clear sets that are likely, by one candidate more,
     less or exchanged at a time; the likeliest are looked at first, `STEPS` of them."""
@@ -144,11 +146,11 @@ def _likely(
     found: list[frozenset[int]] = []
 
     def meet(one: frozenset[int], value: float) -> None:
-        if value > best - BEHIND and one not in met:
+        if value > best - NEGLIGIBLE and one not in met:
             met[one] = value
             heappush(waiting, (-value, sorted(one)))
 
-    while waiting and len(found) < STEPS and -waiting[0][0] > best - BEHIND:
+    while waiting and len(found) < MAX_EXPANDED and -waiting[0][0] > best - NEGLIGIBLE:
         negative, here = heappop(waiting)
         if not (levels.squares(here) >= clear).all():
             continue
@@ -161,9 +163,9 @@ def _likely(
             left = -negative if own is None else -negative - float(gain[own])
             meet(frozenset(others), left)
             values = np.where(square >= clear, left + gain, -np.inf)
-            for candidate in np.flatnonzero(values > best - BEHIND).tolist():
+            for candidate in np.flatnonzero(values > best - NEGLIGIBLE).tolist():
                 meet(frozenset([*others, candidate]), float(values[candidate]))
-    return [one for one in found if met[one] > best - BEHIND]
+    return [one for one in found if met[one] > best - NEGLIGIBLE]
 
 
 def _rests(candidates: Array) -> dict[tuple[int, int], int]:

@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 
 Array = NDArray[np.float64]
 
-SMALL = 96
+MAX_LAPACK = 96
 """Rows up to which LAPACK inverts a triangle as fast as products of blocks do."""
 
 
@@ -32,7 +32,7 @@ def lower_factor(matrix: Array) -> Array:
 def inverse_of_lower(factor: Array) -> Array:
     """L^-1, [n, n]: nearly all of it is products of blocks, at twice the pace of LAPACK's own."""
     n = len(factor)
-    if n <= SMALL:
+    if n <= MAX_LAPACK:
         return np.asarray(dtrtri(factor, lower=1)[0])
     half = n // 2
     first, second = inverse_of_lower(factor[:half, :half]), inverse_of_lower(factor[half:, half:])

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 EXACT = 1e-12
 """m, rad or relative: stands for a launch coordinate that is known exactly."""
 
-UNSEEN = 1e-13
+ROUNDING = 1e-13
 """Share of a direction below which it is rounding: no row sees it, beside those before it."""
 
 
@@ -168,10 +168,10 @@ class Projection:
         self.Q, self._R = np.linalg.qr(directions)
         self._seen = np.abs(np.diagonal(self._R, axis1=1, axis2=2))  # [block, column]
         size = np.linalg.norm(directions, axis=1)
-        if (self._seen <= UNSEEN * size).any():  # else a direction of Q would be any direction
+        if (self._seen <= ROUNDING * size).any():  # else a direction of Q would be any direction
             scale = np.where(size > 0, size, 1.0)[:, None]
             U, s, V = np.linalg.svd(directions / scale, full_matrices=False)
-            kept = s > UNSEEN * max(directions.shape[1:])
+            kept = s > ROUNDING * max(directions.shape[1:])
             self.Q = U * kept[:, None]
             self._R = (s * kept)[..., None] * V * scale
             self._seen = np.where(kept, s, 1.0) * scale[:, 0]

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
-from tmlattice.inference.judge import Half, Judged, other_half
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.root import Root
+from tmlattice.inference.validation import Half, HeldOut, cross_predicted
 from tmlattice.inference.whitening import EXACT, Projection, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import TurnMetric, metric
@@ -81,7 +81,7 @@ class FirstTurns(Problem):
         """Coordinates that are not known exactly."""
         return self.data.shots * len(self.whitening.columns)
 
-    def standing(self, causes: Sequence[Cause]) -> "FirstTurns":
+    def with_fixed(self, causes: Sequence[Cause]) -> "FirstTurns":
         """With errors of magnets and monitors in the model itself, where there are many: each
         trajectory would build all these magnets again."""
         rest, built = list[Cause](), list[Cause]()
@@ -89,7 +89,7 @@ class FirstTurns(Problem):
             of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
             (built if of_model else rest).append(cause)
         if len(built) < MANY and self.alone:
-            return super().standing(causes)
+            return super().with_fixed(causes)
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
@@ -268,7 +268,7 @@ class FirstTurns(Problem):
         return self.whitening.residual(difference, launches)
 
 
-def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
+def judged(problem: FirstTurns, unknown: Array | None = None) -> HeldOut:
     """What a model leaves of shots that no fit saw.
 
     In each shot only the launch is fitted, to one half of the monitors; the readings of the other
@@ -285,7 +285,7 @@ def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
     point = fit(fitted, (), fitted.first, steps=STEPS).point
     residuals = np.full(data.valid.shape, np.nan)
     if point.projection is None:
-        return Judged(residuals, ())
+        return HeldOut(residuals, ())
     left = np.where(data.valid, data.readings - point.view.readings, 0.0)
     columns = fitted.whitening.columns
     off = (data.launches - point.nuisances)[:, columns]
@@ -306,10 +306,10 @@ def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
         )
         order = np.concatenate([index[shots][gives], index[shots][scored]])
         among = None if unknown is None else unknown[np.ix_(order, order)]
-        found = other_half(first, second, off[shots].ravel(), known.ravel(), among)
+        found = cross_predicted(first, second, off[shots].ravel(), known.ravel(), among)
         parts.append(found)
         residuals[shots] = _scattered(found.residual, scored)
-    return Judged(residuals, tuple(parts))
+    return HeldOut(residuals, tuple(parts))
 
 
 def _bounded(data: Data, model: Model) -> Data:

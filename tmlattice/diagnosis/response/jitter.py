@@ -27,7 +27,7 @@ from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.response.weights import weight
-from tmlattice.inference.common import amounts, beside, common
+from tmlattice.inference.common import amounts, common, times_precision
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -197,7 +197,7 @@ def _gains(weights: Array, left: Array, patterns: Array, orbits: Array) -> tuple
     / 2.
     """
     taken = common(weights, patterns)[0]
-    score = orbits @ beside(weights, taken, left).T
+    score = orbits @ times_precision(weights, taken, left).T
     known = orbits**2 @ weights.T
     for k in range(taken.shape[2]):
         known -= (orbits @ taken[..., k].T) ** 2

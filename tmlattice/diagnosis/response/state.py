@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.priors import GUESSED, Group
+from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
@@ -107,7 +107,7 @@ class State:
     apart: tuple[Apart, ...] = ()
     independent: Array | None = None
     jitter: Array | None = None
-    guessed: float = GUESSED
+    guessed: float = SCALE_SPREAD
     unneeded: tuple[Family, ...] = ()
 
     def of_block(self, block: int) -> tuple[Family, ...]:

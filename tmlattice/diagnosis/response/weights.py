@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.odd_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
-from tmlattice.inference.common import amounts, beside, common
+from tmlattice.inference.common import amounts, common, times_precision
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -73,7 +73,7 @@ def weighed(state: State, block: int, left: Array) -> Array:
     monitor]."""
     weights, own = weight(state, block), taken(state, block)
     left = np.where(weights > 0, left, 0.0)
-    return weights * left if own is None else beside(weights, own, left)
+    return weights * left if own is None else times_precision(weights, own, left)
 
 
 def log_scale(state: State, block: int) -> float:

@@ -8,21 +8,21 @@ from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
 from tmlattice.inference import chi2
-from tmlattice.inference.levels import CLEAR
-from tmlattice.inference.newton import Fit, Outcome, fit, settled
+from tmlattice.inference.common_factors import MIN_CHI2
+from tmlattice.inference.newton import Fit, Outcome, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
 
 Array = NDArray[np.float64]
 
 
-EXPLAINS = 1.0
+MIN_FALL = 1.0
 """Chi-square that a parameter takes from noise: what takes less is no explanation, however little
 its amount costs (a spread that ended at nothing)."""
 
 
 @dataclass(frozen=True)
-class Rival:
+class Alternative:
     """A hypothesis that was refitted with everything else in place."""
 
     hypothesis: Hypothesis
@@ -45,16 +45,16 @@ class Detection:
     @classmethod
     def among(cls, statistic: float, count: int) -> "Detection":
         """Of one of so many, each a chi-square of one degree of freedom if nothing is there."""
-        return cls(statistic, CLEAR, min(1.0, count * float(chi2.sf(statistic, 1))))
+        return cls(statistic, MIN_CHI2, min(1.0, count * float(chi2.sf(statistic, 1))))
 
 
-def rivals(
+def alternatives(
     problem: Problem,
     others: Fit,
     found: Scan,
     hypotheses: Sequence[Hypothesis],
     count: int | None = None,
-) -> tuple[Rival, ...]:
+) -> tuple[Alternative, ...]:
     """The leading hypotheses added to what is there, refitted, by falling evidence.
 
     Args:
@@ -67,11 +67,11 @@ def rivals(
     judge = problem.judgement
     linear = linear_evidence(problem, found)
     have = {(c.effect, c.element) for c in others.causes}
-    order = np.argsort(-linear)[: judge.rivals if count is None else count]
+    order = np.argsort(-linear)[: judge.alternatives if count is None else count]
     # the linear scan errs by a share of the statistic itself where an effect is strong
     window = judge.window + judge.drift * float(found.statistic.max(initial=0.0))
     best = -np.inf
-    chosen: list[Rival] = []
+    chosen: list[Alternative] = []
     for index in order:
         if not linear[index] >= linear[order[0]] - window:
             break
@@ -84,15 +84,15 @@ def rivals(
         tried = _with(problem, others, cause, best)
         if tried.outcome not in (Outcome.LOST, Outcome.SINGULAR):
             best = max(best, tried.log_evidence)
-            chosen.append(Rival(found.hypotheses[index], tried))
+            chosen.append(Alternative(found.hypotheses[index], tried))
     if chosen:
         leader = max(chosen, key=lambda rival: rival.fit.log_evidence).hypothesis
         have |= {rival.hypothesis for rival in chosen}
         curved = [h for h in hypotheses if find(h[0]).curved and h not in have]
         for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
             cause = best_start(problem, others, hypothesis)
-            chosen.append(Rival(hypothesis, _with(problem, others, cause, best)))
-    chosen = [r for r in chosen if others.chi2 - r.fit.chi2 > EXPLAINS and _possible(r.cause)]
+            chosen.append(Alternative(hypothesis, _with(problem, others, cause, best)))
+    chosen = [r for r in chosen if others.chi2 - r.fit.chi2 > MIN_FALL and _possible(r.cause)]
     return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
 
 
@@ -155,7 +155,7 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
     for cause in causes:
         there = (*others.causes, cause)
         if effect.whole:  # far from nothing: what the nuisances were without it says little
-            point = settled(problem, there, others.nuisances)
+            point = fit_nuisances(problem, there, others.nuisances)
             left.append(point.chi2)
             continue
         point = problem.at(there, others.nuisances, others.kicks)

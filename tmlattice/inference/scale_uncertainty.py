@@ -21,17 +21,17 @@ from tmlattice.inference.priors import Group
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-FEW = 6.0
+KNOWN_MEMBERS = 6.0
 """Of so many members that the data know the size is known to 30 %."""
-MANY = 128
+MAX_MEMBERS = 128
 """Members from which on a size is not looked at: each draw costs the third power."""
 FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
 """Logarithms of sizes over the present ones that are drawn from."""
-DRAWS, FORGOTTEN = 420, 20
+DRAWS, BURN_IN = 420, 20
 """Of all sizes in turn; and of them those before the chain is at home."""
 
 
-def of_sizes(
+def scale_covariance(
     normal: Normal, groups: Sequence[Group], start: Array, gone: Collection[str] = ()
 ) -> Array:
     """What the base parameters' covariance has beside that of the posterior: F, of F F^T,
@@ -58,7 +58,8 @@ def of_sizes(
     known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
     unsure = np.array([
         absent[i]
-        or (not group.fixed and (own == i).sum() <= MANY and 0 < known[own == i].sum() < FEW)
+        or (not group.fixed and (own == i).sum() <= MAX_MEMBERS
+            and 0 < known[own == i].sum() < KNOWN_MEMBERS)
         for i, group in enumerate(groups)
     ])  # fmt: skip
     if not unsure.any():
@@ -66,7 +67,7 @@ def of_sizes(
     U = unsure[own]
     # the others with their priors taken out: by how much they follow, and what is left to say
     follow = np.linalg.solve(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())), A[np.ix_(~U, U)])
-    sizes = _Sizes(
+    sizes = _Scales(
         A[np.ix_(U, U)] - A[np.ix_(U, ~U)] @ follow,
         b[U] - follow.T @ b[~U],
         (np.cumsum(unsure) - 1)[own[U]],
@@ -78,7 +79,7 @@ def of_sizes(
     return np.asarray(moved @ (directions * np.sqrt(np.maximum(variance, 0))))
 
 
-class _Sizes:
+class _Scales:
     """Sizes of some groups, and their members' amounts in units of the present sizes.
 
     Args:
@@ -143,7 +144,7 @@ class _Sizes:
         [member, member]: by Gibbs' sampling of the sizes."""
         random = np.random.default_rng(0)
         here = np.where(np.isinf(self.now), 0.0, self.now)
-        told, stated = self.amounts(self.now)
+        mean, stated = self.amounts(self.now)
         total = np.zeros_like(stated)
         for draw in range(DRAWS):
             for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
@@ -158,7 +159,7 @@ class _Sizes:
                 both = self._chance(other) - self._chance(here)
                 if np.log(random.random()) < both:
                     here = other
-            if draw >= FORGOTTEN:
+            if draw >= BURN_IN:
                 then, spread = self.amounts(here)
-                total += spread + np.outer(then - told, then - told)
-        return np.asarray(total / (DRAWS - FORGOTTEN) - stated)
+                total += spread + np.outer(then - mean, then - mean)
+        return np.asarray(total / (DRAWS - BURN_IN) - stated)

@@ -34,7 +34,7 @@ class Misfit:
 
 
 @dataclass(frozen=True)
-class Left:
+class Residuals:
     """What a model leaves of readings that no fit saw, some of them correlated.
 
     Attributes:
@@ -63,9 +63,9 @@ class Half:
     sigma: Array
 
 
-def other_half(
-    gives: Half, scored: Half, off: Array, known: Array, unknown: Array | None = None
-) -> Left:
+def cross_predicted(
+    fitted: Half, scored: Half, offset: Array, known: Array, unknown: Array | None = None
+) -> Residuals:
     """What a model leaves of one half where the other one gives the nuisances.
 
     Args:
@@ -76,23 +76,23 @@ def other_half(
             give first, [reading, reading], m^2; None: nothing.
     """
     # by the noise alone: nuisances so fitted take up what else is wrong near these readings
-    weighed = gives.slopes / gives.sigma[:, None] ** 2
-    information = gives.slopes.T @ weighed + np.diag(known)
+    weighed = fitted.slopes / fitted.sigma[:, None] ** 2
+    information = fitted.slopes.T @ weighed + np.diag(known)
     size = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     inverse = np.linalg.pinv(information / size[:, None] / size) / size[:, None] / size
     gain = inverse @ weighed.T  # nuisance per reading
-    moved = gain @ gives.left + inverse @ (known * off)
-    errors = (gain * gives.sigma**2) @ gain.T + (inverse * known) @ inverse
+    moved = gain @ fitted.left + inverse @ (known * offset)
+    errors = (gain * fitted.sigma**2) @ gain.T + (inverse * known) @ inverse
     noise = np.diag(scored.sigma**2) + scored.slopes @ errors @ scored.slopes.T
     whole = None
     if unknown is not None:
         takes = np.hstack([-scored.slopes @ gain, np.eye(len(scored.left))])
         whole = noise + takes @ unknown @ takes.T
-    return Left(scored.left - scored.slopes @ moved, noise, whole)
+    return Residuals(scored.left - scored.slopes @ moved, noise, whole)
 
 
 @dataclass(frozen=True)
-class Judged:
+class HeldOut:
     """All held-out readings of one model.
 
     Attributes:
@@ -102,7 +102,7 @@ class Judged:
     """
 
     residuals: Array
-    parts: tuple[Left, ...]
+    parts: tuple[Residuals, ...]
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Gap:
     residuals: Array
     closed: float | None
     interval: tuple[float, float] | None
-    since: int = 0
+    baseline: int = 0
     readings: int = 0
 
     def significant(self, false_alarm: float) -> bool:
@@ -132,7 +132,7 @@ class Gap:
         Args:
             false_alarm: probability of such a remainder by chance, below which it is significant.
         """
-        square = self.readings * self.misfits[self.since].chi2_per_dof
+        square = self.readings * self.misfits[self.baseline].chi2_per_dof
         return bool(chi2.sf(square, self.readings) < false_alarm)
 
     @property
@@ -140,27 +140,27 @@ class Gap:
         """Whether one of the models loses readings that the other one has: nobody judges it."""
         if not len(self.residuals):  # of a response, whose models lose none
             return False
-        one, other = (np.isfinite(self.residuals[i]).sum() for i in (self.since, -1))
+        one, other = (np.isfinite(self.residuals[i]).sum() for i in (self.baseline, -1))
         return bool(one != other)
 
 
-def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
+def held_out_gap(models: Sequence[HeldOut], baseline: int = 0) -> Gap:
     """The gap of a series of models on readings that no fit saw.
 
     Args:
         judged: by model, the first the design's.
         since: the model whose gap is closed by the last one.
     """
-    misfits = tuple(_misfit(model.parts) for model in judged)
+    misfits = tuple(_misfit(model.parts) for model in models)
     closed, interval = None, None
-    if since < len(judged) - 1 and judged[since].parts and judged[-1].parts:
-        closed, interval = _closed(judged[since].parts, judged[-1].parts)
-    residuals = np.array([model.residuals for model in judged])
-    readings = int(np.isfinite(residuals[since]).sum())
-    return Gap(misfits, residuals, closed, interval, since, readings)
+    if baseline < len(models) - 1 and models[baseline].parts and models[-1].parts:
+        closed, interval = _explained(models[baseline].parts, models[-1].parts)
+    residuals = np.array([model.residuals for model in models])
+    readings = int(np.isfinite(residuals[baseline]).sum())
+    return Gap(misfits, residuals, closed, interval, baseline, readings)
 
 
-def _misfit(parts: Sequence[Left]) -> Misfit:
+def _misfit(parts: Sequence[Residuals]) -> Misfit:
     count = sum(len(part.residual) for part in parts)
     if not count:
         return Misfit(np.nan, np.nan)
@@ -173,8 +173,8 @@ def _misfit(parts: Sequence[Left]) -> Misfit:
     return Misfit(float(np.sqrt(square / count)), weighed / count, float(np.sqrt(expected / count)))
 
 
-def _closed(
-    before: Sequence[Left], after: Sequence[Left]
+def _explained(
+    before: Sequence[Residuals], after: Sequence[Residuals]
 ) -> tuple[float | None, tuple[float, float] | None]:
     """The noise is the same in both, so that much of it goes out of their ratio."""
     one, other = _together(before), _together(after)
@@ -198,7 +198,7 @@ def _closed(
     return float(closed), (float(closed - width), float(min(closed + width, 1.0)))
 
 
-def _together(parts: Sequence[Left]) -> Left:
+def _together(parts: Sequence[Residuals]) -> Residuals:
     """All parts as one: two models may group the same readings differently."""
     residual = np.concatenate([part.residual for part in parts])
-    return Left(residual, block_diag(*(part.noise for part in parts)))
+    return Residuals(residual, block_diag(*(part.noise for part in parts)))

@@ -20,20 +20,20 @@ from scipy.special import logsumexp
 
 Array = NDArray[np.float64]
 
-CLEAR = 25.0
+MIN_CHI2 = 25.0
 """Chi-square that a reason has to have: five standard deviations."""
 SWEEPS = 5
 """Times that every reason is exchanged against its rivals."""
-SEEN = 1e-6
+MIN_INFORMATION = 1e-6
 """Share of what is known of a candidate that others have to leave of it."""
-LEARNT = 2.0
+MIN_SCALE_EVIDENCE = 2.0
 """Log evidence that a size of what cannot be told has to gain to be learnt."""
-RIVAL = 3.0
+MAX_BEHIND = 3.0
 """Log evidence by which a rival may be behind to be told beside a reason: a twentieth."""
 
 
 @dataclass(frozen=True)
-class Reason:
+class CommonFactor:
     """One candidate that is there.
 
     Attributes:
@@ -47,10 +47,10 @@ class Reason:
     amount: float
     sigma: float
     statistic: float
-    rivals: tuple[tuple[int, float], ...]
+    alternatives: tuple[tuple[int, float], ...]
 
 
-class Levels:
+class FactorModel:
     """Candidates weighed beside each other.
 
     Args:
@@ -86,7 +86,7 @@ class Levels:
         self.information = (self.information + self.information.T) / 2
         self.candidates = candidates
 
-    def beside(self, others: Sequence[int], rms: float) -> "Levels":
+    def given(self, others: Sequence[int], rms: float) -> "FactorModel":
         """With an amount of this rms of each of some, which nobody knows: they are candidates no
         more, and are in the errors of all the rest."""
         at = np.array(others, dtype=int)
@@ -101,9 +101,9 @@ class Levels:
         made.information[at] = made.information[:, at] = made.score[at] = 0.0
         return made
 
-    def beside_others(
+    def given_others(
         self, chosen: Sequence[int], alike: Collection[int], rms: Sequence[float]
-    ) -> "BesideOthers":
+    ) -> "GivenOthers":
         """Some of what is alike changed: the others may have, too, each by less than can be told.
 
         Where the evidence wants it they are in the errors, and what is not clear then is one of
@@ -117,18 +117,18 @@ class Levels:
         """
         stay = list(chosen)
         if not set(alike) & set(stay):
-            return BesideOthers(self, stay, 0.0, ((self, 1.0),))
+            return GivenOthers(self, stay, 0.0, ((self, 1.0),))
         while True:
             chosen, others = stay, [own for own in alike if own not in stay]
             sizes = [0.0, *rms] if others else [0.0]
-            made = [self.beside(others, one) if one else self for one in sizes]
+            made = [self.given(others, one) if one else self for one in sizes]
             logs = np.array([own.background + own.log_evidence(chosen) for own in made])
-            best = int(np.argmax(logs - LEARNT * (np.array(sizes) > 0)))
-            stay = made[best]._pruned(list(chosen), CLEAR)
+            best = int(np.argmax(logs - MIN_SCALE_EVIDENCE * (np.array(sizes) > 0)))
+            stay = made[best]._pruned(list(chosen), MIN_CHI2)
             if len(stay) == len(chosen):
                 logs[1:] -= np.log(max(len(rms), 1))
                 chance = np.exp(logs - logsumexp(logs)).tolist()
-                return BesideOthers(
+                return GivenOthers(
                     made[best], stay, sizes[best], tuple(zip(made, chance, strict=True))
                 )
 
@@ -156,7 +156,7 @@ class Levels:
         known = np.maximum(known, 0)
         return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
 
-    def _beside(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+    def _given(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """What is left of each candidate's score and information beside some, and by what a unit of
         it lessens the amounts of these, [chosen, candidate]."""
         amounts, covariance = self.fitted(chosen)
@@ -167,16 +167,18 @@ class Levels:
 
     def gains(self, chosen: Sequence[int]) -> tuple[Array, Array]:
         """Log evidence of one more of each candidate beside some, and its chi-square."""
-        score, own, _ = self._beside(chosen)
+        score, own, _ = self._given(chosen)
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
         square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
-        seen = own > SEEN * np.diag(self.information)  # else the chosen ones make it up
+        seen = own > MIN_INFORMATION * np.diag(self.information)  # else the chosen ones make it up
         gain = np.where(seen, gain, 0.0) - self.cost
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
 
-    def choose(self, most: int, clear: float = CLEAR, without: Collection[int] = ()) -> list[int]:
+    def choose(
+        self, most: int, clear: float = MIN_CHI2, without: Collection[int] = ()
+    ) -> list[int]:
         """The candidates that are there, of all but some."""
         chosen: list[int] = []
         while len(chosen) < most:
@@ -220,19 +222,21 @@ class Levels:
         """Amounts of some candidates and their variances, over whether they are all, or one more is
         there that is not clear, and takes its share of them."""
         amounts, covariance = self.fitted(chosen)
-        score, own, lessened = self._beside(chosen)
+        score, own, lessened = self._given(chosen)
         spread = own + self.slab**-2.0
         moved = -lessened * (score / spread)
         gain = self.gains(chosen)[0]
-        gain[own <= SEEN * np.diag(self.information)] = -np.inf  # the chosen ones make it up
+        gain[
+            own <= MIN_INFORMATION * np.diag(self.information)
+        ] = -np.inf  # the chosen ones make it up
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
         wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
         return amounts + more, wider - more**2
 
     def reasons(
-        self, chosen: Sequence[int], over: Sequence[tuple["Levels", float]] = ()
-    ) -> list[Reason]:
+        self, chosen: Sequence[int], over: Sequence[tuple["FactorModel", float]] = ()
+    ) -> list[CommonFactor]:
         """With amounts, errors and rivals, by falling chi-square.
 
         Args:
@@ -253,21 +257,21 @@ class Levels:
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])
-            near = [int(c) for c in np.flatnonzero(gain > gain[own] - RIVAL) if c != own]
-            odds = np.exp(gain[[own, *near]] - gain[own])
-            told = sorted(zip([own, *near], odds / odds.sum(), strict=True),
+            linearise = [int(c) for c in np.flatnonzero(gain > gain[own] - MAX_BEHIND) if c != own]
+            odds = np.exp(gain[[own, *linearise]] - gain[own])
+            ranked = sorted(zip([own, *linearise], odds / odds.sum(), strict=True),
                           key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
             found.append(
-                Reason(
+                CommonFactor(
                     own, float(amounts[i]), float(np.sqrt(variance[i])), float(square[own]),
-                    tuple((c, float(p)) for c, p in told),
+                    tuple((c, float(p)) for c, p in ranked),
                 )
             )  # fmt: skip
         return sorted(found, key=lambda reason: -reason.statistic)
 
 
 @dataclass(frozen=True, eq=False)
-class BesideOthers:
+class GivenOthers:
     """What is there where others may be that cannot be told.
 
     Attributes:
@@ -277,7 +281,7 @@ class BesideOthers:
         over: the levels with every size of the others, with its probability.
     """
 
-    levels: Levels
+    levels: FactorModel
     chosen: list[int]
     rms: float
-    over: tuple[tuple[Levels, float], ...]
+    over: tuple[tuple[FactorModel, float], ...]

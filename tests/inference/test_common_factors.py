@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from tmlattice.inference.levels import Levels
+from tmlattice.inference.common_factors import FactorModel
 
 SUPPLIES, EACH = 12, 4
 MEMBERS = np.kron(np.eye(SUPPLIES), np.ones((EACH, 1)))
@@ -18,7 +18,7 @@ def told_apart_badly(changes, seed, readings=14):
     slopes = rng.standard_normal((readings, len(MEMBERS)))
     slopes[:, : 4 * EACH] *= 6  # four are seen well
     read = slopes @ MEMBERS @ changes + NOISE * rng.standard_normal(readings)
-    return Levels(
+    return FactorModel(
         slopes.T @ slopes / NOISE**2, slopes.T @ read / NOISE**2, MEMBERS,
         np.full(len(MEMBERS), 1e-4), np.full(SUPPLIES, 3.0),
     )  # fmt: skip
@@ -28,7 +28,7 @@ def test_evidence_beside_others_is_that_of_the_readings():
     rng = np.random.default_rng(3)
     slopes = rng.standard_normal((9, len(MEMBERS)))
     y = slopes @ MEMBERS @ rng.standard_normal(SUPPLIES)
-    own = Levels(slopes.T @ slopes, slopes.T @ y, MEMBERS, np.full(len(MEMBERS), 0.1),
+    own = FactorModel(slopes.T @ slopes, slopes.T @ y, MEMBERS, np.full(len(MEMBERS), 0.1),
                  np.full(SUPPLIES, 3.0))  # fmt: skip
     chosen, others, rms = [1, 4], [0, 2, 7], 0.6
     made = own.beside(others, rms)
@@ -58,7 +58,7 @@ def pulls(beside, seeds=30):
         chosen = own.choose(SUPPLIES)
         over = [(own, 1.0)]
         if beside:
-            there = own.beside_others(chosen, range(SUPPLIES), TRIED)
+            there = own.given_others(chosen, range(SUPPLIES), TRIED)
             own, chosen, over = there.levels, there.chosen, there.over
         found += [(r.amount - changes[r.candidate]) / r.sigma
                   for r in own.reasons(chosen, over)]  # fmt: skip
@@ -78,7 +78,7 @@ def test_nothing_is_learnt_of_others_that_did_not_change():
         changes[[1, 3]] = 1.0, -0.7
         own = told_apart_badly(changes, seed)
         chosen = own.choose(SUPPLIES)
-        there = own.beside_others(chosen, range(SUPPLIES), TRIED)
+        there = own.given_others(chosen, range(SUPPLIES), TRIED)
         assert (there.levels, there.chosen, there.rms) == (own, chosen, 0.0)
         assert {1, 3} <= set(chosen)
 
@@ -86,7 +86,7 @@ def test_nothing_is_learnt_of_others_that_did_not_change():
 def test_where_none_is_told_none_is_learnt():
     own = told_apart_badly(np.random.default_rng(0).standard_normal(SUPPLIES), 0)
     for chosen, alike in (([], range(SUPPLIES)), ([7], [1, 2, 3])):
-        there = own.beside_others(chosen, alike, TRIED)
+        there = own.given_others(chosen, alike, TRIED)
         assert (there.levels, there.chosen, there.rms, there.over) == (
             own, chosen, 0.0, ((own, 1.0),)
         )  # fmt: skip

@@ -17,32 +17,32 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
-from tmlattice.inference.newton import Fit, fit, settled
+from tmlattice.inference.newton import Fit, fit, fit_nuisances
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.root import Root, inverse_root
-from tmlattice.inference.sizes import Sizes, learn_sizes
+from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-ROUNDS = 2
+LINEARISATIONS = 2
 """Linearisations: about the design, and about the likeliest errors."""
 
 ROWS = 1000
 """Rows from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
 
-HALVES = 4
+MAX_HALVINGS = 4
 """How often a step to the likeliest errors is halved where no beam is stored."""
 
-BEST = 0.9999
+MAX_SHARE = 0.9999
 """Share that is known at most: what is linear about the likeliest errors is no better than a
 hundredth of their size."""
 
-LEAST = 0.02
+MIN_SHARE = 0.02
 """Share of the variance of a direction that has to be known for it to be remembered."""
 
-MOST = 10**8
+MAX_ELEMENTS = 10**8
 """Rows times small errors: 0.8 GB, of which some are held at a time (8 GB at most)."""
 
 AT_ONCE = 2**24
@@ -50,7 +50,7 @@ AT_ONCE = 2**24
 
 
 @dataclass(frozen=True)
-class Known:
+class DistributedErrors:
     """What is known of small errors beforehand: Gaussian, about some amounts.
 
     The covariance is rms (1 - sum_d share_d v_d v_d^T) rms: of the directions v something was
@@ -73,20 +73,22 @@ class Known:
     causes: tuple[Cause, ...] = ()
 
     @classmethod
-    def usual(cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]) -> "Known":
+    def usual(
+        cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]
+    ) -> "DistributedErrors":
         """About zero, of sizes by effect; nothing was measured."""
         scale = np.array([rms[name] for name, _ in hypotheses])
         return cls(
             tuple(hypotheses), np.zeros(len(scale)), scale, np.zeros((0, len(scale))), np.zeros(0)
         )
 
-    def mixed(self, x: Array) -> Array:
+    def correlated(self, x: Array) -> Array:
         """Coordinates [error, ...] of independent errors of size 1 as shares of the rms."""
         left = 1 - np.sqrt(1 - self.share)
         return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
                           .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
 
-    def since(self, amounts: Array, share: Array, seen: Array) -> "Known":
+    def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
         """With more readings.
 
         Args:
@@ -96,11 +98,13 @@ class Known:
         """
         if len(self.share):  # back to coordinates of the first rms
             left = np.eye(len(amounts)) - (seen.T * share) @ seen
-            whole = self.mixed(self.mixed(left).T)
+            whole = self.correlated(self.correlated(left).T)
             share, directions = np.linalg.eigh(np.eye(len(amounts)) - whole)
             seen = directions.T
-        big = share > LEAST
-        return replace(self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], BEST))
+        big = share > MIN_SHARE
+        return replace(
+            self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], MAX_SHARE)
+        )
 
     @property
     def errors(self) -> Array:
@@ -110,7 +114,7 @@ class Known:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blurred(Problem):
+class MarginalProblem(Problem):
     """A problem whose rows errors move too that nobody asks for: Gaussian, of size 1.
 
     Attributes:
@@ -190,7 +194,7 @@ class Blurred(Problem):
         """As the kind has it, or signatures made and whitened."""
         assert point.projection is not None
         fast = self.inner.metric_among(point.view, self._root, point.projection)
-        return _BlurredMetric(self, point) if fast is None else fast
+        return _MarginalMetric(self, point) if fast is None else fast
 
     @property
     def kick_places(self) -> Sequence[str]:
@@ -210,9 +214,9 @@ class Blurred(Problem):
         """As the inner one."""
         return self.inner.alone
 
-    def standing(self, causes: Sequence[Cause]) -> Self:
+    def with_fixed(self, causes: Sequence[Cause]) -> Self:
         """The same errors of size 1 beside further fixed causes."""
-        other = replace(self, inner=self.inner.standing(causes))
+        other = replace(self, inner=self.inner.with_fixed(causes))
         vars(other)["_root"] = self._root
         return other
 
@@ -257,7 +261,7 @@ class Blurred(Problem):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Among(Blurred):
+class DistributedProblem(MarginalProblem):
     """A problem among small errors.
 
     Its inner problem has the likeliest small errors among its fixed causes, its errors are the
@@ -271,8 +275,8 @@ class Among(Blurred):
             those were learnt; or None.
     """
 
-    known: Known = field(repr=False)
-    about: Array = field(repr=False)
+    known: DistributedErrors = field(repr=False)
+    linearised_at: Array = field(repr=False)
     open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
@@ -288,22 +292,22 @@ class Among(Blurred):
     def estimate(self, clean: Array) -> Array:
         """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
         known = self.known
-        amounts = known.amounts + known.rms * known.mixed(self.rows @ self._root.back(clean))
+        amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         return np.array([find(name).some_left(amount) for (name, _), amount in own])
 
-    def learnt(self, explained: Fit) -> Known:
+    def learnt(self, explained: Fit) -> DistributedErrors:
         """What is known of the small errors since, beside an explanation."""
         seen = explained.projection.out(self.white(self.rows))
         share, directions = np.linalg.eigh(seen @ seen.T)
-        big = share > LEAST
-        return self.known.since(self.estimate(explained.clean), share[big], directions[:, big].T)
+        big = share > MIN_SHARE
+        return self.known.updated(self.estimate(explained.clean), share[big], directions[:, big].T)
 
 
-class _BlurredMetric(Metric):
+class _MarginalMetric(Metric):
     chunk = 256
 
-    def __init__(self, problem: Blurred, point: Point) -> None:
+    def __init__(self, problem: MarginalProblem, point: Point) -> None:
         assert point.projection is not None
         super().__init__(point.projection)
         self.problem, self.inner = problem, problem.inner.metric(point.view)
@@ -318,7 +322,7 @@ class _BlurredMetric(Metric):
 
 
 @dataclass(frozen=True)
-class Learnt:
+class FittedErrors:
     """Small errors as these data show them.
 
     Attributes:
@@ -331,27 +335,27 @@ class Learnt:
             large its family may be; None: not asked.
     """
 
-    problem: Among
+    problem: DistributedProblem
     plain: Problem
     before: Fit
     sizes: Mapping[str, float]
     errors: Mapping[str, float]
     log_evidence: float
-    apart: float | None = None
+    outlier_evidence: float | None = None
 
 
-def small_errors_of(
+def fit_distributed_errors(
     problem: Problem,
-    known: Known,
+    known: DistributedErrors,
     nuisances: Array,
     causes: Sequence[Cause] = (),
     *,
     learn: bool = True,
     noisy: bool = False,
-    about: Array | None = None,
+    linearised_at: Array | None = None,
     stored: Array | None = None,
     weigh: bool = False,
-) -> Learnt:
+) -> FittedErrors:
     """The background of a machine as these data show it, linear about its likeliest amounts.
 
     Args:
@@ -371,31 +375,31 @@ def small_errors_of(
             causes.
     """
     names, belongs = families_of(known)
-    amounts = known.amounts if about is None else about
+    amounts = known.amounts if linearised_at is None else linearised_at
     stored = amounts if stored is None else stored
-    evidence, errors, opened, apart = 0.0, dict[str, float](), None, None
-    for turn in range(ROUNDS if about is None else 1):
-        inner, alone, amounts = near(problem, known, amounts, stored, causes, nuisances)
+    evidence, errors, opened, outlier_evidence = 0.0, dict[str, float](), None, None
+    for turn in range(LINEARISATIONS if linearised_at is None else 1):
+        inner, alone, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
         assert alone.projection is not None
         stored = amounts
         slopes = signatures_of(inner, alone, known.hypotheses)
-        slopes *= chains(known, amounts)[:, None]
+        slopes *= chain_factors(known, amounts)[:, None]
         shift = (amounts - known.amounts) @ slopes
-        spread = known.mixed(known.rms[:, None] * slopes)
+        spread = known.correlated(known.rms[:, None] * slopes)
         if learn:
             moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
-            keep = kept(len(moved))
+            keep = sampled_rows(len(moved))
             rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
             noise = [part[keep] for part in inner.noise_rows()] if noisy else []
             directions = alone.projection.matrix()[keep]
-            found = sizes_of(moved[keep], directions, rows[:, keep], belongs, noise)
+            found = components_of_rows(moved[keep], directions, rows[:, keep], belongs, noise)
             if weigh:  # as one of them
                 i = known.hypotheses.index((causes[0].effect, causes[0].element))
                 some, amount = rows[:, keep], causes[0].amount
                 some[i] *= find(causes[0].effect).chain(amount)
                 whole = moved[keep] + amount / known.rms[i] * some[i]
-                other = sizes_of(whole, directions, some, belongs, noise)
-                apart = found.log_marginal - other.log_marginal
+                other = components_of_rows(whole, directions, some, belongs, noise)
+                outlier_evidence = found.log_marginal - other.log_marginal
             if noise:
                 problem, inner = (own.noisier(found.noise) for own in (problem, inner))
             evidence = found.log_evidence if turn == 0 else evidence
@@ -403,13 +407,13 @@ def small_errors_of(
             opened = (belongs, found.covariance)
             known = replace(known, rms=known.rms * found.scale[belongs])
             spread *= found.scale[belongs][:, None]
-        among = Among(
+        among = DistributedProblem(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
-            judgement=problem.judgement, inner=inner, known=known, about=amounts,
+            judgement=problem.judgement, inner=inner, known=known, linearised_at=amounts,
             spread=spread.reshape(-1, *inner.valid.shape),
             shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
-        point = settled(among, causes, alone.nuisances)
+        point = fit_nuisances(among, causes, alone.nuisances)
         assert point.projection is not None
         nuisances = point.nuisances
         amounts = among.estimate(point.projection.out(point.residual))
@@ -417,7 +421,7 @@ def small_errors_of(
     if before.point.lost:
         raise UnstableRingError(f"{before.point.lost} without what was found beside small errors")
     sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
-    return Learnt(among, problem, before, sizes, errors, evidence, apart)
+    return FittedErrors(among, problem, before, sizes, errors, evidence, outlier_evidence)
 
 
 def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
@@ -427,25 +431,25 @@ def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesi
     out later: `as_rows` of ones says what that is.
     """
     unit = problem.as_rows(np.ones(problem.valid.shape))
-    about, there = problem.everywhere().metric(point), unit > 0
+    linearised_at, there = problem.everywhere().metric(point), unit > 0
     out = np.zeros((len(hypotheses), problem.valid.size))
     count = max(AT_ONCE // len(unit), 1)
     for start in range(0, len(hypotheses), count):
         some = slice(start, start + count)
-        rows = about.rows(hypotheses[some])
+        rows = linearised_at.rows(hypotheses[some])
         out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
     return out
 
 
-def families_of(known: Known) -> tuple[list[str], NDArray[np.int64]]:
+def families_of(known: DistributedErrors) -> tuple[list[str], NDArray[np.int64]]:
     """Effects that have a size, and of which each error is, [error]."""
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
 
 
-def near(
+def linearise(
     problem: Problem,
-    known: Known,
+    known: DistributedErrors,
     amounts: Array,
     stored: Array,
     causes: Sequence[Cause],
@@ -463,27 +467,27 @@ def near(
         UnstableRingError: there is none near enough.
     """
     first = amounts is stored
-    for turn in range(HALVES):
+    for turn in range(MAX_HALVINGS):
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
-        alone = settled(inner, causes, nuisances)
+        alone = fit_nuisances(inner, causes, nuisances)
         if alone.projection is not None:
             return inner, alone, amounts
         if first:
             break
         # too far for what is linear
-        amounts = stored if turn == HALVES - 2 else (amounts + stored) / 2
+        amounts = stored if turn == MAX_HALVINGS - 2 else (amounts + stored) / 2
     raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
 
 
-def chains(known: Known, amounts: Array) -> Array:
+def chain_factors(known: DistributedErrors, amounts: Array) -> Array:
     """d readings / d amount over signatures, of each, see `Effect.chain`."""
     own = zip(known.hypotheses, amounts, strict=True)
     return np.array([find(name).chain(amount) for (name, _), amount in own])
 
 
-def kept(count: int) -> NDArray[np.int64]:
+def sampled_rows(count: int) -> NDArray[np.int64]:
     """Rows from which sizes are learnt: drawn once and for all, so that planes and monitors, which
     come in turns, all have their share."""
     if count <= ROWS:
@@ -491,13 +495,13 @@ def kept(count: int) -> NDArray[np.int64]:
     return np.sort(np.random.default_rng(0).choice(count, ROWS, replace=False))
 
 
-def sizes_of(
+def components_of_rows(
     residual: Array,
     directions: Array,
     rows: Array,
     belongs: NDArray[np.int64],
     noise: Sequence[Flags] = (),
-) -> Sizes:
+) -> VarianceComponents:
     """Sizes from some rows.
 
     Args:
@@ -513,4 +517,6 @@ def sizes_of(
     there = basis.any(axis=1)  # nobody read the others, which have no noise
     there = np.any(noise, axis=0) | there if noise else np.ones_like(there)
     families = [rows[belongs == k][:, there] for k in range(belongs.max() + 1)]
-    return learn_sizes(residual[there], basis[there], families, [part[there] for part in noise])
+    return fit_variance_components(
+        residual[there], basis[there], families, [part[there] for part in noise]
+    )

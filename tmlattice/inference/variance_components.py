@@ -17,23 +17,23 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 Array = NDArray[np.float64]
 
-COMMON = 1.5
+COMMON_SPREAD = 1.5
 """rms of the logarithm of all sizes together: machines differ by factors of five."""
 
-OWN = 0.7
+FAMILY_SPREAD = 0.7
 """rms of the logarithm of one family's size beside the others: by factors of two."""
 
-NOISE = 2.0
+NOISE_SPREAD = 2.0
 """rms of the logarithm of a noise that is a first guess only."""
 
 STEPS = 20
 LARGEST = 1.5  # of a step, in the logarithm
-SETTLED = 0.5
+MIN_GAIN = 0.5
 """Log likelihood gained by a step after which none is made: steps converge quadratically."""
 
 
 @dataclass(frozen=True)
-class Sizes:
+class VarianceComponents:
     """What the readings say of the sizes of small errors.
 
     Attributes:
@@ -56,9 +56,9 @@ class Sizes:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def learn_sizes(
+def fit_variance_components(
     rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[NDArray[np.bool_]] = ()
-) -> Sizes:
+) -> VarianceComponents:
     """The likeliest sizes of families of small errors.
 
     Args:
@@ -92,13 +92,13 @@ def learn_sizes(
             damping = max(10 * damping, 0.1)
             continue
         gained, size, now, damping = trial.value - now.value, size + step, trial, damping / 5
-        if gained < SETTLED:
+        if gained < MIN_GAIN:
             break
     covariance = np.linalg.inv(now.information)
     none = -0.5 * float(clean @ clean)
     occam = 0.5 * (np.linalg.slogdet(precision)[1] + np.linalg.slogdet(covariance)[1])
     count = len(families)
-    return Sizes(
+    return VarianceComponents(
         np.exp(size[:count]),
         np.asarray(covariance[:count, :count], dtype=float),
         np.exp(size[count:]),
@@ -116,10 +116,12 @@ class _State:
 
 def _prior(families: int, noise: int) -> Array:
     """Precision of the logarithms."""
-    covariance = np.full((families, families), COMMON**2) + OWN**2 * np.eye(families)
+    covariance = np.full((families, families), COMMON_SPREAD**2) + FAMILY_SPREAD**2 * np.eye(
+        families
+    )
     precision = np.zeros((families + noise,) * 2)
     precision[:families, :families] = np.linalg.inv(covariance)
-    precision[families:, families:] = np.eye(noise) / NOISE**2
+    precision[families:, families:] = np.eye(noise) / NOISE_SPREAD**2
     return precision
 
 

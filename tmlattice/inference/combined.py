@@ -68,7 +68,7 @@ class Blocks(Projection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Together(Problem):
+class CombinedProblem(Problem):
     """Measurements of one machine.
 
     Attributes:
@@ -85,7 +85,7 @@ class Together(Problem):
     active: tuple[bool, ...]
 
     @classmethod
-    def of(cls, parts: Sequence[Problem], before: Sequence[Problem] = ()) -> "Together":
+    def of(cls, parts: Sequence[Problem], before: Sequence[Problem] = ()) -> "CombinedProblem":
         """With the places, the judgement and the fixed causes of the first.
 
         Args:
@@ -108,7 +108,7 @@ class Together(Problem):
         """Whether no part is of a reference, nor has shots of one."""
         return all(self.active) and all(part.alone for part in self.parts)
 
-    def reference(self, nuisances: Array) -> "tuple[Together, Array]":
+    def reference(self, nuisances: Array) -> "tuple[CombinedProblem, Array]":
         """Return the measurements, or shots, of the reference alone, as those that are searched."""
         parts: list[tuple[Problem, Array]] = []
         for part, active, start in zip(
@@ -152,16 +152,16 @@ class Together(Problem):
         """Whether any part does."""
         return any(part.sees(hypothesis) for part in self.parts)
 
-    def everywhere(self) -> "Together":
+    def everywhere(self) -> "CombinedProblem":
         """Active in all parts."""
         parts = tuple(part.everywhere() for part in self.parts)
         return replace(self, parts=parts, active=(True,) * len(parts))
 
     @cached_property
-    def standing_parts(self) -> tuple[Problem, ...]:
+    def parts_with_fixed(self) -> tuple[Problem, ...]:
         """The parts, each with the fixed causes that it sees."""
         return tuple(
-            part.standing([c for c in self.fixed if part.sees((c.effect, c.element))])
+            part.with_fixed([c for c in self.fixed if part.sees((c.effect, c.element))])
             for part in self.parts
         )
 
@@ -169,7 +169,7 @@ class Together(Problem):
         """`view` are the points of the parts, each with the causes that it sees."""
         points = []
         for part, active, own in zip(
-            self.standing_parts, self.active, self.of_parts(nuisances), strict=True
+            self.parts_with_fixed, self.active, self.of_parts(nuisances), strict=True
         ):
             there = causes if active else ()
             seen = [c for c in there if part.sees((c.effect, c.element))]
@@ -191,7 +191,7 @@ class Together(Problem):
         """Of each part that sees it."""
         own = point.causes[cause]
         rows = []
-        for part, active, here in zip(self.standing_parts, self.active, point.view, strict=True):
+        for part, active, here in zip(self.parts_with_fixed, self.active, point.view, strict=True):
             if active and part.sees((own.effect, own.element)):
                 rows.append(part.slope(here, here.causes.index(own)))
             else:
@@ -201,14 +201,14 @@ class Together(Problem):
     def metric(self, point: Point) -> Metric:
         """Of the parts, added up."""
         if len(self.parts) == 1:
-            return self.standing_parts[0].metric(point.view[0])
-        return _TogetherMetric(self, point)
+            return self.parts_with_fixed[0].metric(point.view[0])
+        return _CombinedMetric(self, point)
 
     def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
         """Of a single measurement, as its kind has it."""
         if len(self.parts) > 1:
             return None
-        return self.standing_parts[0].metric_among(point.view[0], root, projection)
+        return self.parts_with_fixed[0].metric_among(point.view[0], root, projection)
 
     # --- free kicks: of a single measurement ----------------------------------------------------
     @property
@@ -218,7 +218,7 @@ class Together(Problem):
 
     def kick_rows(self, point: Point, place: int) -> Array:
         """As its kind has it."""
-        return self.standing_parts[0].kick_rows(point.view[0], place)
+        return self.parts_with_fixed[0].kick_rows(point.view[0], place)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Of any part."""
@@ -287,12 +287,12 @@ def _ends(sizes: Sequence[int]) -> list[int]:
     return [int(end) for end in np.cumsum(sizes)[:-1]]
 
 
-class _TogetherMetric(Metric):
-    def __init__(self, problem: Together, point: Point) -> None:
+class _CombinedMetric(Metric):
+    def __init__(self, problem: CombinedProblem, point: Point) -> None:
         assert isinstance(point.projection, Blocks)
         super().__init__(point.projection)
         self.problem, self.blocks = problem, point.projection
-        pairs = zip(problem.standing_parts, point.view, strict=True)
+        pairs = zip(problem.parts_with_fixed, point.view, strict=True)
         self.metrics = [part.metric(here) for part, here in pairs]
 
     def products(self, hypotheses: Sequence[Hypothesis], data: Array) -> Products:
