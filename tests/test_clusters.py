@@ -53,7 +53,7 @@ def readings(rows, values):
 
 
 @pytest.mark.parametrize("lacking", ["nothing", "columns", "monitors"])
-def test_stated_errors_hold_where_readings_share_what_is_lacking(lacking):
+def test_stated_errors_hold_where_readings_share_model_discrepancy(lacking):
     """Posterior ones are 2.9 times too small there; of real rings up to seven times."""
     rng = np.random.default_rng(4)
     pulls, plain = [], []

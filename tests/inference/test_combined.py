@@ -58,7 +58,7 @@ def test_rows_of_both_are_the_rows_of_each(turns, orbit):
     assert (rows[2, len(alone[0].residual) :] == 0).all()  # a closed orbit has no launch
 
 
-def test_slopes_of_both_are_the_scans_own(turns, orbit):
+def test_slopes_of_both_are_the_scans(turns, orbit):
     both = CombinedProblem.of([turns, orbit])
     point = both.at([WEAK], both.first)
     h = 1e-5
@@ -153,5 +153,5 @@ def test_small_errors_that_need_a_cause_to_store_a_beam_are_a_sentence(small_rin
         return replace(there, point=replace(there.point, projection=None, lost="no orbit"))
 
     monkeypatch.setattr(distributed, "fit", lost)
-    with pytest.raises(UnstableRingError, match="no orbit without what was found"):
+    with pytest.raises(UnstableRingError, match="no orbit with distributed errors"):
         fit_distributed_errors(problem, DistributedErrors.usual(everywhere, usual), problem.first)

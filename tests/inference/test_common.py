@@ -55,7 +55,7 @@ def test_normal_equations_are_generalised_least_squares(problem):
     )
 
 
-def test_likeliest_amounts(problem):
+def test_most_probable_amounts(problem):
     _, weight, patterns, left = problem
     likely, covariance = amounts(weight, patterns, np.where(weight > 0, left, np.nan))
     for c in range(COLUMNS):

@@ -1,4 +1,4 @@
-"""Few reasons behind many numbers, where others are there that cannot be told one by one."""
+"""Few reasons behind many numbers, where others are there that cannot be selected one by one."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ NOISE = 1e-2
 TRIED = tuple(np.geomspace(0.03, 3, 9))
 
 
-def told_apart_badly(changes, seed, readings=14):
+def selected_apart_badly(changes, seed, readings=14):
     """Levels of supplies whose changes as few readings see, all of them in each."""
     rng = np.random.default_rng(seed)
     slopes = rng.standard_normal((readings, len(MEMBERS)))
@@ -24,14 +24,14 @@ def told_apart_badly(changes, seed, readings=14):
     )  # fmt: skip
 
 
-def test_evidence_beside_others_is_that_of_the_readings():
+def test_evidence_given_others_is_that_of_the_readings():
     rng = np.random.default_rng(3)
     slopes = rng.standard_normal((9, len(MEMBERS)))
     y = slopes @ MEMBERS @ rng.standard_normal(SUPPLIES)
     own = FactorModel(slopes.T @ slopes, slopes.T @ y, MEMBERS, np.full(len(MEMBERS), 0.1),
                  np.full(SUPPLIES, 3.0))  # fmt: skip
     chosen, others, rms = [1, 4], [0, 2, 7], 0.6
-    made = own.beside(others, rms)
+    made = own.given(others, rms)
     plain = np.eye(9)
     sizes = np.zeros(SUPPLIES)
     sizes[chosen], sizes[others] = 3.0, rms
@@ -50,11 +50,11 @@ def test_evidence_beside_others_is_that_of_the_readings():
 
 
 def pulls(beside, seeds=30):
-    """Of amounts of what is told where all supplies changed."""
+    """Of amounts of what is selected where all supplies changed."""
     found = []
     for seed in range(seeds):
         changes = np.random.default_rng(100 + seed).standard_normal(SUPPLIES)
-        own = told_apart_badly(changes, seed)
+        own = selected_apart_badly(changes, seed)
         chosen = own.choose(SUPPLIES)
         over = [(own, 1.0)]
         if beside:
@@ -65,7 +65,7 @@ def pulls(beside, seeds=30):
     return np.array(found)
 
 
-def test_others_that_changed_are_in_the_errors_of_those_that_are_told():
+def test_unresolved_factors_are_in_the_errors_of_the_selected():
     with_others, without = pulls(True), pulls(False)
     assert len(with_others) > 30
     assert np.sqrt(np.mean(with_others**2)) < 1.6
@@ -76,15 +76,15 @@ def test_nothing_is_learnt_of_others_that_did_not_change():
     for seed in range(20):
         changes = np.zeros(SUPPLIES)
         changes[[1, 3]] = 1.0, -0.7
-        own = told_apart_badly(changes, seed)
+        own = selected_apart_badly(changes, seed)
         chosen = own.choose(SUPPLIES)
         there = own.given_others(chosen, range(SUPPLIES), TRIED)
         assert (there.levels, there.chosen, there.rms) == (own, chosen, 0.0)
         assert {1, 3} <= set(chosen)
 
 
-def test_where_none_is_told_none_is_learnt():
-    own = told_apart_badly(np.random.default_rng(0).standard_normal(SUPPLIES), 0)
+def test_no_selected_factor_no_common_scale():
+    own = selected_apart_badly(np.random.default_rng(0).standard_normal(SUPPLIES), 0)
     for chosen, alike in (([], range(SUPPLIES)), ([7], [1, 2, 3])):
         there = own.given_others(chosen, alike, TRIED)
         assert (there.levels, there.chosen, there.rms, there.over) == (

@@ -42,7 +42,7 @@ def test_a_settled_fit_finds_the_amount(problem):
     assert abs(found.causes[0].amount - FAULT.amount) < 4 * sigma < 0.005
 
 
-def test_too_few_steps_are_said(problem):
+def test_too_few_steps_are_reported(problem):
     found = fit(problem, [replace(FAULT, amount=0.2)], problem.data.launches, steps=1)
     assert found.outcome is Outcome.STEPS
 

@@ -80,15 +80,15 @@ def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
     assert len(seen) > 2
 
 
-def test_sums_leave_known_what_all_signatures_do(response, everywhere, monkeypatch):
+def test_sums_give_the_posterior_of_all_signatures(response, everywhere, monkeypatch):
     monkeypatch.setattr(response_metric, "ROOM", PIECE)
     usual = DistributedErrors.usual(everywhere, USUAL)
     direct = fit_distributed_errors(response, usual, response.first)
-    summed = posterior(response, usual)
-    assert summed.sizes == pytest.approx(direct.sizes, rel=1e-8)
-    assert summed.errors == pytest.approx(direct.errors, rel=1e-8)
+    sums_at = posterior(response, usual)
+    assert sums_at.sizes == pytest.approx(direct.sizes, rel=1e-8)
+    assert sums_at.errors == pytest.approx(direct.errors, rel=1e-8)
     known = direct.problem.learnt(direct.before)
-    same(summed.known, known, 1e-8)
+    same(sums_at.known, known, 1e-8)
     # and once more, from what is known
     again = fit_distributed_errors(response, known, response.first, learn=False)
     twice = posterior(response, known, learn=False)
@@ -102,10 +102,10 @@ def test_nuisances_are_projected_out(small_ring, everywhere):
     turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
     usual = DistributedErrors.usual(everywhere, USUAL)
     direct = fit_distributed_errors(turns, usual, turns.first, learn=False)
-    summed = posterior(turns, usual, learn=False).known
+    sums_at = posterior(turns, usual, learn=False).known
     known = direct.problem.learnt(direct.before)
-    assert_allclose(summed.errors, known.errors, rtol=0.02)
-    assert_allclose((summed.amounts - known.amounts) / known.errors, 0, atol=0.1)
+    assert_allclose(sums_at.errors, known.errors, rtol=0.02)
+    assert_allclose((sums_at.amounts - known.amounts) / known.errors, 0, atol=0.1)
 
 
 def test_memory_does_not_grow_with_readings():
@@ -131,7 +131,7 @@ def test_memory_does_not_grow_with_readings():
     )
     point = SimpleNamespace(residual=residual, projection=projection)
     tracemalloc.start()
-    sums = module.summed(problem, point, known, np.zeros(count), np.array([3, size + 7]))
+    sums = module.sums_at(problem, point, known, np.zeros(count), np.array([3, size + 7]))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6
@@ -147,7 +147,9 @@ def test_too_large_small_errors_are_a_sentence(response, everywhere, monkeypatch
         return replace(response.at((), response.first), projection=None, lost="no orbit")
 
     monkeypatch.setattr(distributed, "fit_nuisances", lost)
-    with pytest.raises(UnstableRingError, match="no orbit with the small errors"):
+    with pytest.raises(
+        UnstableRingError, match="no orbit with the most probable distributed errors"
+    ):
         posterior(response, DistributedErrors.usual(everywhere, USUAL))
 
 

@@ -63,7 +63,7 @@ def test_a_size_that_the_data_hardly_tell_is_in_the_errors(problem):
     assert (more[2:10] < 0.2 * stated[2:10]).all()
 
 
-def test_a_family_that_was_left_out_may_be_there(problem):
+def test_a_rejected_family_may_be_present(problem):
     J, left, many, one = problem
     normal = Normal(J.T @ J, J.T @ left)
     more = variance(scale_covariance(normal, [many, one], np.zeros(11), ["one"]))
@@ -75,7 +75,7 @@ def test_a_family_that_was_left_out_may_be_there(problem):
     np.testing.assert_allclose(more, expected, rtol=0.1, atol=1e-3)
 
 
-def test_families_that_were_left_out_stand_for_one_another(problem, monkeypatch):
+def test_rejected_families_are_exchangeable(problem, monkeypatch):
     """ALS: one of two families that do nearly the same is there, and a chain that adds and takes
     away one of them at a time would stay with one."""
     monkeypatch.undo()  # draws as many as it draws
@@ -108,7 +108,7 @@ def test_families_that_were_left_out_stand_for_one_another(problem, monkeypatch)
     np.testing.assert_allclose(more[10:], expected[10:], rtol=0.35)
 
 
-def test_sizes_that_are_known_add_nothing(problem):
+def test_known_scales_add_nothing(problem):
     J, left, many, one = problem
     normal = Normal(J.T @ J, J.T @ left)
     posterior = solve(normal, [many], rounds=20)

@@ -36,7 +36,7 @@ def of(left):
 
 
 @pytest.mark.parametrize("unknown", [False, True])
-def test_the_misfit_to_expect_is_what_comes(halves, rng, unknown):
+def test_expected_misfit_is_the_measured_one(halves, rng, unknown):
     found = [held_out_gap([of(judged(halves, 0.0, rng, unknown))]).misfits[0] for _ in range(300)]
     square = np.mean([one.rms**2 for one in found])
     assert np.sqrt(square) == pytest.approx(found[0].expected, rel=0.05)
@@ -76,12 +76,12 @@ def test_the_interval_of_what_is_closed_holds_in_95_per_cent(halves, rng):
     assert 0.92 < np.mean(inside) <= 0.98  # a width of 0.011
 
 
-def test_no_share_is_told_of_a_gap_within_the_noise(halves, rng):
+def test_no_share_is_stated_of_a_gap_within_the_noise(halves, rng):
     both = [of(judged(halves, 0.0, rng, False)) for _ in range(2)]
     assert held_out_gap(both).closed is None
 
 
-def test_a_gap_of_which_a_model_loses_the_beam_is_judged_by_nobody(halves, rng):
+def test_a_gap_is_not_scored_if_a_model_loses_the_beam(halves, rng):
     whole = judged(halves, 1e-4, rng, False)
     seen = whole.residual.copy()
     seen[0] = np.nan

@@ -61,7 +61,7 @@ def test_a_family_that_is_not_seen_stays_near_the_others(families, launches, rng
     assert found.error[2] > 0.5 > found.error[:2].max()
 
 
-def test_the_noise_of_each_part_is_learnt_beside_them(families, launches, rng):
+def test_the_noise_of_each_part_is_estimated_too(families, launches, rng):
     first = np.arange(ROWS) < ROWS // 2
     rows = readings([0.02 * own for own in families], (1, 1, 1), launches, rng, noise=0.2)
     rows += np.where(first, 0, 0.8) * rng.standard_normal(ROWS)

@@ -1,9 +1,9 @@
-"""Any problem among small errors everywhere: rows whitened once more by what those make of them.
+"""Problems with distributed errors: rows whitened by the covariance that such errors make.
 
-Small errors are Gaussian and far too many to be found one by one; with signatures S (rms times
-slope, in rows) the rows' covariance is C = 1 + S^T S. Divided by its Cholesky factor they are again
-white, and a search knows nothing of it. The signatures hold about the likeliest small errors, which
-stand in the model; the rows are shifted so that their prior still stands about zero.
+Distributed errors are Gaussian, and too many to be found one by one. With signatures S (rms times
+slope, in rows) the rows have the covariance C = 1 + S^T S. Its inverse root makes them white again,
+so that a search works as before. Signatures are linearised at the most probable errors, which are
+part of the model; a shift of the rows keeps the errors' prior centred at zero.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,42 +27,41 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LINEARISATIONS = 2
-"""Linearisations: about the design, and about the likeliest errors."""
+"""Linearisations: at the design, and at the most probable errors."""
 
 ROWS = 1000
-"""Rows from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
+"""Rows for variance components: 17 of them to some per cent; the time goes as the cube."""
 
 MAX_HALVINGS = 4
-"""How often a step to the likeliest errors is halved where no beam is stored."""
+"""Halvings, at most, of a step to the most probable errors where no beam is stored."""
 
 MAX_SHARE = 0.9999
-"""Share that is known at most: what is linear about the likeliest errors is no better than a
-hundredth of their size."""
+"""Largest share of a variance that data may remove: linearisation leaves a hundredth of the rms."""
 
 MIN_SHARE = 0.02
-"""Share of the variance of a direction that has to be known for it to be remembered."""
+"""Smallest share of a direction's variance that the data must remove for it to be kept."""
 
 MAX_ELEMENTS = 10**8
-"""Rows times small errors: 0.8 GB, of which some are held at a time (8 GB at most)."""
+"""Rows times distributed errors: 0.8 GB each array, 8 GB for all of them."""
 
 AT_ONCE = 2**24
-"""Numbers of the rows of small errors that are taken at a time."""
+"""Numbers of signature rows in memory at a time."""
 
 
 @dataclass(frozen=True)
 class DistributedErrors:
-    """What is known of small errors beforehand: Gaussian, about some amounts.
+    """Gaussian distribution of distributed errors.
 
-    The covariance is rms (1 - sum_d share_d v_d v_d^T) rms: of the directions v something was
-    measured already.
+    The covariance is rms (1 - sum_d share_d v_d v_d^T) rms, with the directions v that were
+    measured.
 
     Attributes:
-        hypotheses: every small error.
-        amounts: the likeliest, [error].
-        rms: of each before anything was measured, [error].
-        seen: orthonormal directions in units of the rms, [direction, error].
-        share: of the variance of each that is known since, [direction].
-        causes: what is there besides, for certain.
+        hypotheses: every error.
+        amounts: mean, [error].
+        rms: prior standard deviations, [error].
+        seen: measured directions, orthonormal, in units of the rms, [direction, error].
+        share: share of each direction's variance that measurements removed, [direction].
+        causes: further causes that are certain.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -76,27 +75,27 @@ class DistributedErrors:
     def usual(
         cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]
     ) -> "DistributedErrors":
-        """About zero, of sizes by effect; nothing was measured."""
+        """Return the prior with zero mean and one rms per effect."""
         scale = np.array([rms[name] for name, _ in hypotheses])
         return cls(
             tuple(hypotheses), np.zeros(len(scale)), scale, np.zeros((0, len(scale))), np.zeros(0)
         )
 
     def correlated(self, x: Array) -> Array:
-        """Coordinates [error, ...] of independent errors of size 1 as shares of the rms."""
+        """Correlated errors in units of the rms, from independent ones of size 1, [error, ...]."""
         left = 1 - np.sqrt(1 - self.share)
         return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
                           .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
 
     def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
-        """With more readings.
+        """Return the distribution after more readings.
 
         Args:
-            amounts: the likeliest now, [error].
-            share: of the variance that was left, what is known now, [direction].
-            seen: of which directions, in the coordinates of `mixed`, [direction, error].
+            amounts: new mean, [error].
+            share: share of each direction's remaining variance that they removed, [direction].
+            seen: these directions in the coordinates of `correlated`, [direction, error].
         """
-        if len(self.share):  # back to coordinates of the first rms
+        if len(self.share):  # back to units of the prior rms
             left = np.eye(len(amounts)) - (seen.T * share) @ seen
             whole = self.correlated(self.correlated(left).T)
             share, directions = np.linalg.eigh(np.eye(len(amounts)) - whole)
@@ -108,19 +107,19 @@ class DistributedErrors:
 
     @property
     def errors(self) -> Array:
-        """Standard deviation of each, [error]."""
+        """Standard deviations, [error]."""
         taken = self.share @ self.seen**2 if len(self.share) else 0.0
         return np.asarray(self.rms * np.sqrt(np.maximum(1 - taken, 0.0)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class MarginalProblem(Problem):
-    """A problem whose rows errors move too that nobody asks for: Gaussian, of size 1.
+    """A problem with nuisance errors integrated out: Gaussian, of size 1.
 
     Attributes:
-        inner: what is asked.
+        inner: the problem given these errors.
         spread: d reading / d error, [error, *shape of `valid`].
-        shift: what is to be put back on the readings, of the shape of `valid`; or 0.
+        shift: offset of the readings, of the shape of `valid`; or 0.
     """
 
     inner: Problem = field(repr=False)
@@ -129,7 +128,7 @@ class MarginalProblem(Problem):
 
     @cached_property
     def rows(self) -> Array:
-        """The signatures in rows of the inner problem, [error, row]."""
+        """The errors' signatures in rows of the inner problem, [error, row]."""
         return self.inner.as_rows(self.spread)
 
     @cached_property
@@ -142,36 +141,35 @@ class MarginalProblem(Problem):
 
     @property
     def log_scale(self) -> float:
-        """Of the rows' density beside the exponential of chi-square: -1/2 log det of their
-        covariance, by which explanations among other small errors compare."""
+        """Log density of the rows beyond exp(-chi2 / 2): -1/2 log det of their covariance."""
         return self._root.log_scale
 
     def white(self, rows: Array) -> Array:
-        """Rows [..., row] of the inner problem in the covariance of all."""
+        """Rows [..., row] of the inner problem, whitened."""
         return self._root.white(rows)
 
     # --- the model ------------------------------------------------------------------------------
     @property
     def first(self) -> Array:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.first
 
     @property
     def free(self) -> int:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.free
 
     @property
     def freedom(self) -> int:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.freedom
 
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.sees(hypothesis)
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
-        """`view` is the inner point."""
+        """Return the model's point; its `view` is the inner problem's."""
         point = self.inner.at(causes, nuisances, kicks)
         if point.projection is None:
             return replace(point, view=point)
@@ -183,68 +181,68 @@ class MarginalProblem(Problem):
         )
 
     def slope(self, point: Point, cause: int) -> Array:
-        """Whitened."""
+        """Return the whitened slope, [row]."""
         return self.white(self.inner.slope(point.view, cause))
 
     def moved(self, nuisances: Array, change: Array) -> Array:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.moved(nuisances, change)
 
     def metric(self, point: Point) -> Metric:
-        """As the kind has it, or signatures made and whitened."""
+        """Return the kind's own products, or those of whitened signatures."""
         assert point.projection is not None
         fast = self.inner.metric_among(point.view, self._root, point.projection)
         return _MarginalMetric(self, point) if fast is None else fast
 
     @property
     def kick_places(self) -> Sequence[str]:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.kick_places
 
     def kick_rows(self, point: Point, place: int) -> Array:
-        """Whitened."""
+        """Return the whitened rows, [parameter, row]."""
         return self.white(self.inner.kick_rows(point.view, place))
 
     def everywhere(self) -> Self:
-        """As the inner one."""
+        """As in the inner problem."""
         return replace(self, inner=self.inner.everywhere())
 
     @property
     def alone(self) -> bool:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.alone
 
     def with_fixed(self, causes: Sequence[Cause]) -> Self:
-        """The same errors of size 1 beside further fixed causes."""
+        """Return the problem with further fixed causes and the same errors."""
         other = replace(self, inner=self.inner.with_fixed(causes))
         vars(other)["_root"] = self._root
         return other
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.neighbours(hypothesis, among)
 
     # --- readings -------------------------------------------------------------------------------
     @property
     def monitors(self) -> Sequence[str]:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.monitors
 
     @property
     def valid(self) -> Flags:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.valid
 
     def owner(self) -> NDArray[np.int64]:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.owner()
 
     def as_rows(self, readings: Array) -> Array:
-        """Whitened."""
+        """Return whitened rows, [..., row]."""
         return self.white(self.inner.as_rows(readings))
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """What is left of each reading given those before it, where the kind has single ones."""
+        """Residual of each single reading given those before it, and its variance."""
         assert point.projection is not None
         alone, size = self.inner.left(point.view)
         clean = point.projection.out(point.residual)
@@ -254,7 +252,7 @@ class MarginalProblem(Problem):
         return np.where(alone == 0, 0.0, left), np.ones_like(size)
 
     def without(self, dropped: Flags) -> Self:
-        """The covariance is worked out anew."""
+        """Return the problem without some readings; its covariance is computed anew."""
         if not dropped.any():
             return self
         return replace(self, inner=self.inner.without(dropped))
@@ -262,17 +260,15 @@ class MarginalProblem(Problem):
 
 @dataclass(frozen=True, kw_only=True)
 class DistributedProblem(MarginalProblem):
-    """A problem among small errors.
+    """A problem with distributed errors.
 
-    Its inner problem has the likeliest small errors among its fixed causes, its errors are the
-    coordinates of `known.mixed`, and its shift is what the amounts in the model, beyond the
-    likeliest beforehand, make of the readings.
+    The inner problem has the linearisation's amounts among its fixed causes. The errors are the
+    coordinates of `known.correlated`; the shift moves readings from these amounts to the mean.
 
     Attributes:
-        known: of the small errors beforehand.
-        about: their amounts in the model, [error].
-        open: of which family each is, and the covariance of the logarithms of their sizes where
-            those were learnt; or None.
+        known: distribution of the errors before these data.
+        linearised_at: amounts in the model, [error].
+        open: family of each error, and covariance of the log scales that were estimated; or None.
     """
 
     known: DistributedErrors = field(repr=False)
@@ -280,7 +276,7 @@ class DistributedProblem(MarginalProblem):
     open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
-        """By how the variance along it changes with the sizes of small errors."""
+        """Degrees of freedom of the variance along a hypothesis, from the scales' covariance."""
         if self.open is None or point.projection is None:
             return np.inf
         family, covariance = self.open
@@ -290,14 +286,14 @@ class DistributedProblem(MarginalProblem):
         return 2 / max(float(slope @ covariance @ slope), 1e-9)
 
     def estimate(self, clean: Array) -> Array:
-        """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
+        """Most probable amounts of the errors, given the rows that remain, [error]."""
         known = self.known
         amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         return np.array([find(name).some_left(amount) for (name, _), amount in own])
 
     def learnt(self, explained: Fit) -> DistributedErrors:
-        """What is known of the small errors since, beside an explanation."""
+        """Distribution of the errors given an explanation."""
         seen = explained.projection.out(self.white(self.rows))
         share, directions = np.linalg.eigh(seen @ seen.T)
         big = share > MIN_SHARE
@@ -316,23 +312,23 @@ class _MarginalMetric(Metric):
         return self.problem.white(self.inner.rows(hypotheses))
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Monitors have errors of their own among the small ones: none is set aside here."""
+        """Return no information: monitor errors are part of the distributed ones."""
         count = len(self.problem.monitors)
         return np.zeros((count, 1, 1)), np.zeros((count, 1))
 
 
 @dataclass(frozen=True)
 class FittedErrors:
-    """Small errors as these data show them.
+    """Distributed errors as estimated from data.
 
     Attributes:
-        problem: among them.
-        plain: without them, with the noise as learnt.
-        before: nuisances alone.
+        problem: with these errors.
+        plain: without them, with the noise as estimated.
+        before: fit of the nuisances alone.
         sizes, errors: rms by effect; relative error of each.
-        log_evidence: over no small errors.
-        apart: log evidence that the cause given which they were taken is none of them, however
-            large its family may be; None: not asked.
+        log_evidence: over no distributed errors.
+        outlier_evidence: log evidence that the one cause is a fault rather than a member of its
+            family of errors; None: not computed.
     """
 
     problem: DistributedProblem
@@ -356,23 +352,21 @@ def fit_distributed_errors(
     stored: Array | None = None,
     weigh: bool = False,
 ) -> FittedErrors:
-    """The background of a machine as these data show it, linear about its likeliest amounts.
+    """Return the distributed errors of a machine, linearised at their most probable amounts.
 
     Args:
         problem: of the design.
-        known: of the small errors beforehand; where sizes are learnt they start there.
+        known: distribution of the errors before these data, with initial scales.
         nuisances: first guess.
-        causes: what was found already: small errors are taken beside it.
-        learn: the sizes are learnt; else they are as known.
-        noisy: so is the noise, which is a guess.
-        about: amounts that it is linearised at, [error]; None: at those that are known, and then at
-            the most probable ones.
-        weigh: whether the one cause is a small error itself is weighed too.
-        stored: amounts at which a beam is stored: `about` goes so far towards them as it has to.
+        causes: causes that are fitted together with the errors.
+        learn: estimate the scales; else they stay.
+        noisy: estimate the noise too.
+        linearised_at: [error]; None: the mean of `known`, then the most probable amounts.
+        weigh: compare the one cause with a member of its family (`outlier_evidence`).
+        stored: amounts with a stored beam, towards which `linearised_at` is moved if needed.
 
     Raises:
-        UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
-            causes.
+        UnstableRingError: no beam is stored with the most probable errors.
     """
     names, belongs = families_of(known)
     amounts = known.amounts if linearised_at is None else linearised_at
@@ -393,7 +387,7 @@ def fit_distributed_errors(
             noise = [part[keep] for part in inner.noise_rows()] if noisy else []
             directions = alone.projection.matrix()[keep]
             found = components_of_rows(moved[keep], directions, rows[:, keep], belongs, noise)
-            if weigh:  # as one of them
+            if weigh:  # as a member of its family
                 i = known.hypotheses.index((causes[0].effect, causes[0].element))
                 some, amount = rows[:, keep], causes[0].amount
                 some[i] *= find(causes[0].effect).chain(amount)
@@ -419,16 +413,15 @@ def fit_distributed_errors(
         amounts = among.estimate(point.projection.out(point.residual))
     before = fit(among, (), nuisances)
     if before.point.lost:
-        raise UnstableRingError(f"{before.point.lost} without what was found beside small errors")
+        raise UnstableRingError(f"{before.point.lost} with distributed errors, without the causes")
     sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
     return FittedErrors(among, problem, before, sizes, errors, evidence, outlier_evidence)
 
 
 def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
-    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where there is none.
+    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where missing.
 
-    Rows are what a kind gives; the readings' own noise is put back so that readings can be left
-    out later: `as_rows` of ones says what that is.
+    The noise is put back, so that readings can be dropped later: `as_rows` of ones gives it.
     """
     unit = problem.as_rows(np.ones(problem.valid.shape))
     linearised_at, there = problem.everywhere().metric(point), unit > 0
@@ -442,7 +435,7 @@ def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesi
 
 
 def families_of(known: DistributedErrors) -> tuple[list[str], NDArray[np.int64]]:
-    """Effects that have a size, and of which each error is, [error]."""
+    """Effects in `known`, and the index of each error's effect, [error]."""
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
 
@@ -455,16 +448,18 @@ def linearise(
     causes: Sequence[Cause],
     nuisances: Array,
 ) -> tuple[Problem, Point, Array]:
-    """The problem with small errors in it as near to some amounts as a beam is stored, the point
-    of the causes there, and those amounts.
+    """Return the problem linearised as near to some amounts as a beam is stored.
 
     Args:
-        problem, causes, nuisances, known: see `small_errors_of`.
+        problem, causes, nuisances, known: see `fit_distributed_errors`.
         amounts: wanted, [error].
-        stored: amounts at which there is a beam; the same ones: that is not known.
+        stored: amounts with a stored beam; the same object as `amounts`: unknown.
+
+    Returns:
+        The problem with these errors, the point of the causes, and the amounts.
 
     Raises:
-        UnstableRingError: there is none near enough.
+        UnstableRingError: no amounts between the two store a beam.
     """
     first = amounts is stored
     for turn in range(MAX_HALVINGS):
@@ -476,20 +471,19 @@ def linearise(
             return inner, alone, amounts
         if first:
             break
-        # too far for what is linear
+        # beyond the linear range
         amounts = stored if turn == MAX_HALVINGS - 2 else (amounts + stored) / 2
-    raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
+    raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
 
 
 def chain_factors(known: DistributedErrors, amounts: Array) -> Array:
-    """d readings / d amount over signatures, of each, see `Effect.chain`."""
+    """Factors from signatures to d readings / d amount, [error]; see `Effect.chain`."""
     own = zip(known.hypotheses, amounts, strict=True)
     return np.array([find(name).chain(amount) for (name, _), amount in own])
 
 
 def sampled_rows(count: int) -> NDArray[np.int64]:
-    """Rows from which sizes are learnt: drawn once and for all, so that planes and monitors, which
-    come in turns, all have their share."""
+    """Return rows for variance components: a fixed random sample, as rows alternate in kind."""
     if count <= ROWS:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, ROWS, replace=False))
@@ -502,19 +496,19 @@ def components_of_rows(
     belongs: NDArray[np.int64],
     noise: Sequence[Flags] = (),
 ) -> VarianceComponents:
-    """Sizes from some rows.
+    """Return the variance components from a sample of rows.
 
     Args:
-        residual: what is left, [row].
+        residual: [row].
         directions: of the nuisances, [row, coordinate].
-        rows: what errors of size 1 make, [error, row].
+        rows: signatures of errors of size 1, [error, row].
         belongs: family of each error, [error].
-        noise: parts of the rows whose noise is learnt too, [row] each.
+        noise: parts of the rows whose noise is estimated too, [row] each.
     """
     launch = directions[:, np.abs(directions).max(axis=0) > 0]
     size = np.linalg.norm(launch, axis=0)
     basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(residual), 0))
-    there = basis.any(axis=1)  # nobody read the others, which have no noise
+    there = basis.any(axis=1)  # the other rows have no reading, and no noise
     there = np.any(noise, axis=0) | there if noise else np.ones_like(there)
     families = [rows[belongs == k][:, there] for k in range(belongs.max() + 1)]
     return fit_variance_components(

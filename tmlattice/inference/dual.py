@@ -1,8 +1,8 @@
-"""Many small causes at once: the most probable amounts under a prior, more of them than readings.
+"""Most probable amounts of many errors under a prior, more amounts than readings.
 
-Gauss and Newton in the space of the readings: with the slopes J and the prior's variances P the
-amounts are P J^T (J P J^T + C)^-1 target. J is not needed itself, only its products, which the
-problem knows (`Slopes`). Tails give each amount a variance of its own, found as the fit goes.
+Gauss-Newton in the space of the readings: with slopes J and prior variances P the amounts are
+P J^T (J P J^T + C)^-1 target. Only products with J are needed (`Slopes`). Heavy tails give each
+amount a variance of its own, which is updated during the fit.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,24 +19,24 @@ from tmlattice.inference.priors import Student
 Array = NDArray[np.float64]
 
 INITIAL_NOISE = 30.0
-"""The fit begins with a noise of the residual's rms over this, and ends with the readings' own: a
-linear model is worth no more, and a fit that believes it exactly runs away."""
+"""The residual's rms over the first added noise, which falls to zero: a linear model that is
+believed exactly far from the solution diverges."""
 
 WIDEST, NARROWING = 1000.0, 1.78
-"""Tails have many local maxima: they begin this much wider, near a Gaussian, and every time that
-the variances are found anew they are narrower by the second figure."""
+"""Heavy tails have many local maxima: the prior starts wider by the first number, near a Gaussian,
+and narrows by the second at every update of the variances."""
 
 MAX_HALVINGS = 8
-"""A step is halved so often at most, where the linear model does not reach."""
+"""Halvings of a step, at most, beyond the linear range."""
 
 SCALE_ITERATIONS = 4
-"""Iterations in which the scale of the prior follows the evidence."""
+"""Iterations in which the prior's scale follows the evidence."""
 
 SCALES = np.logspace(-4, 3, 141)
 
 
 class Slopes(Protocol):
-    """d readings / d amounts about one point, as products."""
+    """d readings / d amounts at one point, as products."""
 
     def times(self, amounts: Array) -> Array:
         """J amounts, [row]."""
@@ -46,7 +46,7 @@ class Slopes(Protocol):
 
     @property
     def matrix(self) -> Array:
-        """J itself, [row, amount]: asked for where amounts are fewer than rows."""
+        """J itself, [row, amount]: used if there are fewer amounts than rows."""
 
     def kernel(self, variance: Array) -> Array:
         """J P J^T for variances P [amount], [row, row]."""
@@ -61,28 +61,28 @@ class AmountProblem(Protocol):
 
     @property
     def largest(self) -> float:
-        """No amount is larger."""
+        """Largest amount."""
 
     def residual(self, amounts: Array) -> Array:
-        """Measured less model, m, [row]; BeamLostError where there is none."""
+        """Measured less model, m, [row]; raises BeamLostError without a beam."""
 
     def slopes(self, amounts: Array) -> Slopes:
-        """About these amounts."""
+        """Slopes at these amounts."""
 
     def nuisances(self, amounts: Array) -> Array:
-        """Covariance of the readings by what else is not known, m^2, [row, row]."""
+        """Covariance of the readings by nuisances, m^2, [row, row]."""
 
 
 @dataclass(frozen=True)
 class MostProbable:
-    """Where a fit stands.
+    """A fit: amounts, residual and history.
 
     Attributes:
         amounts: [amount].
         residual: measured less model, m, [row].
-        prior: with the width as it is.
+        prior: with its final width.
         chi2: of every step.
-        settled: whether the last step was smaller than the noise.
+        converged: whether the last step was smaller than the noise.
     """
 
     amounts: Array
@@ -101,15 +101,15 @@ def most_probable(
     wide: bool = True,
     iterations: int = 12,
 ) -> MostProbable:
-    """The most probable amounts, from a noise far above the readings' own down to it.
+    """Most probable amounts, with an added noise that falls to zero.
 
     Args:
         problem: readings as a function of amounts.
         prior: of each amount.
         start: first guess, [amount].
-        choose: the width of the prior follows the evidence.
-        wide: tails begin wide; not where the start is a maximum of its own.
-        iterations: at most, at each level of noise.
+        choose: fit the width of the prior by the evidence.
+        wide: start with wide tails; not where the start is a local maximum to keep.
+        iterations: at most, at each level of added noise.
     """
     residual = problem.residual(start)
     now = MostProbable(start, residual, prior, (_chi2(problem, residual),))
@@ -130,7 +130,7 @@ def most_probable(
 
 
 def cost(problem: AmountProblem, found: MostProbable) -> float:
-    """- log of likelihood and prior, up to constants, with the readings' own noise."""
+    """Negative log posterior, up to constants, with the readings' own noise."""
     half = cho_factor(_base(problem, found.amounts, 0.0))
     return _cost(half, found.residual, found.prior, found.amounts)
 
@@ -155,7 +155,7 @@ def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Ar
 def _iterated(
     problem: AmountProblem, now: MostProbable, added_noise: float, widening: float, choose: bool
 ) -> tuple[MostProbable, float]:
-    """One step with noise `trust` added; settled where it was smaller than the noise."""
+    """Return one step with added noise; converged if the step is smaller than the noise."""
     slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, added_noise)
     target = now.residual + slopes.times(now.amounts)
     if choose:
@@ -191,8 +191,8 @@ def _iterated(
 def _linear(
     slopes: Slopes, base: Array, half: tuple[Array, bool], target: Array, amounts: int
 ) -> Callable[[Array], Array]:
-    """The best amounts of a linear model as a function of the prior's precisions [amount], in the
-    space of amounts or of readings, whichever is the smaller."""
+    """Best amounts of a linear model as a function of the prior's precisions [amount], in the space
+    of amounts or of readings, whichever is smaller."""
     if amounts < len(target):
         J = slopes.matrix
         weighed = cho_solve(half, J)
@@ -213,7 +213,7 @@ def _linear(
 
 
 def best_scale(kernel: Array, base: Array, target: Array) -> float:
-    """The factor s of greatest evidence, target ~ N(0, s^2 kernel + base)."""
+    """Factor s of the largest evidence, target ~ N(0, s^2 kernel + base)."""
     half = np.linalg.cholesky(base)
     inner = np.linalg.solve(half, np.linalg.solve(half, kernel).T)
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
@@ -224,5 +224,5 @@ def best_scale(kernel: Array, base: Array, target: Array) -> float:
 
 
 def best_of(problem: AmountProblem, found: Sequence[MostProbable]) -> MostProbable:
-    """The one of least cost."""
+    """Return the fit of least cost."""
     return min(found, key=lambda one: cost(problem, one))

@@ -1,4 +1,4 @@
-"""What could be done next without a name: a free kick, a monitor set aside, a reading left out."""
+"""Next steps of a search without an effect of the catalogue: free kick, BPM or reading rejected."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.scan import FreeScan, free_threshold, look_elsewhere
 
 READINGS_PER_OUTLIER = 10
-"""Readings for each one that is wrong for once: of a few, such as two tunes, none is."""
+"""Readings per rejected one, at least: of a few readings, such as two tunes, none is rejected."""
 
 Reading = tuple[int, ...]
-"""Where it stands among the problem's readings."""
+"""Index among the problem's readings."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """What could be done next: by how much the log evidence grows, and how it was seen."""
+    """Next step of a search: its gain in log evidence, and its significance."""
 
     kind: str
     name: str
@@ -36,14 +36,14 @@ def unnamed(
     names: Sequence[str],
     taken: Mapping[int, Detection],
 ) -> list[Option]:
-    """Something without a name at the place where it explains most, if that is clear.
+    """Free kick or rejected BPM that explains most, if significant.
 
     Args:
         problem: model and data.
         kind: "kick" or "monitor".
         free: the scan of all places.
         names: of the places.
-        taken: places that have one already.
+        taken: places that have one.
     """
     rate = problem.judgement.rate(kind)
     place = int(free.gain.argmax())
@@ -61,12 +61,12 @@ def unnamed(
 
 
 def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
-    """The reading that is least explained, left out, if that is clear.
+    """Rejection of the reading with the largest residual, if significant.
 
     Args:
         problem: model and data.
-        point: the model at what was found.
-        already: readings that were left out.
+        point: the model of the fit.
+        already: number of rejected readings.
     """
     judge = problem.judgement
     if int(problem.valid.sum()) < READINGS_PER_OUTLIER * (already + 1):
@@ -79,6 +79,6 @@ def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
     seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
     if not seen.p_value < rate:
         return []
-    # an amount even over its logarithm, as for every other cause
+    # a log-uniform amount, as for every other cause
     gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.outlier_prior
     return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]

@@ -1,9 +1,9 @@
-"""What readings leave known of small errors, from sums over their rows: no signature is held whole.
+"""Posterior of distributed errors from sums over rows, without storing signatures.
 
-With signatures S (rms times slope, errors x rows) and what is left r, the likeliest errors are
-(1 + S S^T)^-1 S r, and their covariance is (1 + S S^T)^-1. Both need S S^T and S r alone, which
-are added up some rows at a time: memory goes as the square of the errors, whatever the number of
-readings. `among` holds all signatures, because a search among small errors whitens rows by them.
+With signatures S (rms times slope, errors x rows) and residual r, the most probable errors are
+(1 + S S^T)^-1 S r, and their covariance is (1 + S S^T)^-1. S S^T and S r are summed some rows at a
+time: memory grows as the square of the errors, whatever the number of readings. `distributed` keeps
+all signatures, since its search whitens rows by them.
 """
 
 from collections.abc import Mapping
@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Posterior:
-    """Small errors as these readings leave them.
+    """Distributed errors given these readings.
 
     Attributes:
-        before: what was known, with the sizes as learnt.
-        amounts: the likeliest, [error].
-        felt: which errors the readings feel.
-        spread: S S^T of these, in the coordinates of `Known.mixed`, [felt, felt].
-        errors: relative error of each size by effect, where they were learnt.
+        before: the prior, with its estimated scales.
+        amounts: most probable amounts, [error].
+        visible: errors with a signature.
+        spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
+        errors: relative error of each estimated scale, by effect.
     """
 
     before: DistributedErrors = field(repr=False)
@@ -50,13 +50,13 @@ class Posterior:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """rms by effect."""
+        """Estimated rms by effect."""
         own = zip(self.before.hypotheses, self.before.rms.tolist(), strict=True)
         return {name: rms for (name, _), rms in own}
 
     @cached_property
     def known(self) -> DistributedErrors:
-        """What is known now."""
+        """Posterior distribution."""
         values, vectors = eigh(
             self.spread, subset_by_value=(MIN_SHARE / (1 - MIN_SHARE), np.inf), check_finite=False
         )
@@ -67,12 +67,12 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Sums:
-    """Of d rows / d amount over all rows, nuisances projected out.
+    """Sums of d rows / d amount over all rows, nuisances projected out.
 
     Attributes:
-        gram: with one another, [error, error].
-        inner: with what is left of the readings, [error].
-        some: themselves in a few rows, nuisances not projected out, [error, row].
+        gram: with each other, [error, error].
+        inner: with the residual, [error].
+        some: slopes in a few rows, nuisances not projected out, [error, row].
     """
 
     gram: Array
@@ -87,16 +87,16 @@ def posterior(
     learn: bool = True,
     linearised_at: Array | None = None,
 ) -> Posterior:
-    """What is known of small errors since these readings, linear about the likeliest amounts.
+    """Return the posterior of distributed errors, linearised at the most probable amounts.
 
     Args:
         problem: of the design.
-        known: beforehand; where sizes are learnt they start there.
-        learn: the sizes are learnt; else they are as known.
-        about: amounts from which on it is linear at first, [error]; None: those that are known.
+        known: prior, with initial scales.
+        learn: estimate the scales; else they stay.
+        linearised_at: first point of linearisation, [error]; None: the prior's mean.
 
     Raises:
-        UnstableRingError: the likeliest small errors leave no stored beam.
+        UnstableRingError: no beam is stored with the most probable errors.
     """
     names, belongs = families_of(known)
     amounts = stored = known.amounts if linearised_at is None else linearised_at
@@ -136,14 +136,14 @@ def sums_at(
     amounts: Array,
     keep: NDArray[np.int64],
 ) -> Sums:
-    """The sums about a point.
+    """Return the sums at a point.
 
     Args:
-        problem: with the small errors in it.
+        problem: with the distributed errors in it.
         point: of nuisances alone.
-        known: which errors.
-        amounts: of those that are in the problem, [error].
-        keep: the few rows.
+        known: the errors.
+        amounts: amounts of the errors in the problem, [error].
+        keep: rows for `Sums.some`.
     """
     assert point.projection is not None
     clean = point.projection.out(point.residual)
@@ -155,7 +155,7 @@ def sums_at(
     column = np.full(len(clean), -1)
     column[keep] = np.arange(len(keep))
     for rows, signatures in problem.everywhere().metric(point).pieces(known.hypotheses):
-        visible = np.flatnonzero(signatures.any(axis=1))  # errors of other monitors are not
+        visible = np.flatnonzero(signatures.any(axis=1))
         own = slope[visible, None] * signatures[visible]
         gram[np.ix_(visible, visible)] += own @ own.T
         inner[visible] += own @ clean[rows]

@@ -1,9 +1,9 @@
-"""Which causes explain the data: one after another, each choice open to revision.
+"""Stepwise search for the causes that explain the data, with every choice revised.
 
-A step scans every hypothesis, stops where nothing is above the threshold, refits the leading
-hypotheses through the nonlinear model, and takes the one with the largest evidence: an effect of
-the catalogue, or something without a name at a place, or a monitor that is set aside. After each
-step every earlier choice is held against its rivals again, with all the others in place.
+A step scans every hypothesis, ends below the threshold, refits the leading hypotheses through the
+nonlinear model, and takes the one with the largest evidence: an effect of the catalogue, a free
+kick at a place, or a rejected BPM. After each step every earlier choice is compared with its
+alternatives, together with all the others.
 
 >>> found = explain(Search(problem, hypotheses), fit(problem, (), launches))
 """
@@ -37,22 +37,22 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched, and by which rules.
+    """What is searched, and the rules.
 
     Attributes:
-        problem: model and data, nothing left out.
-        hypotheses: what may be the cause.
+        problem: model and all data.
+        hypotheses: candidate causes.
         most: findings at most.
-        unnamed: whether free kicks, monitors set aside and single readings may explain something.
-        by_evidence: evidence alone says whether a first cause is there, not the rate of false
-            alarms: for a caller that asks for the likeliest explanation, whatever it is.
-        names_first: what has a name goes before a free kick. Else that is tried where a free kick
-            took what a name nearly explains, and the evidence decides.
-        enough: chi-square at which nothing is left to be explained, and no further look is taken.
-        granted: hypotheses of which it is decided already that something is there.
-        keep: whether a cause may only give way to a better one, not to none.
+        unnamed: whether free kicks, rejected BPMs and rejected readings may explain something.
+        by_marginal_likelihood: the marginal likelihood alone decides on a first cause, not the
+            false-alarm rate: for the most probable explanation, significant or not.
+        labelled_first: effects of the catalogue go before a free kick. Else that is tried if a free
+            kick was preferred to an effect that nearly explains it, and the evidence decides.
+        enough: chi-square below which the search ends.
+        established: hypotheses whose presence is known.
+        keep: a cause may be replaced, not removed.
         seed: of the threshold's simulation.
-        progress: told what was found.
+        progress: called with the name of each finding.
     """
 
     problem: Problem
@@ -70,7 +70,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Identified:
-    """A cause with a name: how it was seen, and what was held against it, itself the first."""
+    """Significance of a cause of the catalogue, and its alternatives, itself the first."""
 
     detection: Detection
     alternatives: tuple[Alternative, ...]
@@ -78,18 +78,18 @@ class Identified:
 
 @dataclass(frozen=True)
 class State:
-    """What is explained so far.
+    """Present explanation.
 
     Attributes:
-        problem: without what was left out.
-        fit: all named causes, free kicks and nuisances together.
+        problem: without rejected readings.
+        fit: all causes, free kicks and nuisances together.
         named: of each cause of the fit, in their order.
-        kicks: how each free kick was seen, by place.
-        monitors: those set aside because no named cause explains them.
-        spikes: single readings left out.
-        dropped: all readings left out, of the problem's shape.
-        effective: number of independent hypotheses that pure noise sees; None: not known yet.
-        passed_over: whether a free kick took what a name nearly explains.
+        kicks: significance of each free kick, by place.
+        monitors: rejected BPMs, which no cause of the catalogue explains.
+        outliers: rejected single readings.
+        dropped: all rejected readings, of the problem's shape.
+        effective: number of independent hypotheses in pure noise; None: not yet simulated.
+        kick_preferred: whether a free kick was preferred to an effect that nearly explains it.
     """
 
     problem: Problem
@@ -104,18 +104,18 @@ class State:
 
     @property
     def count(self) -> int:
-        """Findings: causes with a name, free kicks, and monitors set aside."""
+        """Number of causes, free kicks and rejected BPMs."""
         return len(self.named) + len(self.kicks) + len(self.monitors)
 
     @property
     def names(self) -> frozenset[object]:
-        """Of causes and places of kicks."""
+        """Causes and places of kicks."""
         causes = ((c.effect, c.element) for c in self.fit.causes)
         return frozenset([*causes, *self.fit.kicks])
 
     @property
     def choices(self) -> object:
-        """All of them, what was left out too."""
+        """Causes, kicks and rejected readings."""
         return self.names, frozenset(self.monitors), frozenset(self.outliers)
 
 
@@ -124,14 +124,14 @@ AnyState = TypeVar("AnyState", bound=State)
 
 @dataclass(frozen=True)
 class Explanation(State):
-    """What was found, and the scans that saw it.
+    """Final explanation with its scans.
 
     Attributes:
-        before: the nuisances alone.
-        first, first_kicks: the scans of the nuisances alone, which saw the first finding.
-        scan, left: the last ones, of what is left.
-        full: whether the search ended because no more findings were allowed.
-        beyond: one cause more, refitted and not taken.
+        before: fit of the nuisances alone.
+        first, first_kicks: scans of that fit.
+        scan, left: scans of the final residual.
+        full: whether the search ended at the largest number of findings.
+        beyond: one cause more, refitted and not accepted.
     """
 
     before: Fit = None  # type: ignore[assignment]
@@ -145,7 +145,7 @@ class Explanation(State):
 
 @dataclass(frozen=True)
 class Scans:
-    """One look at what is left: all scans about a state."""
+    """All scans of a state's residual."""
 
     named: Scan
     kicks: FreeScan
@@ -153,12 +153,12 @@ class Scans:
 
 
 def explain(search: Search, before: Fit, so_far: Explanation | None = None) -> Explanation:
-    """Search for the causes of what the nuisances leave unexplained.
+    """Search for the causes of the residual of a fit.
 
     Args:
         search: what is searched.
-        before: the nuisances alone.
-        so_far: a search for fewer that goes on; None: a new one.
+        before: fit of the nuisances alone.
+        so_far: a search for fewer findings, to be continued; None: a new one.
     """
     found = _run(search, before, so_far)
     if not (found.kick_preferred and found.kicks):
@@ -177,7 +177,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         first = Scans(so_far.first, so_far.first_kicks, NO_SCAN)
     seen: set[frozenset[object]] = set()
     visited: set[object] = set()
-    pending = False  # choices were added or readings left out since all were held against rivals
+    pending = False  # choices changed since all were compared with their alternatives
     while True:
         state, scans = _scan_all(search, state)
         first = first or scans
@@ -185,7 +185,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         over = full or len(state.outliers) > state.problem.judgement.most_outliers
         options = [] if over else _options(search, state, scans)
         beyond = next((option.alternatives for option in options if option.kind == "named"), ())
-        # the rate of false alarms says whether anything is there; evidence what more
+        # the false-alarm rate decides on a first finding, the evidence on further ones
         told = () if seen or search.by_marginal_likelihood else ("named",)
         options = [option for option in options if option.gain > 0 or option.kind in told]
         seen.add(state.names)
@@ -199,7 +199,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
         search.progress(best.name)
         there, state = state, _taken(search, state, best, scans)
-        if state.fit.point.lost:  # the model has no answer there
+        if state.fit.point.lost:  # the model has no solution there
             state = there
             break
         pending = pending or state.count > 1
@@ -208,7 +208,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         if state.fit.chi2 <= search.enough:
             break
         if state.choices in visited or (best.kind in ("named", "kick") and state.names in seen):
-            break  # what was added went again
+            break  # the last choice was reverted
     if pending:
         state = revised(search, state)
     return Explanation(
@@ -218,15 +218,15 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
 
 
 def _weighed(search: Search, one: State, other: State) -> float:
-    """Log evidence of an explanation on the readings that both keep."""
+    """Log evidence of an explanation on the readings that neither rejects."""
     return on_readings(search.problem.without(one.dropped | other.dropped), one)[0]
 
 
 def on_readings(problem: Problem, state: State) -> tuple[float, Fit]:
-    """Log evidence of what is explained, refitted on the readings of a problem; and that fit.
+    """Log evidence of an explanation refitted on a problem's readings; and that fit.
 
     Args:
-        problem: with the readings that two explanations are compared on.
+        problem: with the readings on which explanations are compared.
         state: one of them.
     """
     refitted = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
@@ -260,7 +260,7 @@ def _scan_all(search: Search, state: State) -> tuple[State, Scans]:
 
 
 def _options(search: Search, state: State, scans: Scans) -> list[Option]:
-    """What could be done next."""
+    """Possible next steps."""
     problem = state.problem
     judge = problem.judgement
     options = []
@@ -295,7 +295,7 @@ def _options(search: Search, state: State, scans: Scans) -> list[Option]:
 
 
 def _refitted(search: Search, state: State, option: Option, scans: Scans) -> Option:
-    """With what it takes of chi-square in fact: about a fit that is stuck a scan says little."""
+    """Correct the gain by the actual fall of chi-square: a scan of a stuck fit is unreliable."""
     if option.kind == "named":
         return option
     fell = state.fit.chi2 - _taken(search, state, option, scans).fit.chi2
@@ -303,7 +303,7 @@ def _refitted(search: Search, state: State, option: Option, scans: Scans) -> Opt
 
 
 def _choice(search: Search, state: State, options: Sequence[Option]) -> tuple[Option, State]:
-    """The one that explains most; or the cause with a name, where names come first."""
+    """Take the step that explains most; or the cause of the catalogue, where these go first."""
     best = max(options, key=lambda option: option.gain)
     named = [option for option in options if option.kind == "named"]
     if named and best.kind == "kick":
@@ -338,7 +338,7 @@ def _taken(search: Search, state: State, option: Option, scans: Scans) -> State:
 
 
 def _without(search: Search, state: AnyState, dropped: Flags) -> AnyState:
-    """The same causes on the readings that are left."""
+    """Fit the same causes without some readings."""
     problem = search.problem.without(dropped)
     found = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
     return replace(state, problem=problem, fit=found, dropped=dropped)
@@ -346,13 +346,13 @@ def _without(search: Search, state: AnyState, dropped: Flags) -> AnyState:
 
 # --- revising ----
 def revised(search: Search, state: AnyState, quick: bool = False) -> AnyState:
-    """Every choice held against its rivals, all the others in place, until none changes.
+    """Compare every choice with its alternatives, given all others, until none changes.
 
     Args:
         search: what is searched; its problem has all readings.
-        state: what is explained so far.
-        doubted: once, only causes that a scan puts behind others, and kicks against few rivals:
-            all of eight after each choice would take most of the time.
+        state: present explanation.
+        quick: once, and only causes that are not the leader of a scan, and kicks against three
+            alternatives: all of eight after each choice would take most of the time.
     """
     for _ in range(1 if quick else 3):
         names = state.names
@@ -368,7 +368,7 @@ def revised(search: Search, state: AnyState, quick: bool = False) -> AnyState:
 
 
 def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
-    """A monitor that was set aside comes back where a named cause, or none, does as well."""
+    """Restore a rejected BPM if a cause of the catalogue, or none, explains it as well."""
     own = state.problem.owner() == monitor
     others = {m: seen for m, seen in state.monitors.items() if m != monitor}
     outliers = tuple(outlier for outlier in state.outliers if not own[outlier])
@@ -394,7 +394,7 @@ def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
 
 
 def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> AnyState:
-    """A free kick gives way to a named cause, or to none, where that explains more."""
+    """Replace a free kick by a cause of the catalogue, or by none, if that explains more."""
     now = state.fit
     kicks = {k: v for k, v in now.kicks.items() if k != place}
     seen = {k: v for k, v in state.kicks.items() if k != place}
@@ -414,7 +414,7 @@ def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> An
 def _cause_revised(
     search: Search, state: AnyState, hypothesis: Hypothesis, quick: bool
 ) -> AnyState:
-    """A named cause gives way to a better one, or to none; its rivals are weighed anew."""
+    """Replace a cause by a better one, or by none; its alternatives are refitted."""
     now = state.fit
     own = [i for i, c in enumerate(now.causes) if (c.effect, c.element) == hypothesis]
     if not own:

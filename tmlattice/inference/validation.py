@@ -1,8 +1,7 @@
-"""How far the gap between model and measurement shrinks, judged on readings that no fit saw.
+"""Reduction of the gap between model and measurement on held-out readings.
 
-closed = 1 - (r_after^2 - v) / (r_before^2 - v), where v is the variance that the noise of readings
-makes of what is left, refitted nuisances included. Its interval says what the noise of these
-readings leaves open of it.
+explained = 1 - (r_after^2 - v) / (r_before^2 - v), where v is the variance of the residuals by the
+readings' noise, refitted nuisances included. Its interval is that of the same noise.
 """
 
 from collections.abc import Sequence
@@ -19,13 +18,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Misfit:
-    """What a model leaves.
+    """Size of a model's residuals.
 
     Attributes:
         rms: m.
         chi2_per_dof: per reading, in the covariance that the model expects.
-        expected: the rms that the model expects, m: of noise, of refitted nuisances, and of what is
-            not known of the model; None where nobody asked.
+        expected: expected rms, m, of noise, refitted nuisances and model uncertainty; None: not
+            computed.
     """
 
     rms: float
@@ -35,12 +34,12 @@ class Misfit:
 
 @dataclass(frozen=True)
 class Residuals:
-    """What a model leaves of readings that no fit saw, some of them correlated.
+    """Residuals of held-out readings, some of them correlated.
 
     Attributes:
         residual: readings less model, [reading], m.
-        noise: covariance that the noise of readings makes of that, [reading, reading], m^2.
-        covariance: the same with what is not known of the model; None: nothing more.
+        noise: their covariance by the readings' noise, [reading, reading], m^2.
+        covariance: the same with the model's uncertainty; None: no uncertainty.
     """
 
     residual: Array
@@ -53,7 +52,7 @@ class Half:
     """Readings of one half of the monitors.
 
     Attributes:
-        left: less the model, [reading], m.
+        left: readings less model, [reading], m.
         slopes: d reading / d nuisance, [reading, nuisance].
         sigma: noise, [reading], m.
     """
@@ -66,16 +65,16 @@ class Half:
 def cross_predicted(
     fitted: Half, scored: Half, offset: Array, known: Array, unknown: Array | None = None
 ) -> Residuals:
-    """What a model leaves of one half where the other one gives the nuisances.
+    """Residuals of one half of the monitors with nuisances fitted to the other half.
 
     Args:
-        gives, scored: the halves.
-        off: nuisances as known beforehand less those that the model stands at, [nuisance].
-        known: precision of that, [nuisance]; 0 where nothing is known.
-        unknown: covariance of what is not known of the model, readings of both halves, those that
-            give first, [reading, reading], m^2; None: nothing.
+        fitted, scored: the halves.
+        offset: prior mean of the nuisances less the model's values, [nuisance].
+        known: prior precision of the nuisances, [nuisance]; 0: none.
+        unknown: covariance of the readings by the model's uncertainty, the fitted half first,
+            [reading, reading], m^2; None: none.
     """
-    # by the noise alone: nuisances so fitted take up what else is wrong near these readings
+    # weighted by the noise alone: nuisances also absorb model errors near these readings
     weighed = fitted.slopes / fitted.sigma[:, None] ** 2
     information = fitted.slopes.T @ weighed + np.diag(known)
     size = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
@@ -97,8 +96,7 @@ class HeldOut:
 
     Attributes:
         residuals: readings less model, NaN where not scored, [shot, reading, 2], m.
-        parts: those that are scored, in groups without correlation with one another; empty where
-            the model has no answer.
+        parts: scored residuals in uncorrelated groups; empty where the model has no solution.
     """
 
     residuals: Array
@@ -107,16 +105,16 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Gap:
-    """The gap on held-out shots, model after model.
+    """Gap between models and held-out readings.
 
     Attributes:
-        misfits: of each model, in the order asked for.
+        misfits: of each model, in the order of the arguments.
         residuals: readings less model, NaN where not scored, [model, shot, reading, 2], m.
-        closed: share of the gap of model `since` that the last one closes; None where that is the
-            last one itself, or has no gap beyond the noise.
+        closed: share of the gap of model `baseline` that the last model explains; None if that is
+            the last one itself, or its gap is within the noise.
         interval: of `closed`, 95 %.
-        since: index of the model with which the last one is compared.
-        readings: how many are scored.
+        baseline: index of the model with which the last one is compared.
+        readings: number of scored readings.
     """
 
     misfits: tuple[Misfit, ...]
@@ -127,29 +125,29 @@ class Gap:
     readings: int = 0
 
     def significant(self, false_alarm: float) -> bool:
-        """Whether model `since` leaves more of these readings than it expects.
+        """Whether the gap of model `baseline` is larger than expected.
 
         Args:
-            false_alarm: probability of such a remainder by chance, below which it is significant.
+            false_alarm: largest p-value of a significant gap.
         """
         square = self.readings * self.misfits[self.baseline].chi2_per_dof
         return bool(chi2.sf(square, self.readings) < false_alarm)
 
     @property
     def lost(self) -> bool:
-        """Whether one of the models loses readings that the other one has: nobody judges it."""
-        if not len(self.residuals):  # of a response, whose models lose none
+        """Whether the two models lose the beam at different readings: they cannot be compared."""
+        if not len(self.residuals):  # of a response
             return False
         one, other = (np.isfinite(self.residuals[i]).sum() for i in (self.baseline, -1))
         return bool(one != other)
 
 
 def held_out_gap(models: Sequence[HeldOut], baseline: int = 0) -> Gap:
-    """The gap of a series of models on readings that no fit saw.
+    """Return the gap of a series of models on held-out readings.
 
     Args:
-        judged: by model, the first the design's.
-        since: the model whose gap is closed by the last one.
+        models: the first is the design.
+        baseline: index of the model with which the last one is compared.
     """
     misfits = tuple(_misfit(model.parts) for model in models)
     closed, interval = None, None
@@ -176,7 +174,7 @@ def _misfit(parts: Sequence[Residuals]) -> Misfit:
 def _explained(
     before: Sequence[Residuals], after: Sequence[Residuals]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """The noise is the same in both, so that much of it goes out of their ratio."""
+    """Explained share of the gap and its interval; the noise of both models is the same."""
     one, other = _together(before), _together(after)
     if len(one.residual) != len(other.residual):
         return None, None  # the beam is lost in one of them
@@ -185,7 +183,7 @@ def _explained(
     moved_one, moved_other = V @ one.residual, V @ other.residual
     bottom = float(one.residual @ one.residual - np.trace(one.noise))
     top = float(other.residual @ other.residual - np.trace(V))
-    # of what is left without noise, the noise being taken out of its estimate
+    # variances of the noise-free squares; the noise's own part is subtracted
     spread_bottom = 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
     spread_top = 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
     shared = 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
@@ -199,6 +197,6 @@ def _explained(
 
 
 def _together(parts: Sequence[Residuals]) -> Residuals:
-    """All parts as one: two models may group the same readings differently."""
+    """Return all parts as one: two models may group the same readings differently."""
     residual = np.concatenate([part.residual for part in parts])
     return Residuals(residual, block_diag(*(part.noise for part in parts)))
