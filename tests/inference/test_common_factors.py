@@ -1,4 +1,4 @@
-"""Few reasons behind many numbers, where others are there that cannot be selected one by one."""
+"""Common factors of many numbers, given others that cannot be resolved."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ NOISE = 1e-2
 TRIED = tuple(np.geomspace(0.03, 3, 9))
 
 
-def selected_apart_badly(changes, seed, readings=14):
-    """Levels of supplies whose changes as few readings see, all of them in each."""
+def few_readings(changes, seed, readings=14):
+    """Factors of supplies whose changes a few readings see, all of them in each."""
     rng = np.random.default_rng(seed)
     slopes = rng.standard_normal((readings, len(MEMBERS)))
     slopes[:, : 4 * EACH] *= 6  # four are seen well
@@ -49,15 +49,15 @@ def test_evidence_given_others_is_that_of_the_readings():
     np.testing.assert_allclose(amounts, exact @ shape.T @ np.linalg.solve(rest, y))
 
 
-def pulls(beside, seeds=30):
-    """Of amounts of what is selected where all supplies changed."""
+def pulls(given, seeds=30):
+    """Pulls of the selected amounts where all supplies changed."""
     found = []
     for seed in range(seeds):
         changes = np.random.default_rng(100 + seed).standard_normal(SUPPLIES)
-        own = selected_apart_badly(changes, seed)
+        own = few_readings(changes, seed)
         chosen = own.choose(SUPPLIES)
         over = [(own, 1.0)]
-        if beside:
+        if given:
             there = own.given_others(chosen, range(SUPPLIES), TRIED)
             own, chosen, over = there.levels, there.chosen, there.over
         found += [(r.amount - changes[r.candidate]) / r.sigma
@@ -76,7 +76,7 @@ def test_nothing_is_learnt_of_others_that_did_not_change():
     for seed in range(20):
         changes = np.zeros(SUPPLIES)
         changes[[1, 3]] = 1.0, -0.7
-        own = selected_apart_badly(changes, seed)
+        own = few_readings(changes, seed)
         chosen = own.choose(SUPPLIES)
         there = own.given_others(chosen, range(SUPPLIES), TRIED)
         assert (there.levels, there.chosen, there.rms) == (own, chosen, 0.0)
@@ -84,7 +84,7 @@ def test_nothing_is_learnt_of_others_that_did_not_change():
 
 
 def test_no_selected_factor_no_common_scale():
-    own = selected_apart_badly(np.random.default_rng(0).standard_normal(SUPPLIES), 0)
+    own = few_readings(np.random.default_rng(0).standard_normal(SUPPLIES), 0)
     for chosen, alike in (([], range(SUPPLIES)), ([7], [1, 2, 3])):
         there = own.given_others(chosen, alike, TRIED)
         assert (there.levels, there.chosen, there.rms, there.over) == (

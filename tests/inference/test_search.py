@@ -72,7 +72,7 @@ def test_a_search_ends_where_it_has_been(ring, measured, looks, monkeypatch):
     def options(search, state, look):
         return [Option("monitor", "another", 10.0, seen, where=len(state.monitors))]
 
-    def revised(search, state, doubted=False):
+    def revised(search, state, quick=False):
         return replace(state, monitors={0: seen})
 
     monkeypatch.setattr(own, "_options", options)

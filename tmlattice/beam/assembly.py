@@ -34,7 +34,7 @@ MADE = 10_000
 """Changed layers that are remembered: some 20 MB."""
 KEPT = 4
 """Rings with something known that are kept with a ring."""
-FEW = 10
+MAX_CHANGES = 10
 """Known causes of which a ring is worth keeping."""
 
 
@@ -147,7 +147,7 @@ def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Ass
     """A ring with known causes; where they are few, kept with the ring."""
     known = tuple(known)
     key = ("model", known, dimension)
-    few = len(known) < FEW
+    few = len(known) < MAX_CHANGES
     if few and key in ring.memory:
         kept: Assembly = ring.memory[key]
         return kept
@@ -239,6 +239,6 @@ class Group:
         layers = LayerMaps(set_ring, self.there.layers.dimension)
         fresh = directions(layers, [key[i] for i in again])
         found = base.replaced(again, fresh)
-        if len(key) > FEW:
+        if len(key) > MAX_CHANGES:
             self._latest = (key, found)
         return found

@@ -54,7 +54,7 @@ class Columns:
     layer: Indices
     slope: Array
     start: Array
-    pulled: Array
+    launch_kick: Array
 
 
 class ResponseModel:
@@ -93,13 +93,15 @@ class ResponseModel:
         ring: Ring,
         dimension: int = 6,
         frequency: float = 0.0,
-        astray: Array | None = None,
+        orbit_kicks: Array | None = None,
     ) -> None:
-        if astray is not None and (dimension != 6 or astray.shape != (len(ring.magnets), 2)):
-            raise ValueError("kicks astray are [magnet, 2], and of six coordinates")
+        if orbit_kicks is not None and (
+            dimension != 6 or orbit_kicks.shape != (len(ring.magnets), 2)
+        ):
+            raise ValueError("kicks of the orbit are [magnet, 2], and need six coordinates")
         self.ring = ring
         self.layers = LayerMaps(ring, dimension)
-        self.astray = astray
+        self.orbit_kicks = orbit_kicks
         magnets = np.arange(len(ring.magnets))
         self.maps = self._dispersed(ring_maps(ring, dimension, self.layers), magnets)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
@@ -145,22 +147,22 @@ class ResponseModel:
 
     def _dispersed(self, maps: RingMaps, layers: Sequence[int] | Indices) -> RingMaps:
         """With what `astray` says behind some layers."""
-        if self.astray is None:
+        if self.orbit_kicks is None:
             return maps
-        own = np.array([k for k in layers if k < len(self.astray)], dtype=np.int64)
+        own = np.array([k for k in layers if k < len(self.orbit_kicks)], dtype=np.int64)
         arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2")}
         for weights in arrays.values():
-            weights[own] = self._with_astray(own, weights[own])
+            weights[own] = self._with_orbit_kicks(own, weights[own])
         return replace(maps, **arrays)
 
-    def _with_astray(self, layers: Indices, weights: Array) -> Array:
+    def _with_orbit_kicks(self, layers: Indices, weights: Array) -> Array:
         """Weights of some layers, and behind each px -= kick p, and tau -= kick x, or the map
         were not symplectic, [layer, n, ...]."""
-        if self.astray is None:
+        if self.orbit_kicks is None:
             return weights
         behind = np.tile(np.eye(self.dimension), (len(layers), 1, 1))
         for plane in (0, 1):
-            kick = self.astray[layers, plane]
+            kick = self.orbit_kicks[layers, plane]
             behind[:, 2 * plane + 1, 5] = behind[:, 4, 2 * plane] = -kick
         return np.asarray(np.einsum("kij,kj...->ki...", behind, weights))
 
@@ -249,15 +251,15 @@ class ResponseModel:
             planes.append(CORRECTORS[element.kind])
         layer = self.layers.layer_of[place] if len(place) else np.empty(0, dtype=np.int64)
         kick, slope = self._kicks(place, layer)
-        pulled = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
+        launch_kick = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
         return Columns(
             names=tuple(ring.elements[i].name for i in place),
             planes=tuple(planes),
             place=place,
             layer=layer,
             slope=slope,
-            start=pulled @ self.closing.T,
-            pulled=pulled,
+            start=launch_kick @ self.closing.T,
+            launch_kick=launch_kick,
         )
 
     def response(self, correctors: Sequence[str] | None = None) -> Array:
@@ -272,7 +274,7 @@ class ResponseModel:
         """
         columns = self.columns(correctors)
         before = np.einsum("mai,ci->cma", self.reading_slopes, columns.start)
-        after = np.einsum("mai,ci->cma", self.reading_slopes, columns.pulled)
+        after = np.einsum("mai,ci->cma", self.reading_slopes, columns.launch_kick)
         return np.asarray(before + self.downstream(columns)[:, :, None] * after)
 
     def downstream(self, columns: Columns) -> NDArray[np.bool_]:
@@ -305,7 +307,7 @@ class ResponseModel:
             changed = element.changed(angle=element.angle + float(kick))
             replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
         V0, V1, V2 = (
-            self._with_astray(layer, np.stack(own)) for own in zip(*replaced, strict=True)
+            self._with_orbit_kicks(layer, np.stack(own)) for own in zip(*replaced, strict=True)
         )
         good = np.zeros(len(paths), dtype=bool)
         share(

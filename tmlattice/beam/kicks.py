@@ -41,9 +41,9 @@ def orbits_of_kicks(
     behind = np.asarray(sources) + 1
     kick = np.zeros((len(behind), model.dimension))
     kick[:, 2 * plane + 1] = 1.0
-    pulled = np.einsum("kij,kj->ki", model.inverse[behind], kick)
-    start = pulled @ model.closing.T
-    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ pulled.T))
+    launch_kick = np.einsum("kij,kj->ki", model.inverse[behind], kick)
+    start = launch_kick @ model.closing.T
+    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ launch_kick.T))
 
 
 def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:

@@ -100,7 +100,7 @@ class ResponseSlopes:
         n, at = model.dimension, model.maps.at
         rf = model.rf_start if n == 6 else np.zeros(n)
         self.start = np.vstack([columns.start, rf])
-        self.pulled = np.vstack([columns.pulled, np.zeros(n)])
+        self.launch_kick = np.vstack([columns.launch_kick, np.zeros(n)])
         self.readings = model.reading_slopes
         self.first = np.append(np.searchsorted(at, columns.layer, side="right"), len(at))
         self._exits = np.append(columns.layer + 1, 0)
@@ -111,7 +111,7 @@ class ResponseSlopes:
         n, shape = self.model.dimension, (len(self.start), *self.readings.shape[:2])
         seen = np.concatenate([change.seen, self.readings], axis=2).reshape(-1, 2 * n).T
         out = np.hstack([self.start, change.before]) @ seen
-        behind = np.hstack([self.pulled, change.behind]) @ seen
+        behind = np.hstack([self.launch_kick, change.behind]) @ seen
         there = np.arange(shape[1]) >= self.first[:, None]
         return np.asarray(out.reshape(shape) + there[:, :, None] * behind.reshape(shape))
 
@@ -134,7 +134,7 @@ class ResponseSlopes:
         for change in self.factors(hypotheses):
             for p, rows, there, readings in parts:
                 seen = np.hstack([change.seen[at, p], readings]).T
-                behind = np.hstack([self.pulled[rows], change.behind[rows]]) @ seen
+                behind = np.hstack([self.launch_kick[rows], change.behind[rows]]) @ seen
                 out[rows] = np.hstack([self.start[rows], change.before[rows]]) @ seen
                 out[rows] += there * behind
             yield out
@@ -165,7 +165,7 @@ class ResponseSlopes:
             if np.abs(kicks[own]).max(initial=0.0) > STILL:
                 moved = self._moved(d.layer[own], kicks[own])
                 seen, behind, end = seen + moved[0], behind + moved[1], end + moved[2]
-            before = (self.start + self.pulled) @ end.T + behind
+            before = (self.start + self.launch_kick) @ end.T + behind
             yield Factors(seen, before @ model.closing.T, behind)
 
     def _own(self, d: Directions) -> tuple[Array, Array]:
@@ -181,11 +181,11 @@ class ResponseSlopes:
     def _stepped(self, layers: NDArray[np.int64], sources: Array) -> tuple[Array, Array, Array]:
         """Of new kicks S u [row, n, n] in layers: what the monitors see of the launch; what of the
         columns' own kicks comes too late for them, [column, n]; and their sum, [n, n]."""
-        seen, missed = np.zeros_like(self.readings), np.zeros_like(self.pulled)
+        seen, missed = np.zeros_like(self.readings), np.zeros_like(self.launch_kick)
         for k, source in zip(layers, sources, strict=True):
             behind = np.searchsorted(self.model.maps.at, k, side="right")
             seen[behind:] += self.readings[behind:] @ source
-            missed += (self._exits > k)[:, None] * (self.pulled @ source.T)
+            missed += (self._exits > k)[:, None] * (self.launch_kick @ source.T)
         return seen, missed, sources.sum(axis=0)
 
     def _moved(self, layers: NDArray[np.int64], kicks: Array) -> tuple[Array, Array, Array]:
@@ -199,7 +199,7 @@ class ResponseSlopes:
             earlier = fed[k + 1] @ kick  # the kick is not there yet
             behind = np.searchsorted(self.model.maps.at, k, side="right")
             seen[behind:] += seen_by[behind:] @ kick - self.readings[behind:] @ earlier
-            missed = missed_by @ kick - self.pulled @ earlier.T
+            missed = missed_by @ kick - self.launch_kick @ earlier.T
             added -= (self._exits > k)[:, None] * missed
             added += (self._exits > k + 1)[:, None] * (own_by @ kick)
             end -= earlier
@@ -222,15 +222,15 @@ class ResponseSlopes:
         if maps.R2.any():
             bends = second_derivatives(maps.R2)
             seen += np.einsum("mpxy,mxb,myi->mpbi", bends, C[at], C[at], optimize=True)
-        missed = np.einsum("cabi,cb->cai", fed[self._exits], self.pulled)
-        own = np.zeros((len(self.pulled), n, n))
+        missed = np.einsum("cabi,cb->cai", fed[self._exits], self.launch_kick)
+        own = np.zeros((len(self.launch_kick), n, n))
         own[:-1] = back[columns.layer + 1] @ columns.slope @ C[columns.layer]
         return fed, seen, missed, own
 
     def _mixed(self, hypothesis: Hypothesis) -> Array:
         """What an error in a corrector makes of its own kick, as a change of the launch."""
         model, columns = self.model, self.columns
-        mixed = np.zeros_like(self.pulled)
+        mixed = np.zeros_like(self.launch_kick)
         effect, place = ring_effect(hypothesis[0]), hypothesis[1]
         members = effect.members(model.ring, place)
         for c in np.flatnonzero(np.isin(columns.place, members)):

@@ -128,7 +128,7 @@ def kicks(layer, D0, D1, D2, states, steps, out):  # type: ignore[no-untyped-def
 
 
 @jit
-def carry(first, last, owner, start, pulled, G, out):  # type: ignore[no-untyped-def]
+def carry(first, last, owner, start, launch_kick, G, out):  # type: ignore[no-untyped-def]
     """out [hypothesis, shot, reading, 2] += G v: kicks carried to all readings downstream.
 
     Args:
@@ -143,7 +143,7 @@ def carry(first, last, owner, start, pulled, G, out):  # type: ignore[no-untyped
         for row in range(len(owner)):
             h = owner[row]
             for turn in range(start.shape[1]):
-                v = pulled[shot, turn, row]
+                v = launch_kick[shot, turn, row]
                 for m in range(start[row, turn], G.shape[1]):
                     for plane in range(2):
                         total = 0.0

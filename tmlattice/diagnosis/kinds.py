@@ -35,7 +35,7 @@ from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import split_columns
-from tmlattice.observe.stored import Kept, Stored
+from tmlattice.observe.stored import ModelCache, Stored
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
@@ -118,10 +118,10 @@ def part_of(label: str, measured: Measured, how: How) -> Part:
 def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> CombinedProblem:
     """Measurements as one problem, beside those of a reference; stored beams of the same machine
     share the models made of it."""
-    kept = Kept()
+    cache = ModelCache()
     first, then = (
         [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            replace(own, cache=cache) if isinstance(own := part.problem, Stored) else own
             for part in some
         ]
         for some in (parts, before)
@@ -216,7 +216,7 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
         problem = make(how.ring, measured, how.places)
         if isinstance(problem, Stored):
             refused(how.ring, measured, problem)
-        said = problem.said if isinstance(problem, ManyTurns) else ()
+        said = problem.warnings if isinstance(problem, ManyTurns) else ()
         return Part(label, kind, problem, held and make(how.ring, held, how.places), said=said)
 
     return made

@@ -28,7 +28,7 @@ from tmlattice.inference.newton import Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit, held_out_gap
-from tmlattice.observe.first_turns import FirstTurns, judged
+from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -237,7 +237,7 @@ def held_out_shots(
             explained = explained if stage.causes or found.fit.causes == () else found.before
             about = replace(judge, model=model)
             unknown = _unknown(small, explained, about, stage)
-        scored.append(judged(replace(judge, model=model, fixed=stage.causes), unknown))
+        scored.append(held_out_residuals(replace(judge, model=model, fixed=stage.causes), unknown))
     return held_out_gap(scored, since)
 
 

@@ -201,7 +201,7 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
             return np.full(modes.shape, complex(np.nan, np.nan))
 
     mends = [replace(EXCHANGED, undo=exchanged), *_of_lines()]
-    said = [note("lines", one) for one in problem.said]
+    said = [note("lines", one) for one in problem.warnings]
     tunes = _near(ring, problem.data[:, -2:], problem.used[:, -2:])
     return [*said, tunes, *_judged(ring, "line", share, _lines(problem), mends)]
 
