@@ -1,6 +1,6 @@
-"""What each hypothesis, and each free kick, would change in the readings: d readings / d amount.
+"""Signatures of hypotheses and free kicks: d readings / d amount.
 
-A cause changes the state at the exit of its layer; C^-1 of the trajectory's tangent C makes that a
+A cause changes the state at the exit of its layer. C^-1 of the trajectory's tangent C makes that a
 change of the launch, and d reading / d launch carries it to all readings downstream.
 """
 
@@ -18,7 +18,8 @@ from tmlattice.effects import Cause, LaunchEffect, Monitors, ReadingEffect, Ring
 Array = NDArray[np.float64]
 
 SMALL = 1e-4
-"""Of the largest fault: central differences of readings, which are quadratic in none by more."""
+"""Step of central differences of readings over the largest fault; no effect is of higher than
+second order there."""
 
 
 def signatures(
@@ -115,7 +116,7 @@ def _given_back(
     slopes: Array,
     part: Array,
 ) -> None:
-    """More radiation moves the cavities' phase: they make good what the design orbit loses."""
+    """Signature by the cavities' phase, which follows the radiation loss."""
     if model.turns == 1:
         return
     there = model.assembly
@@ -186,7 +187,7 @@ def single_kicks(
         if not group.active:
             continue
         d = group.directions(some)
-        own = np.isin(d.owner, owner)  # fewer where a setting takes its effect away
+        own = np.isin(d.owner, owner)  # without those that a setting removes
         kicks = np.empty((len(group.shots), 1, len(d.owner), model.dimension))
         states = np.ascontiguousarray(paths.states[group.shots])
         kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, 0, kicks)
@@ -197,7 +198,7 @@ def single_kicks(
 
 
 def seen(model: TrackedShots, paths: Paths, beam: Array) -> Array:
-    """What the monitors make of changes of the beam, [hypothesis, shot, reading, 2]."""
+    """Readings of changes of the beam, [hypothesis, shot, reading, 2]."""
     return _through(paths.monitors, beam)
 
 
