@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
-    from tmlattice.inference.among import Known
+    from tmlattice.inference.distributed import DistributedErrors
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
 
@@ -281,7 +281,7 @@ def _not_used(lattice: str) -> list[str]:
     ]
 
 
-def _known(ring: "Ring", lattice: str) -> "Known | None":
+def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
     """What an earlier diagnosis left known beside the ring as it found it."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, read_known
 
@@ -316,7 +316,7 @@ def _write(
         write_json(extra, document)
 
 
-def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | None":
+def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Correction | None":
     """Settings of supplies that bring the estimated ring to the design, where the covariance of its
     errors is known and they have an expected gain."""
     from tmlattice.correction import correct
@@ -336,7 +336,7 @@ def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | Non
 
 def _write_rings(
     result: "Diagnosis",
-    known: "Known | None",
+    known: "DistributedErrors | None",
     lattice_out: Path | None,
     corrected_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:

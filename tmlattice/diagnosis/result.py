@@ -17,10 +17,10 @@ from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
-from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
@@ -425,7 +425,7 @@ class Diagnosis(ShownDiagnosis):
         heldout = None
         if gap is not None:
             heldout = {
-                **both(gap.misfits[gap.since], gap.misfits[-1]),
+                **both(gap.misfits[gap.baseline], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
                 "monitors": "half" if self.by_steps else "odd",
                 "steps": [dict(vars(m)) for m in gap.misfits],

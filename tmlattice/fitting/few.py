@@ -217,13 +217,14 @@ def sparse_fit(
         data=data,
         places=dict.fromkeys(effects, len(hypotheses) / len(effects)),  # all magnets are alike
         amounts=AmountPrior(Student(fault, np.inf), bound=LARGEST),
-        judgement=Judgement(unknown=0.0, rivals=refined, rarer=RARER),
+        judgement=Judgement(unknown=0.0, alternatives=refined, rarer=RARER),
     )
     before = fit(problem, (), data.launches)
     if before.point.lost:
         raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
     return explain(
-        Search(problem, hypotheses, largest_number, unnamed=False, by_evidence=True), before
+        Search(problem, hypotheses, largest_number, unnamed=False, by_marginal_likelihood=True),
+        before,
     )
 
 
@@ -236,7 +237,7 @@ def _settled(found: Explanation) -> Fit:
 
 def _spread(turn: RingTunes, best: Fit, tunes: Array, found: Explanation) -> Array:
     """Standard error of the tunes [2] about the best ones, over all explanations refined last."""
-    others = [rival.fit for named in found.named for rival in named.rivals[1:]]
+    others = [rival.fit for named in found.named for rival in named.alternatives[1:]]
     total, weights = np.zeros((2, 2)), 0.0
     for one in [best, *others, *(rival.fit for rival in found.beyond)]:
         weight = float(np.exp(one.log_evidence - best.log_evidence))

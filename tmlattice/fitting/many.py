@@ -189,7 +189,7 @@ def fit_map(
         loss=[c * float(np.mean(problem.sigma**2)) / data.shots for c in found.chi2],
         penalty=[0.0] * len(found.chi2),
         best_epoch=len(found.chi2) - 1,
-        stopped_early=found.settled,
+        stopped_early=found.converged,
         seconds=time.perf_counter() - begun,
         options={
             "method": "map",

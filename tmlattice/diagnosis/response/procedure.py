@@ -62,8 +62,8 @@ from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
-from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import response_data

@@ -1,4 +1,4 @@
-"""Hypotheses added to what is there, refitted through the full model, by falling evidence."""
+"""Hypotheses refitted through the full model together with a fit, by falling evidence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,35 +8,34 @@ from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
 from tmlattice.inference import chi2
-from tmlattice.inference.levels import CLEAR
-from tmlattice.inference.newton import Fit, Outcome, fit, settled
+from tmlattice.inference.common_factors import MIN_CHI2
+from tmlattice.inference.newton import Fit, Outcome, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
 
 Array = NDArray[np.float64]
 
 
-EXPLAINS = 1.0
-"""Chi-square that a parameter takes from noise: what takes less is no explanation, however little
-its amount costs (a spread that ended at nothing)."""
+MIN_FALL = 1.0
+"""Chi-square that a parameter takes from noise: a smaller fall explains nothing."""
 
 
 @dataclass(frozen=True)
-class Rival:
-    """A hypothesis that was refitted with everything else in place."""
+class Alternative:
+    """A hypothesis, refitted together with all other causes."""
 
     hypothesis: Hypothesis
     fit: Fit = field(repr=False)
 
     @property
     def cause(self) -> Cause:
-        """With its best amount: the last of the fit's causes."""
+        """The cause with its best amount, the last of the fit's causes."""
         return self.fit.causes[-1]
 
 
 @dataclass(frozen=True)
 class Detection:
-    """How clearly something was seen when it was found: see the scan."""
+    """Significance of a finding in its scan: statistic, threshold and p-value."""
 
     statistic: float
     threshold: float
@@ -44,34 +43,34 @@ class Detection:
 
     @classmethod
     def among(cls, statistic: float, count: int) -> "Detection":
-        """Of one of so many, each a chi-square of one degree of freedom if nothing is there."""
-        return cls(statistic, CLEAR, min(1.0, count * float(chi2.sf(statistic, 1))))
+        """Return the significance of the largest of `count` chi-squares of one degree."""
+        return cls(statistic, MIN_CHI2, min(1.0, count * float(chi2.sf(statistic, 1))))
 
 
-def rivals(
+def alternatives(
     problem: Problem,
     others: Fit,
     found: Scan,
     hypotheses: Sequence[Hypothesis],
     count: int | None = None,
-) -> tuple[Rival, ...]:
-    """The leading hypotheses added to what is there, refitted, by falling evidence.
+) -> tuple[Alternative, ...]:
+    """Return the leading hypotheses, each refitted together with a fit, by falling evidence.
 
     Args:
         problem: model and data.
-        others: the fit without.
-        found: the scan about it.
-        hypotheses: all that may be the cause.
-        count: refitted at most; else as the judgement has it.
+        others: the fit without them.
+        found: the scan of its residual.
+        hypotheses: all candidates.
+        count: refitted at most; None: `Judgement.alternatives`.
     """
     judge = problem.judgement
     linear = linear_evidence(problem, found)
     have = {(c.effect, c.element) for c in others.causes}
-    order = np.argsort(-linear)[: judge.rivals if count is None else count]
+    order = np.argsort(-linear)[: judge.alternatives if count is None else count]
     # the linear scan errs by a share of the statistic itself where an effect is strong
     window = judge.window + judge.drift * float(found.statistic.max(initial=0.0))
     best = -np.inf
-    chosen: list[Rival] = []
+    chosen: list[Alternative] = []
     for index in order:
         if not linear[index] >= linear[order[0]] - window:
             break
@@ -84,15 +83,15 @@ def rivals(
         tried = _with(problem, others, cause, best)
         if tried.outcome not in (Outcome.LOST, Outcome.SINGULAR):
             best = max(best, tried.log_evidence)
-            chosen.append(Rival(found.hypotheses[index], tried))
+            chosen.append(Alternative(found.hypotheses[index], tried))
     if chosen:
         leader = max(chosen, key=lambda rival: rival.fit.log_evidence).hypothesis
         have |= {rival.hypothesis for rival in chosen}
         curved = [h for h in hypotheses if find(h[0]).curved and h not in have]
         for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
             cause = best_start(problem, others, hypothesis)
-            chosen.append(Rival(hypothesis, _with(problem, others, cause, best)))
-    chosen = [r for r in chosen if others.chi2 - r.fit.chi2 > EXPLAINS and _possible(r.cause)]
+            chosen.append(Alternative(hypothesis, _with(problem, others, cause, best)))
+    chosen = [r for r in chosen if others.chi2 - r.fit.chi2 > MIN_FALL and _possible(r.cause)]
     return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
 
 
@@ -103,8 +102,9 @@ def _possible(cause: Cause) -> bool:
 
 
 def linear_evidence(problem: Problem, found: Scan) -> Array:
-    """Log evidence of each hypothesis by the scan alone, up to a constant; -inf for what it does
-    not see, [hypothesis].
+    """Log evidence of each hypothesis from a scan, up to a constant, [hypothesis].
+
+    Hypotheses without a signature have -inf.
 
     Args:
         problem: for the priors.
@@ -120,7 +120,7 @@ def linear_evidence(problem: Problem, found: Scan) -> Array:
 
 
 def _first_guess(found: Scan, index: int) -> Cause | None:
-    """With the scan's amount; None where that has no root."""
+    """The scan's amount as a cause; None where the amount has no root."""
     name, place = found.hypotheses[index]
     effect, amount = find(name), float(found.amount[index])
     if effect.discrete:
@@ -136,7 +136,7 @@ def _first_guess(found: Scan, index: int) -> Cause | None:
 
 
 def _with(problem: Problem, others: Fit, cause: Cause, hopeless: float) -> Fit:
-    """What is there, and one cause more."""
+    """Fit with one cause more."""
     return fit(
         problem, (*others.causes, cause), others.nuisances, others.kicks,
         hopeless=hopeless, slopes=others.slopes,
@@ -144,7 +144,7 @@ def _with(problem: Problem, others: Fit, cause: Cause, hopeless: float) -> Fit:
 
 
 def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
-    """The amount, out of a few, that leaves least when the nuisances follow."""
+    """Return the starting amount with the smallest chi-square, nuisances fitted."""
     effect = find(hypothesis[0])
     starts = [share * effect.largest for share in problem.judgement.starts]
     starts = [amount for amount in starts if amount > 0 or not effect.one_sign]
@@ -154,8 +154,8 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
     left = []
     for cause in causes:
         there = (*others.causes, cause)
-        if effect.whole:  # far from nothing: what the nuisances were without it says little
-            point = settled(problem, there, others.nuisances)
+        if effect.whole:  # nonlinear: nuisances without it are no guide
+            point = fit_nuisances(problem, there, others.nuisances)
             left.append(point.chi2)
             continue
         point = problem.at(there, others.nuisances, others.kicks)
@@ -165,12 +165,12 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
 
 
 def leading(problem: Problem, found: Scan, count: int) -> dict[Hypothesis, float]:
-    """The likeliest hypotheses by a scan, with its amounts.
+    """Most probable hypotheses of a scan, with its amounts.
 
     Args:
         problem: for the priors.
         found: the scan.
-        count: so many at most.
+        count: number of hypotheses at most.
     """
     ranks = linear_evidence(problem, found)
     first = (

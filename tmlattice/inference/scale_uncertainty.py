@@ -1,11 +1,10 @@
-"""What numbers are unknown by because the sizes of their priors are.
+"""Uncertainty of numbers that comes from the uncertain scales of their priors.
 
-A family's size follows the evidence. Where it has few members, or the data say little of them, the
-evidence is flat: a size near zero, which holds its members there as if they were known, is as
-likely as one twenty times as large, with which they, and all that makes up for them, are elsewhere.
-So it is with a family that was tried and left out. Errors at one size alone are then far too small.
-Sizes are therefore drawn as likely as they are, their members integrated out, and what that adds to
-the variance of each number is told (the law of total variance).
+A family's prior scale follows the evidence. With few members, or little data on them, the evidence
+is flat: a scale near zero, which fixes the members, is as probable as one twenty times larger. The
+same holds for a family that was rejected. Errors at one scale alone are then far too small. Scales
+are therefore sampled from their posterior with the members integrated out, and the law of total
+variance gives the additional variance of each number.
 """
 
 from collections.abc import Collection, Sequence
@@ -21,30 +20,29 @@ from tmlattice.inference.priors import Group
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-FEW = 6.0
-"""Of so many members that the data know the size is known to 30 %."""
-MANY = 128
-"""Members from which on a size is not looked at: each draw costs the third power."""
+KNOWN_MEMBERS = 6.0
+"""Members determined by the data above which the scale is known to 30 %."""
+MAX_MEMBERS = 128
+"""Members above which a scale is not sampled: each draw costs the third power."""
 FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
-"""Logarithms of sizes over the present ones that are drawn from."""
-DRAWS, FORGOTTEN = 420, 20
-"""Of all sizes in turn; and of them those before the chain is at home."""
+"""Log factors of the present scales, the support of the samples."""
+DRAWS, BURN_IN = 420, 20
+"""Gibbs samples, and those of them that are discarded as burn-in."""
 
 
-def of_sizes(
+def scale_covariance(
     normal: Normal, groups: Sequence[Group], start: Array, gone: Collection[str] = ()
 ) -> Array:
-    """What the base parameters' covariance has beside that of the posterior: F, of F F^T,
-    [parameter, direction].
+    """Root F of the covariance F F^T that uncertain scales add, [parameter, direction].
 
-    It is about the values that the groups' present sizes give.
+    It is relative to the values at the present scales.
 
     Args:
         normal: at `start`.
-        groups: the priors, as they are.
-        start: the base parameters where the residual was taken.
-        gone: names of groups whose members, `MANY` at most, are taken for zero, as they may be: as
-            likely as that they are not. Their sizes are first guesses.
+        groups: the priors.
+        start: base parameters of the residual.
+        gone: groups of at most `MAX_MEMBERS` members that are taken as zero: as probable as not.
+            Their scales are first guesses.
     """
     groups = [group for group in groups if group.basis.any()]
     if not groups:
@@ -58,15 +56,16 @@ def of_sizes(
     known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
     unsure = np.array([
         absent[i]
-        or (not group.fixed and (own == i).sum() <= MANY and 0 < known[own == i].sum() < FEW)
+        or (not group.fixed and (own == i).sum() <= MAX_MEMBERS
+            and 0 < known[own == i].sum() < KNOWN_MEMBERS)
         for i, group in enumerate(groups)
     ])  # fmt: skip
     if not unsure.any():
         return np.zeros((len(start), 0))
     U = unsure[own]
-    # the others with their priors taken out: by how much they follow, and what is left to say
+    # the other groups with their priors integrated out
     follow = np.linalg.solve(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())), A[np.ix_(~U, U)])
-    sizes = _Sizes(
+    sizes = _Scales(
         A[np.ix_(U, U)] - A[np.ix_(U, ~U)] @ follow,
         b[U] - follow.T @ b[~U],
         (np.cumsum(unsure) - 1)[own[U]],
@@ -78,14 +77,14 @@ def of_sizes(
     return np.asarray(moved @ (directions * np.sqrt(np.maximum(variance, 0))))
 
 
-class _Sizes:
-    """Sizes of some groups, and their members' amounts in units of the present sizes.
+class _Scales:
+    """Scales of some groups, and their members' amounts in units of the present scales.
 
     Args:
-        information, score: of the members, all others taken out.
+        information, score: of the members, all others integrated out.
         group: of each member.
         groups: with their hyperpriors.
-        absent: whether a group's members are taken for zero, [group].
+        absent: whether a group's members are taken as zero, [group].
     """
 
     def __init__(
@@ -109,20 +108,20 @@ class _Sizes:
             self.chances.append(np.log(chances))
 
     def _root(self, sizes: Array) -> tuple[Array, Array]:
-        """Prior rms of the members, and the root of what is known of them in these units."""
+        """Prior rms of the members, and the root of their posterior precision in these units."""
         scale = np.exp(sizes)[self.group]
         inside = scale[:, None] * self.information * scale
         inside[np.diag_indices(len(inside))] += 1
         return scale, np.asarray(np.linalg.cholesky(inside))
 
     def log_evidence(self, sizes: Array) -> float:
-        """Of the readings, with all members integrated out."""
+        """Log marginal likelihood with all members integrated out."""
         scale, root = self._root(sizes)
         pull = solve_triangular(root, scale * self.score, lower=True, check_finite=False)
         return float(0.5 * pull @ pull - np.log(np.diag(root)).sum())
 
     def _chance(self, sizes: Array) -> float:
-        """Log probability of sizes, -inf where one is none of its choices."""
+        """Log probability of scales; -inf outside their support."""
         chance = 0.0
         for size, choices, chances in zip(sizes, self.choices, self.chances, strict=True):
             (at,) = np.nonzero(choices == size)
@@ -132,18 +131,18 @@ class _Sizes:
         return chance + self.log_evidence(sizes)
 
     def amounts(self, sizes: Array) -> tuple[Array, Array]:
-        """The likeliest, and their covariance."""
+        """Most probable amounts, and their covariance."""
         scale, root = self._root(sizes)
         half = solve_triangular(root, np.diag(scale), lower=True, check_finite=False)
         covariance = half.T @ half
         return covariance @ self.score, covariance
 
     def more(self) -> Array:
-        """Covariance of the amounts about those at the present sizes, less what it is there,
-        [member, member]: by Gibbs' sampling of the sizes."""
+        """Covariance that sampled scales add to that at the present ones, [member, member], by
+        Gibbs sampling."""
         random = np.random.default_rng(0)
         here = np.where(np.isinf(self.now), 0.0, self.now)
-        told, stated = self.amounts(self.now)
+        mean, stated = self.amounts(self.now)
         total = np.zeros_like(stated)
         for draw in range(DRAWS):
             for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
@@ -152,13 +151,13 @@ class _Sizes:
                 values = chances + [self.log_evidence(one) for one in tried]
                 weights = np.exp(values - values.max())
                 here = tried[random.choice(len(tried), p=weights / weights.sum())]
-            for a, b in self.pairs:  # one may stand for the other, both not likely
+            for a, b in self.pairs:  # swap two groups that compensate each other
                 other = here.copy()
                 other[[a, b]] = here[[b, a]]
                 both = self._chance(other) - self._chance(here)
                 if np.log(random.random()) < both:
                     here = other
-            if draw >= FORGOTTEN:
+            if draw >= BURN_IN:
                 then, spread = self.amounts(here)
-                total += spread + np.outer(then - told, then - told)
-        return np.asarray(total / (DRAWS - FORGOTTEN) - stated)
+                total += spread + np.outer(then - mean, then - mean)
+        return np.asarray(total / (DRAWS - BURN_IN) - stated)

@@ -11,11 +11,11 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference import among
-from tmlattice.inference.among import Known, small_errors_of
+from tmlattice.inference import distributed
+from tmlattice.inference.combined import CombinedProblem
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
-from tmlattice.inference.together import Together
 from tmlattice.measurement import ClosedOrbit
 from tmlattice.observe.orbits import closed_orbits
 
@@ -44,7 +44,7 @@ def orbit(small_ring):
 
 
 def test_rows_of_both_are_the_rows_of_each(turns, orbit):
-    both = Together.of([turns, orbit])
+    both = CombinedProblem.of([turns, orbit])
     point = both.at([WEAK], both.first)
     alone = [part.at([WEAK], part.first) for part in (turns, orbit)]
     assert_allclose(point.chi2, sum(one.chi2 for one in alone))
@@ -58,8 +58,8 @@ def test_rows_of_both_are_the_rows_of_each(turns, orbit):
     assert (rows[2, len(alone[0].residual) :] == 0).all()  # a closed orbit has no launch
 
 
-def test_slopes_of_both_are_the_scans_own(turns, orbit):
-    both = Together.of([turns, orbit])
+def test_slopes_of_both_are_the_scans(turns, orbit):
+    both = CombinedProblem.of([turns, orbit])
     point = both.at([WEAK], both.first)
     h = 1e-5
     up, down = (
@@ -82,19 +82,19 @@ def test_many_fixed_causes_act_as_ones_that_are_sought(turns, orbit):
         )
     )  # fmt: skip
     fixed += (Cause("energy_offset", None, 1e-4),)
-    both = Together.of([turns, orbit])
-    standing = replace(both, fixed=fixed).at([WEAK], both.first)
+    both = CombinedProblem.of([turns, orbit])
+    with_fixed = replace(both, fixed=fixed).at([WEAK], both.first)
     assert_allclose(
-        standing.residual, both.at([*fixed, WEAK], both.first).residual, rtol=1e-9, atol=1e-6
+        with_fixed.residual, both.at([*fixed, WEAK], both.first).residual, rtol=1e-9, atol=1e-6
     )
-    assert np.abs(standing.residual - both.at([WEAK], both.first).residual).max() > 10
-    slope = replace(both, fixed=fixed).slope(standing, 0)
+    assert np.abs(with_fixed.residual - both.at([WEAK], both.first).residual).max() > 10
+    slope = replace(both, fixed=fixed).slope(with_fixed, 0)
     point = both.at([*fixed, WEAK], both.first)
     assert_allclose(slope, both.slope(point, len(fixed)), rtol=1e-6, atol=1e-4)
 
 
 def test_a_reference_has_what_is_fixed_and_not_what_is_sought(orbit):
-    both = Together.of([orbit], [orbit])
+    both = CombinedProblem.of([orbit], [orbit])
     cause = Cause("corrector_kick_x", "v6", 2e-5)
     count = len(orbit.at((), orbit.first).residual)
     sought = both.at([cause], both.first).residual
@@ -108,7 +108,9 @@ def test_fast_products_among_small_errors_are_those_of_all_signatures(turns):
     rms = {name: find(name).background for name in ("quadrupole_gradient", "monitor_gain_x")}
     everywhere = [(name, place) for name in rms for place in find(name).places(turns.model.ring)]
     start = fit(turns, (), turns.first)
-    among = small_errors_of(turns, Known.usual(everywhere, rms), start.nuisances, learn=False)
+    among = fit_distributed_errors(
+        turns, DistributedErrors.usual(everywhere, rms), start.nuisances, learn=False
+    )
     assert among.before.chi2 < 0.9 * start.chi2
     problem = among.problem
     some = [(WEAK.effect, WEAK.element), ("monitor_offset_y", "end_1"), ("energy_spread", None),
@@ -132,7 +134,9 @@ def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):
     ]
     everywhere = [(cause.effect, cause.element) for cause in small]
     problem = closed_orbits(small_ring, _orbit(small_ring, small, 2), {})
-    learnt = small_errors_of(problem, Known.usual(everywhere, usual), problem.first)
+    learnt = fit_distributed_errors(
+        problem, DistributedErrors.usual(everywhere, usual), problem.first
+    )
     assert learnt.log_evidence > 1e3
     assert 0.5 < learnt.before.chi2 / problem.valid.sum() < 1.5  # 70 readings: +- 0.17
     assert 0.5 < learnt.sizes["quadrupole_offset_x"] / usual["quadrupole_offset_x"] < 2
@@ -148,6 +152,6 @@ def test_small_errors_that_need_a_cause_to_store_a_beam_are_a_sentence(small_rin
         there = fit(problem, causes, nuisances)
         return replace(there, point=replace(there.point, projection=None, lost="no orbit"))
 
-    monkeypatch.setattr(among, "fit", lost)
-    with pytest.raises(UnstableRingError, match="no orbit without what was found"):
-        small_errors_of(problem, Known.usual(everywhere, usual), problem.first)
+    monkeypatch.setattr(distributed, "fit", lost)
+    with pytest.raises(UnstableRingError, match="no orbit with distributed errors"):
+        fit_distributed_errors(problem, DistributedErrors.usual(everywhere, usual), problem.first)

@@ -1,10 +1,10 @@
-"""How large the small errors of a machine are: what its own readings say of it.
+"""Variance components: the sizes of a machine's distributed errors, from its readings.
 
-Small errors are Gaussian, one rms for each family (an effect, say): C = C0 + sum_h t_h^2 K_h with
-K_h = S_h^T S_h of the family's signatures at their usual rms. The sizes t_h are those that make the
-readings likeliest, launches projected out (restricted maximum likelihood, by the average
-information of Gilmour, Thompson and Cullis 1995); families that the readings do not see stay near
-the others by their prior. The evidence says whether small errors are there at all.
+The errors are Gaussian with one rms per family (an effect, say): C = C0 + sum_h t_h^2 K_h with
+K_h = S_h^T S_h of the family's signatures at their usual rms. The scales t_h maximise the
+restricted likelihood, launches projected out, by the average information of Gilmour, Thompson and
+Cullis (1995). A prior keeps families that the readings do not determine near the others. The
+evidence decides whether there are distributed errors at all.
 """
 
 from collections.abc import Sequence
@@ -17,31 +17,31 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 Array = NDArray[np.float64]
 
-COMMON = 1.5
-"""rms of the logarithm of all sizes together: machines differ by factors of five."""
+COMMON_SPREAD = 1.5
+"""rms of the common log scale: machines differ by factors of five."""
 
-OWN = 0.7
-"""rms of the logarithm of one family's size beside the others: by factors of two."""
+FAMILY_SPREAD = 0.7
+"""rms of one family's log scale relative to the others: by factors of two."""
 
-NOISE = 2.0
-"""rms of the logarithm of a noise that is a first guess only."""
+NOISE_SPREAD = 2.0
+"""rms of the log scale of a noise that is a first guess."""
 
 STEPS = 20
 LARGEST = 1.5  # of a step, in the logarithm
-SETTLED = 0.5
-"""Log likelihood gained by a step after which none is made: steps converge quadratically."""
+MIN_GAIN = 0.5
+"""Gain of log likelihood below which the iteration ends: steps converge quadratically."""
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """What the readings say of the sizes of small errors.
+class VarianceComponents:
+    """Estimated scales of distributed errors.
 
     Attributes:
-        scale: of each family, over its usual size, [family].
-        covariance: of their logarithms, [family, family].
-        noise: scale of each part of the noise, over its first guess, [part].
-        log_evidence: over that of no small errors and the noise as guessed.
-        log_marginal: of the readings, up to a constant.
+        scale: of each family, relative to its usual size, [family].
+        covariance: of the log scales, [family, family].
+        noise: scale of each part of the noise, relative to its first guess, [part].
+        log_evidence: over no distributed errors with the guessed noise.
+        log_marginal: log marginal likelihood, up to a constant.
     """
 
     scale: Array
@@ -52,21 +52,20 @@ class Sizes:
 
     @property
     def error(self) -> Array:
-        """Of the logarithm of each, [family]."""
+        """Standard deviation of each log scale, [family]."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def learn_sizes(
+def fit_variance_components(
     rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[NDArray[np.bool_]] = ()
-) -> Sizes:
-    """The likeliest sizes of families of small errors.
+) -> VarianceComponents:
+    """Return the most probable scales of families of distributed errors.
 
     Args:
-        rows: readings less model in units of their noise, [row].
-        launches: orthonormal directions of the launches among them, [row, direction].
+        rows: residual in units of the noise, [row].
+        launches: orthonormal directions of the launches, [row, direction].
         families: usual rms times signature of each error of a family, [error, row].
-        noise: parts of the rows whose noise is to be learnt too, [row] each; none: it is known.
-
+        noise: parts of the rows whose noise is estimated too, [row] each; none: noise is known.
     """
 
     def out(x: Array) -> Array:
@@ -76,7 +75,7 @@ def learn_sizes(
     inside = launches @ launches.T
     seen = [out(some) for some in (*families, *(np.diag(mask.astype(float)) for mask in noise))]
     parts = [own.T @ own for own in seen]
-    # what has no size of its own: the noise where it is known, and the launches' directions
+    # without a scale: the noise where it is known, and the launches' directions
     base = inside if noise else np.eye(len(rows))
     precision = _prior(len(families), len(noise))
     size = np.zeros(len(parts))
@@ -92,13 +91,13 @@ def learn_sizes(
             damping = max(10 * damping, 0.1)
             continue
         gained, size, now, damping = trial.value - now.value, size + step, trial, damping / 5
-        if gained < SETTLED:
+        if gained < MIN_GAIN:
             break
     covariance = np.linalg.inv(now.information)
     none = -0.5 * float(clean @ clean)
     occam = 0.5 * (np.linalg.slogdet(precision)[1] + np.linalg.slogdet(covariance)[1])
     count = len(families)
-    return Sizes(
+    return VarianceComponents(
         np.exp(size[:count]),
         np.asarray(covariance[:count, :count], dtype=float),
         np.exp(size[count:]),
@@ -115,18 +114,20 @@ class _State:
 
 
 def _prior(families: int, noise: int) -> Array:
-    """Precision of the logarithms."""
-    covariance = np.full((families, families), COMMON**2) + OWN**2 * np.eye(families)
+    """Prior precision of the log scales."""
+    covariance = np.full((families, families), COMMON_SPREAD**2) + FAMILY_SPREAD**2 * np.eye(
+        families
+    )
     precision = np.zeros((families + noise,) * 2)
     precision[:families, :families] = np.linalg.inv(covariance)
-    precision[families:, families:] = np.eye(noise) / NOISE**2
+    precision[families:, families:] = np.eye(noise) / NOISE_SPREAD**2
     return precision
 
 
 def _state(
     rows: Array, base: Array, parts: Sequence[Array], size: Array, precision: Array
 ) -> _State:
-    """Log posterior of the sizes, its slope, and the average information."""
+    """Log posterior of the scales, its slope, and the average information."""
     weights = np.exp(2 * size)
     covariance = base.copy()
     for weight, part in zip(weights, parts, strict=True):

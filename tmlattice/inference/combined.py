@@ -1,10 +1,10 @@
-"""Several measurements of one machine as one problem: their rows stacked, their causes shared.
+"""Several measurements of one machine as one problem: rows stacked, causes shared.
 
->>> both = Together.of([first_turns, dispersion])
+>>> both = CombinedProblem.of([first_turns, dispersion])
 >>> explain(Search(both, hypotheses, unnamed=False), fit(both, (), both.first))
 
-Each measurement keeps its nuisances and its noise; a cause that one of them does not see has rows
-of zeros there. Nothing here knows which kinds they are.
+Each measurement keeps its nuisances and its noise. A cause without effect in one of them has zero
+rows there.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ Flags = NDArray[np.bool_]
 
 
 class Blocks(Projection):
-    """Nuisances of each part, projected out of its own rows.
+    """Projection of each part's nuisances out of its own rows.
 
     Args:
         parts: the projections, one after another.
@@ -39,17 +39,17 @@ class Blocks(Projection):
         self.ends = np.cumsum(sizes)[:-1]
 
     def split(self, rows: Array) -> list[Array]:
-        """Rows [..., row] of each part."""
+        """Return the rows [..., row] of each part."""
         return np.split(rows, self.ends, axis=-1)
 
     def out(self, rows: Array) -> Array:
-        """Rows less what nuisances explain."""
+        """Return rows less the part that nuisances explain."""
         own = zip(self.parts, self.split(rows), strict=True)
         return np.concatenate([part.out(np.ascontiguousarray(mine)) for part, mine in own], axis=-1)
 
     @property
     def log_volume(self) -> float:
-        """Of all parts."""
+        """Sum over the parts."""
         return sum(part.log_volume for part in self.parts)
 
     def matrix(self) -> Array:
@@ -57,7 +57,7 @@ class Blocks(Projection):
         return np.asarray(block_diag(*(part.matrix() for part in self.parts)))
 
     def inside(self, rows: Array) -> Array:
-        """The square of what nuisances explain, [...]."""
+        """Square of the part of rows that nuisances explain, [...]."""
         own = zip(self.parts, self.split(rows), strict=True)
         return np.asarray(sum(part.inside(np.ascontiguousarray(mine)) for part, mine in own))
 
@@ -68,15 +68,15 @@ class Blocks(Projection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Together(Problem):
+class CombinedProblem(Problem):
     """Measurements of one machine.
 
     Attributes:
-        parts: the problems; what they say of priors, thresholds and fixed causes is not asked.
-        names: of all monitors that any of them reads.
-        starts: a first guess of each part's nuisances.
-        active: whether the causes that are looked for are there in each; they are not in a
-            reference from before. What is fixed is there in all.
+        parts: their problems; priors, thresholds and fixed causes of these are not used.
+        names: all monitors.
+        starts: first guess of each part's nuisances.
+        active: whether the causes sought act in a part; they do not in a reference. Fixed causes
+            act in all.
     """
 
     parts: tuple[Problem, ...] = field(repr=False)
@@ -85,12 +85,12 @@ class Together(Problem):
     active: tuple[bool, ...]
 
     @classmethod
-    def of(cls, parts: Sequence[Problem], before: Sequence[Problem] = ()) -> "Together":
-        """With the places, the judgement and the fixed causes of the first.
+    def of(cls, parts: Sequence[Problem], before: Sequence[Problem] = ()) -> "CombinedProblem":
+        """Return the problem with the priors, judgement and fixed causes of the first part.
 
         Args:
-            parts: measurements in which causes are looked for.
-            before: those of a reference.
+            parts: measurements in which causes are sought.
+            before: reference measurements.
         """
         active = (True,) * len(parts) + (False,) * len(before)
         parts = [*parts, *before]
@@ -105,11 +105,11 @@ class Together(Problem):
 
     @property
     def alone(self) -> bool:
-        """Whether no part is of a reference, nor has shots of one."""
+        """Whether no part is, or contains, a reference."""
         return all(self.active) and all(part.alone for part in self.parts)
 
-    def reference(self, nuisances: Array) -> "tuple[Together, Array]":
-        """Return the measurements, or shots, of the reference alone, as those that are searched."""
+    def reference(self, nuisances: Array) -> "tuple[CombinedProblem, Array]":
+        """Return the problem of the reference measurements or shots, and its nuisances."""
         parts: list[tuple[Problem, Array]] = []
         for part, active, start in zip(
             self.parts, self.active, self.of_parts(nuisances), strict=True
@@ -123,58 +123,58 @@ class Together(Problem):
     # --- nuisances: one flat vector -------------------------------------------------------------
     @property
     def first(self) -> Array:
-        """Each part's own guess, one after another."""
+        """First guesses of the nuisances, part after part."""
         return np.concatenate([start.ravel() for start in self.starts])
 
     @property
     def free(self) -> int:
-        """Of all parts."""
+        """Sum over the parts."""
         return sum(part.free for part in self.parts)
 
     @property
     def freedom(self) -> int:
-        """Of all parts."""
+        """Sum over the parts."""
         return sum(part.freedom for part in self.parts)
 
     def of_parts(self, nuisances: Array) -> list[Array]:
-        """Of each part, in its own shape."""
+        """Nuisances of each part, in its own shape."""
         flat = np.split(nuisances, _ends([start.size for start in self.starts]))
         return [own.reshape(start.shape) for own, start in zip(flat, self.starts, strict=True)]
 
     def moved(self, nuisances: Array, change: Array) -> Array:
-        """Each part moves its own."""
+        """Return the nuisances after a change of each part's."""
         changes = np.split(change, _ends([part.free for part in self.parts]))
         own = zip(self.parts, self.of_parts(nuisances), changes, strict=True)
         return np.concatenate([part.moved(n, c).ravel() for part, n, c in own])
 
     # --- the model ------------------------------------------------------------------------------
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """Whether any part does."""
+        """Whether the cause has an effect in any part."""
         return any(part.sees(hypothesis) for part in self.parts)
 
-    def everywhere(self) -> "Together":
-        """Active in all parts."""
+    def everywhere(self) -> "CombinedProblem":
+        """Return the problem with causes that act in all parts."""
         parts = tuple(part.everywhere() for part in self.parts)
         return replace(self, parts=parts, active=(True,) * len(parts))
 
     @cached_property
-    def standing_parts(self) -> tuple[Problem, ...]:
-        """The parts, each with the fixed causes that it sees."""
+    def parts_with_fixed(self) -> tuple[Problem, ...]:
+        """The parts, each with the fixed causes that act in it."""
         return tuple(
-            part.standing([c for c in self.fixed if part.sees((c.effect, c.element))])
+            part.with_fixed([c for c in self.fixed if part.sees((c.effect, c.element))])
             for part in self.parts
         )
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
-        """`view` are the points of the parts, each with the causes that it sees."""
+        """Return the model's point; its `view` are the points of the parts."""
         points = []
         for part, active, own in zip(
-            self.standing_parts, self.active, self.of_parts(nuisances), strict=True
+            self.parts_with_fixed, self.active, self.of_parts(nuisances), strict=True
         ):
             there = causes if active else ()
             seen = [c for c in there if part.sees((c.effect, c.element))]
             points.append(part.at(seen, own, kicks))
-            if points[-1].lost:  # the others would not be asked any more
+            if points[-1].lost:  # the other parts are not needed
                 rest = np.full(1, np.nan)
                 return Point(
                     tuple(causes), nuisances, dict(kicks), rest, None, rest, None, points[-1].lost
@@ -188,10 +188,10 @@ class Together(Problem):
         )  # fmt: skip
 
     def slope(self, point: Point, cause: int) -> Array:
-        """Of each part that sees it."""
+        """Return the slope, zero in parts without an effect, [row]."""
         own = point.causes[cause]
         rows = []
-        for part, active, here in zip(self.standing_parts, self.active, point.view, strict=True):
+        for part, active, here in zip(self.parts_with_fixed, self.active, point.view, strict=True):
             if active and part.sees((own.effect, own.element)):
                 rows.append(part.slope(here, here.causes.index(own)))
             else:
@@ -199,45 +199,45 @@ class Together(Problem):
         return np.concatenate(rows)
 
     def metric(self, point: Point) -> Metric:
-        """Of the parts, added up."""
+        """Return the products summed over the parts."""
         if len(self.parts) == 1:
-            return self.standing_parts[0].metric(point.view[0])
-        return _TogetherMetric(self, point)
+            return self.parts_with_fixed[0].metric(point.view[0])
+        return _CombinedMetric(self, point)
 
     def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
-        """Of a single measurement, as its kind has it."""
+        """Return the products of a single measurement, as its kind has them."""
         if len(self.parts) > 1:
             return None
-        return self.standing_parts[0].metric_among(point.view[0], root, projection)
+        return self.parts_with_fixed[0].metric_among(point.view[0], root, projection)
 
     # --- free kicks: of a single measurement ----------------------------------------------------
     @property
     def kick_places(self) -> Sequence[str]:
-        """Several measurements have no kick in common."""
+        """Places of free kicks of a single measurement; several have no kick in common."""
         return self.parts[0].kick_places if len(self.parts) == 1 else ()
 
     def kick_rows(self, point: Point, place: int) -> Array:
-        """As its kind has it."""
-        return self.standing_parts[0].kick_rows(point.view[0], place)
+        """Return the rows of a single measurement, as its kind has them."""
+        return self.parts_with_fixed[0].kick_rows(point.view[0], place)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Of any part."""
+        """Return the neighbours in any part."""
         found = [h for part in self.parts for h in part.neighbours(hypothesis, among)]
         return list(dict.fromkeys(found))
 
     @property
     def monitors(self) -> Sequence[str]:
-        """Of all parts."""
+        """All monitors of the parts."""
         return self.names
 
     # --- readings -------------------------------------------------------------------------------
     @property
     def valid(self) -> Flags:
-        """Of all parts, flat."""
+        """Valid readings of all parts, flat."""
         return np.concatenate([part.valid.ravel() for part in self.parts])
 
     def owner(self) -> NDArray[np.int64]:
-        """By the names of all."""
+        """Monitor of each reading, an index of `names`."""
         at = {name: i for i, name in enumerate(self.names)}
         found = []
         for part in self.parts:
@@ -246,7 +246,7 @@ class Together(Problem):
         return np.concatenate(found)
 
     def as_rows(self, readings: Array) -> Array:
-        """Each part's own."""
+        """Return the rows, part after part."""
         rows = [
             part.as_rows(own.reshape(*own.shape[:-1], *part.valid.shape))
             for part, own in zip(self.parts, self._split(readings), strict=True)
@@ -254,25 +254,25 @@ class Together(Problem):
         return np.concatenate(rows, axis=-1)
 
     def noise_rows(self) -> list[Flags]:
-        """Of a single measurement, as its kind has it."""
+        """Return the noise rows of a single measurement; of several: none."""
         return self.parts[0].noise_rows() if len(self.parts) == 1 else []
 
     def noisier(self, factors: Array) -> Self:
-        """Of a single measurement, as its kind has it."""
+        """Return the problem with scaled noise, of a single measurement."""
         return replace(self, parts=tuple(part.noisier(factors) for part in self.parts))
 
     def disagreement(self, point: Point) -> float:
-        """Of a single measurement, as its kind has it."""
+        """Return the disagreement of a single measurement; of several: 0."""
         return self.parts[0].disagreement(point.view[0]) if len(self.parts) == 1 else 0.0
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """Of each part."""
+        """Return the residuals and their variances, part after part."""
         found = [part.left(here) for part, here in zip(self.parts, point.view, strict=True)]
         rows, size = zip(*found, strict=True)
         return np.concatenate([r.ravel() for r in rows]), np.concatenate([s.ravel() for s in size])
 
     def without(self, dropped: Flags) -> Self:
-        """The same with these missing."""
+        """Return the problem without some readings."""
         parts = [
             part.without(own.reshape(part.valid.shape))
             for part, own in zip(self.parts, self._split(dropped), strict=True)
@@ -287,12 +287,12 @@ def _ends(sizes: Sequence[int]) -> list[int]:
     return [int(end) for end in np.cumsum(sizes)[:-1]]
 
 
-class _TogetherMetric(Metric):
-    def __init__(self, problem: Together, point: Point) -> None:
+class _CombinedMetric(Metric):
+    def __init__(self, problem: CombinedProblem, point: Point) -> None:
         assert isinstance(point.projection, Blocks)
         super().__init__(point.projection)
         self.problem, self.blocks = problem, point.projection
-        pairs = zip(problem.standing_parts, point.view, strict=True)
+        pairs = zip(problem.parts_with_fixed, point.view, strict=True)
         self.metrics = [part.metric(here) for part, here in pairs]
 
     def products(self, hypotheses: Sequence[Hypothesis], data: Array) -> Products:
@@ -328,7 +328,7 @@ class _TogetherMetric(Metric):
         return np.concatenate(parts, axis=1)
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Readings of one monitor in different measurements are blocks of their own."""
+        """Return the information; a monitor's readings in each measurement are a block."""
         problem = self.problem
         at = {name: i for i, name in enumerate(problem.names)}
         found = []

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from tmlattice.inference import chi2
-from tmlattice.inference.sizes import learn_sizes
+from tmlattice.inference.variance_components import fit_variance_components
 
 ROWS, LAUNCHES = 240, 8
 
@@ -35,7 +35,9 @@ def test_sizes_are_those_that_were_drawn(families, launches, rng):
     scales = (0.2, 1.0, 4.0)
     pulls = []
     for _ in range(12):
-        found = learn_sizes(readings(families, scales, launches, rng), launches, families)
+        found = fit_variance_components(
+            readings(families, scales, launches, rng), launches, families
+        )
         assert found.log_evidence > 100
         pulls.append(np.log(found.scale / scales) / found.error)
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4  # 36 pulls of width 1
@@ -43,24 +45,28 @@ def test_sizes_are_those_that_were_drawn(families, launches, rng):
 
 def test_no_small_errors_are_seen_in_noise(families, launches, rng):
     for _ in range(10):
-        found = learn_sizes(readings(families, (0, 0, 0), launches, rng), launches, families)
+        found = fit_variance_components(
+            readings(families, (0, 0, 0), launches, rng), launches, families
+        )
         assert found.log_evidence < 0
         assert found.scale.max() < 0.05
 
 
 def test_a_family_that_is_not_seen_stays_near_the_others(families, launches, rng):
     families[2] = 1e-4 * families[2]
-    found = learn_sizes(readings(families, (3, 3, 0), launches, rng), launches, families)
+    found = fit_variance_components(
+        readings(families, (3, 3, 0), launches, rng), launches, families
+    )
     assert 1.5 < found.scale[2] < 6
     assert found.error[2] > 0.5 > found.error[:2].max()
 
 
-def test_the_noise_of_each_part_is_learnt_beside_them(families, launches, rng):
+def test_the_noise_of_each_part_is_estimated_too(families, launches, rng):
     first = np.arange(ROWS) < ROWS // 2
     rows = readings([0.02 * own for own in families], (1, 1, 1), launches, rng, noise=0.2)
     rows += np.where(first, 0, 0.8) * rng.standard_normal(ROWS)
     families = [0.02 * own for own in families]
-    found = learn_sizes(rows, launches, families, [first, ~first])
+    found = fit_variance_components(rows, launches, families, [first, ~first])
     # (0.2, sqrt(0.04 + 0.64)) to twice the error of a width from 120 values
     assert found.noise == pytest.approx([0.2, 0.825], rel=0.3)
 

@@ -1,12 +1,12 @@
-"""Few reasons behind many numbers: levels of sharing, weighed by evidence.
+"""Common factors behind many numbers, selected by the marginal likelihood.
 
->>> told = explain(information, score, candidates, variance, slab=0.01)
->>> [(candidates.names[own.candidate], own.amount, own.sigma) for own in told.reasons]
+>>> model = FactorModel(information, score, candidates, variance, slab)
+>>> [(one.candidate, one.amount, one.sigma) for one in model.reasons(model.choose(20))]
 
 Many numbers (gradients, say) are known with a covariance, and each scatters by itself. A candidate
-moves some of them together: all, a family, one. Which few candidates are there is found by adding
-the one that gains most evidence, taking out what the others make needless, and exchanging. All is
-linear and Gaussian, so that every amount comes with the error that the scatter leaves it.
+factor moves some of them together: all, a family, one. Factors are selected by adding the one with
+the largest evidence, removing redundant ones, and exchanging. The model is linear and Gaussian, so
+that the error of each amount includes the scatter.
 """
 
 from collections.abc import Collection, Sequence
@@ -20,47 +20,46 @@ from scipy.special import logsumexp
 
 Array = NDArray[np.float64]
 
-CLEAR = 25.0
-"""Chi-square that a reason has to have: five standard deviations."""
+MIN_CHI2 = 25.0
+"""Chi-square of a selected factor, at least: five standard deviations."""
 SWEEPS = 5
-"""Times that every reason is exchanged against its rivals."""
-SEEN = 1e-6
-"""Share of what is known of a candidate that others have to leave of it."""
-LEARNT = 2.0
-"""Log evidence that a size of what cannot be told has to gain to be learnt."""
-RIVAL = 3.0
-"""Log evidence by which a rival may be behind to be told beside a reason: a twentieth."""
+"""Rounds in which every factor is exchanged against its alternatives."""
+MIN_INFORMATION = 1e-6
+"""Share of a candidate's information that the selected factors must leave, at least."""
+MIN_SCALE_EVIDENCE = 2.0
+"""Log evidence that the common scale of unresolved factors must gain to be used."""
+MAX_BEHIND = 3.0
+"""Log evidence below the best at which an alternative is still reported: odds of 1 to 20."""
 
 
 @dataclass(frozen=True)
-class Reason:
-    """One candidate that is there.
+class CommonFactor:
+    """One selected factor.
 
     Attributes:
-        candidate: which one.
-        amount, sigma: with the scatter of single numbers in the error.
-        statistic: chi-square that it explains beside all others.
-        rivals: other candidates in its place, with their probabilities; the first is itself.
+        candidate: its index.
+        amount, sigma: with the scatter of the single numbers in the error.
+        statistic: its chi-square given all others.
+        alternatives: candidates in its place and their probabilities; the first is itself.
     """
 
     candidate: int
     amount: float
     sigma: float
     statistic: float
-    rivals: tuple[tuple[int, float], ...]
+    alternatives: tuple[tuple[int, float], ...]
 
 
-class Levels:
-    """Candidates weighed beside each other.
+class FactorModel:
+    """Candidate factors together with the scatter of single numbers.
 
     Args:
-        information: J^T W J of the numbers, nuisances taken out, [number, number].
+        information: J^T W J of the numbers, nuisances projected out, [number, number].
         score: J^T W y with all numbers at zero, [number].
         candidates: what each moves, [number, candidate].
-        variance: of the scatter of each number, or the whole covariance, [number] or
-            [number, number].
+        variance: of the scatter of each number, or its covariance, [number] or [number, number].
         slab: prior rms of each candidate's amount, [candidate].
-        cost: log odds against each candidate, beside the number of them, [candidate].
+        cost: log odds against each candidate beyond their number, [candidate].
 
     Attributes:
         background: log evidence of the scatter alone, over numbers that are zero.
@@ -86,9 +85,8 @@ class Levels:
         self.information = (self.information + self.information.T) / 2
         self.candidates = candidates
 
-    def beside(self, others: Sequence[int], rms: float) -> "Levels":
-        """With an amount of this rms of each of some, which nobody knows: they are candidates no
-        more, and are in the errors of all the rest."""
+    def given(self, others: Sequence[int], rms: float) -> "FactorModel":
+        """Return the model with some candidates integrated out, each an amount of this rms."""
         at = np.array(others, dtype=int)
         inside = self.information[np.ix_(at, at)] + np.eye(len(at)) / rms**2
         across = self.information[:, at]
@@ -101,46 +99,45 @@ class Levels:
         made.information[at] = made.information[:, at] = made.score[at] = 0.0
         return made
 
-    def beside_others(
+    def given_others(
         self, chosen: Sequence[int], alike: Collection[int], rms: Sequence[float]
-    ) -> "BesideOthers":
-        """Some of what is alike changed: the others may have, too, each by less than can be told.
+    ) -> "GivenOthers":
+        """Return the selected factors with the unresolved ones of their kind integrated out.
 
-        Where the evidence wants it they are in the errors, and what is not clear then is one of
-        them, or is not there.
+        The common rms of the unresolved factors follows the evidence. A selected factor that is no
+        longer significant is one of them, or is removed.
 
         Args:
-            chosen: that are there.
-            alike: candidates that are, chosen ones among them.
-            rms: of the amounts of the others, that are tried: as likely together as that they are
-                not there.
+            chosen: selected factors.
+            alike: candidates of one kind.
+            rms: of the others' amounts, to be tried; together as probable as no others.
         """
         stay = list(chosen)
         if not set(alike) & set(stay):
-            return BesideOthers(self, stay, 0.0, ((self, 1.0),))
+            return GivenOthers(self, stay, 0.0, ((self, 1.0),))
         while True:
             chosen, others = stay, [own for own in alike if own not in stay]
             sizes = [0.0, *rms] if others else [0.0]
-            made = [self.beside(others, one) if one else self for one in sizes]
+            made = [self.given(others, one) if one else self for one in sizes]
             logs = np.array([own.background + own.log_evidence(chosen) for own in made])
-            best = int(np.argmax(logs - LEARNT * (np.array(sizes) > 0)))
-            stay = made[best]._pruned(list(chosen), CLEAR)
+            best = int(np.argmax(logs - MIN_SCALE_EVIDENCE * (np.array(sizes) > 0)))
+            stay = made[best]._pruned(list(chosen), MIN_CHI2)
             if len(stay) == len(chosen):
                 logs[1:] -= np.log(max(len(rms), 1))
                 chance = np.exp(logs - logsumexp(logs)).tolist()
-                return BesideOthers(
+                return GivenOthers(
                     made[best], stay, sizes[best], tuple(zip(made, chance, strict=True))
                 )
 
     def fitted(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Amounts and covariance of some candidates together."""
+        """Amounts of some candidates and their covariance."""
         at = np.array(chosen, dtype=int)
         inside = self.information[np.ix_(at, at)] + np.diag(self.slab[at] ** -2.0)
         covariance = np.linalg.inv(inside)
         return covariance @ self.score[at], covariance
 
     def log_evidence(self, chosen: Sequence[int]) -> float:
-        """Of some candidates together over none, with the odds against them."""
+        """Log evidence of some candidates over none, with the prior odds."""
         if not len(chosen):
             return 0.0
         at = np.array(chosen, dtype=int)
@@ -149,16 +146,16 @@ class Levels:
         return float(amounts @ self.score[at] / 2 + wide - self.cost[at].sum())
 
     def squares(self, chosen: Sequence[int]) -> Array:
-        """Chi-square that each of some explains beside the others."""
+        """Chi-square of each of some candidates given the others."""
         amounts, covariance = self.fitted(chosen)
         variance = np.diag(covariance)
         known = 1 / variance - self.slab[np.array(chosen, dtype=int)] ** -2.0
         known = np.maximum(known, 0)
         return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
 
-    def _beside(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
-        """What is left of each candidate's score and information beside some, and by what a unit of
-        it lessens the amounts of these, [chosen, candidate]."""
+    def _given(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Score and information of each candidate given some, and the change of the amounts of
+        these by a unit of it, [chosen, candidate]."""
         amounts, covariance = self.fitted(chosen)
         across = self.information[:, list(chosen)]
         lessened = covariance @ across.T
@@ -166,18 +163,20 @@ class Levels:
         return self.score - across @ amounts, np.maximum(own, 0.0), lessened
 
     def gains(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Log evidence of one more of each candidate beside some, and its chi-square."""
-        score, own, _ = self._beside(chosen)
+        """Log evidence of adding each candidate, and its chi-square."""
+        score, own, _ = self._given(chosen)
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
         square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
-        seen = own > SEEN * np.diag(self.information)  # else the chosen ones make it up
+        seen = own > MIN_INFORMATION * np.diag(self.information)  # else redundant
         gain = np.where(seen, gain, 0.0) - self.cost
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
 
-    def choose(self, most: int, clear: float = CLEAR, without: Collection[int] = ()) -> list[int]:
-        """The candidates that are there, of all but some."""
+    def choose(
+        self, most: int, clear: float = MIN_CHI2, without: Collection[int] = ()
+    ) -> list[int]:
+        """Select factors, except some."""
         chosen: list[int] = []
         while len(chosen) < most:
             gain, square = self.gains(chosen)
@@ -204,7 +203,7 @@ class Levels:
         return chosen
 
     def _pruned(self, chosen: list[int], clear: float) -> list[int]:
-        """Without those that the others make needless, the least needed first."""
+        """Remove redundant factors, the weakest first."""
         while chosen:
             worth = []
             for own in chosen:
@@ -217,28 +216,28 @@ class Levels:
         return chosen
 
     def averaged(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Amounts of some candidates and their variances, over whether they are all, or one more is
-        there that is not clear, and takes its share of them."""
+        """Amounts of some candidates and their variances, averaged over one further factor that is
+        not significant."""
         amounts, covariance = self.fitted(chosen)
-        score, own, lessened = self._beside(chosen)
+        score, own, lessened = self._given(chosen)
         spread = own + self.slab**-2.0
         moved = -lessened * (score / spread)
         gain = self.gains(chosen)[0]
-        gain[own <= SEEN * np.diag(self.information)] = -np.inf  # the chosen ones make it up
+        gain[own <= MIN_INFORMATION * np.diag(self.information)] = -np.inf  # redundant
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
         wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
         return amounts + more, wider - more**2
 
     def reasons(
-        self, chosen: Sequence[int], over: Sequence[tuple["Levels", float]] = ()
-    ) -> list[Reason]:
-        """With amounts, errors and rivals, by falling chi-square.
+        self, chosen: Sequence[int], over: Sequence[tuple["FactorModel", float]] = ()
+    ) -> list[CommonFactor]:
+        """Return amounts, errors and alternatives of the selected factors, by falling chi-square.
 
         Args:
-            chosen: all that are there.
-            over: levels with their probabilities, in each of which one more may be there that is
-                not clear, see `averaged`; none: nothing else is there.
+            chosen: selected factors.
+            over: models with their probabilities, each averaged over one further factor, see
+                `averaged`; none: no further factor.
         """
         if not chosen:
             return []
@@ -253,31 +252,31 @@ class Levels:
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])
-            near = [int(c) for c in np.flatnonzero(gain > gain[own] - RIVAL) if c != own]
-            odds = np.exp(gain[[own, *near]] - gain[own])
-            told = sorted(zip([own, *near], odds / odds.sum(), strict=True),
+            linearise = [int(c) for c in np.flatnonzero(gain > gain[own] - MAX_BEHIND) if c != own]
+            odds = np.exp(gain[[own, *linearise]] - gain[own])
+            ranked = sorted(zip([own, *linearise], odds / odds.sum(), strict=True),
                           key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
             found.append(
-                Reason(
+                CommonFactor(
                     own, float(amounts[i]), float(np.sqrt(variance[i])), float(square[own]),
-                    tuple((c, float(p)) for c, p in told),
+                    tuple((c, float(p)) for c, p in ranked),
                 )
             )  # fmt: skip
         return sorted(found, key=lambda reason: -reason.statistic)
 
 
 @dataclass(frozen=True, eq=False)
-class BesideOthers:
-    """What is there where others may be that cannot be told.
+class GivenOthers:
+    """Selected factors, given unresolved ones of the same kind.
 
     Attributes:
-        levels: to ask for the chosen, with the others' likeliest size in the errors.
-        chosen: those that stay.
-        rms: of the others, 0 where nothing wants them.
-        over: the levels with every size of the others, with its probability.
+        levels: the model, with the most probable rms of the others in its errors.
+        chosen: the selected factors.
+        rms: of the others, 0 if the evidence is against them.
+        over: models with every rms of the others, and their probabilities.
     """
 
-    levels: Levels
+    levels: FactorModel
     chosen: list[int]
     rms: float
-    over: tuple[tuple[Levels, float], ...]
+    over: tuple[tuple[FactorModel, float], ...]

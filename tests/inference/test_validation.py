@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.judge import Half, Judged, Left, held_out_gap, other_half
+from tmlattice.inference.validation import Half, HeldOut, Residuals, cross_predicted, held_out_gap
 
 READINGS, LAUNCHES, ERRORS = 40, 4, 30
 SIGMA = 20e-6
@@ -28,15 +28,15 @@ def judged(halves, signal, rng, unknown):
     )
     covariance = errors @ errors.T if unknown else None
     none = np.zeros(LAUNCHES)
-    return other_half(first, second, none, none, covariance)
+    return cross_predicted(first, second, none, none, covariance)
 
 
 def of(left):
-    return Judged(left.residual.reshape(1, -1, 1), (left,))
+    return HeldOut(left.residual.reshape(1, -1, 1), (left,))
 
 
 @pytest.mark.parametrize("unknown", [False, True])
-def test_the_misfit_to_expect_is_what_comes(halves, rng, unknown):
+def test_expected_misfit_is_the_measured_one(halves, rng, unknown):
     found = [held_out_gap([of(judged(halves, 0.0, rng, unknown))]).misfits[0] for _ in range(300)]
     square = np.mean([one.rms**2 for one in found])
     assert np.sqrt(square) == pytest.approx(found[0].expected, rel=0.05)
@@ -55,7 +55,7 @@ def test_a_launch_known_beforehand_is_weighed_with_the_readings(halves, rng):
             Half(slopes @ true + SIGMA * rng.standard_normal(READINGS), slopes, sigma)
             for slopes in launch
         )
-        left = other_half(first, second, np.zeros(LAUNCHES), known**-2)
+        left = cross_predicted(first, second, np.zeros(LAUNCHES), known**-2)
         errors.append(left.residual @ np.linalg.solve(left.noise, left.residual) / READINGS)
     assert np.mean(errors) == pytest.approx(1, abs=0.05)
     assert np.sqrt(np.trace(left.noise) / READINGS) < 1.01 * SIGMA  # the readings alone: 1.05
@@ -76,17 +76,17 @@ def test_the_interval_of_what_is_closed_holds_in_95_per_cent(halves, rng):
     assert 0.92 < np.mean(inside) <= 0.98  # a width of 0.011
 
 
-def test_no_share_is_told_of_a_gap_within_the_noise(halves, rng):
+def test_no_share_is_stated_of_a_gap_within_the_noise(halves, rng):
     both = [of(judged(halves, 0.0, rng, False)) for _ in range(2)]
     assert held_out_gap(both).explained is None
 
 
-def test_a_gap_of_which_a_model_loses_the_beam_is_judged_by_nobody(halves, rng):
+def test_a_gap_is_not_scored_if_a_model_loses_the_beam(halves, rng):
     whole = judged(halves, 1e-4, rng, False)
     seen = whole.residual.copy()
     seen[0] = np.nan
-    fewer = Left(whole.residual[1:], whole.noise[1:, 1:])
-    found = held_out_gap([of(whole), Judged(seen.reshape(1, -1, 1), (fewer,))])
+    fewer = Residuals(whole.residual[1:], whole.noise[1:, 1:])
+    found = held_out_gap([of(whole), HeldOut(seen.reshape(1, -1, 1), (fewer,))])
     assert found.explained is None
     assert found.lost
     assert not held_out_gap([of(whole)] * 2).lost

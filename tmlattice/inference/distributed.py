@@ -1,9 +1,9 @@
-"""Any problem among small errors everywhere: rows whitened once more by what those make of them.
+"""Problems with distributed errors: rows whitened by the covariance that such errors make.
 
-Small errors are Gaussian and far too many to be found one by one; with signatures S (rms times
-slope, in rows) the rows' covariance is C = 1 + S^T S. Divided by its Cholesky factor they are again
-white, and a search knows nothing of it. The signatures hold about the likeliest small errors, which
-stand in the model; the rows are shifted so that their prior still stands about zero.
+Distributed errors are Gaussian, and too many to be found one by one. With signatures S (rms times
+slope, in rows) the rows have the covariance C = 1 + S^T S. Its inverse root makes them white again,
+so that a search works as before. Signatures are linearised at the most probable errors, which are
+part of the model; a shift of the rows keeps the errors' prior centred at zero.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,52 +17,51 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
-from tmlattice.inference.newton import Fit, fit, settled
+from tmlattice.inference.newton import Fit, fit, fit_nuisances
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.root import Root, inverse_root
-from tmlattice.inference.sizes import Sizes, learn_sizes
+from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-ROUNDS = 2
-"""Linearisations: about the design, and about the likeliest errors."""
+LINEARISATIONS = 2
+"""Linearisations: at the design, and at the most probable errors."""
 
 ROWS = 1000
-"""Rows from which sizes are learnt: 17 sizes to some per cent; the time goes as their cube."""
+"""Rows for variance components: 17 of them to some per cent; the time goes as the cube."""
 
-HALVES = 4
-"""How often a step to the likeliest errors is halved where no beam is stored."""
+MAX_HALVINGS = 4
+"""Halvings, at most, of a step to the most probable errors where no beam is stored."""
 
-BEST = 0.9999
-"""Share that is known at most: what is linear about the likeliest errors is no better than a
-hundredth of their size."""
+MAX_SHARE = 0.9999
+"""Largest share of a variance that data may remove: linearisation leaves a hundredth of the rms."""
 
-LEAST = 0.02
-"""Share of the variance of a direction that has to be known for it to be remembered."""
+MIN_SHARE = 0.02
+"""Smallest share of a direction's variance that the data must remove for it to be kept."""
 
-MOST = 10**8
-"""Rows times small errors: 0.8 GB, of which some are held at a time (8 GB at most)."""
+MAX_ELEMENTS = 10**8
+"""Rows times distributed errors: 0.8 GB each array, 8 GB for all of them."""
 
 AT_ONCE = 2**24
-"""Numbers of the rows of small errors that are taken at a time."""
+"""Numbers of signature rows in memory at a time."""
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known of small errors beforehand: Gaussian, about some amounts.
+class DistributedErrors:
+    """Gaussian distribution of distributed errors.
 
-    The covariance is rms (1 - sum_d share_d v_d v_d^T) rms: of the directions v something was
-    measured already.
+    The covariance is rms (1 - sum_d share_d v_d v_d^T) rms, with the directions v that were
+    measured.
 
     Attributes:
-        hypotheses: every small error.
-        amounts: the likeliest, [error].
-        rms: of each before anything was measured, [error].
-        seen: orthonormal directions in units of the rms, [direction, error].
-        share: of the variance of each that is known since, [direction].
-        causes: what is there besides, for certain.
+        hypotheses: every error.
+        amounts: mean, [error].
+        rms: prior standard deviations, [error].
+        seen: measured directions, orthonormal, in units of the rms, [direction, error].
+        share: share of each direction's variance that measurements removed, [direction].
+        causes: further causes that are certain.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -73,50 +72,54 @@ class Known:
     causes: tuple[Cause, ...] = ()
 
     @classmethod
-    def usual(cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]) -> "Known":
-        """About zero, of sizes by effect; nothing was measured."""
+    def usual(
+        cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]
+    ) -> "DistributedErrors":
+        """Return the prior with zero mean and one rms per effect."""
         scale = np.array([rms[name] for name, _ in hypotheses])
         return cls(
             tuple(hypotheses), np.zeros(len(scale)), scale, np.zeros((0, len(scale))), np.zeros(0)
         )
 
-    def mixed(self, x: Array) -> Array:
-        """Coordinates [error, ...] of independent errors of size 1 as shares of the rms."""
+    def correlated(self, x: Array) -> Array:
+        """Correlated errors in units of the rms, from independent ones of size 1, [error, ...]."""
         left = 1 - np.sqrt(1 - self.share)
         return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
                           .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
 
-    def since(self, amounts: Array, share: Array, seen: Array) -> "Known":
-        """With more readings.
+    def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
+        """Return the distribution after more readings.
 
         Args:
-            amounts: the likeliest now, [error].
-            share: of the variance that was left, what is known now, [direction].
-            seen: of which directions, in the coordinates of `mixed`, [direction, error].
+            amounts: new mean, [error].
+            share: share of each direction's remaining variance that they removed, [direction].
+            seen: these directions in the coordinates of `correlated`, [direction, error].
         """
-        if len(self.share):  # back to coordinates of the first rms
+        if len(self.share):  # back to units of the prior rms
             left = np.eye(len(amounts)) - (seen.T * share) @ seen
-            whole = self.mixed(self.mixed(left).T)
+            whole = self.correlated(self.correlated(left).T)
             share, directions = np.linalg.eigh(np.eye(len(amounts)) - whole)
             seen = directions.T
-        big = share > LEAST
-        return replace(self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], BEST))
+        big = share > MIN_SHARE
+        return replace(
+            self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], MAX_SHARE)
+        )
 
     @property
     def errors(self) -> Array:
-        """Standard deviation of each, [error]."""
+        """Standard deviations, [error]."""
         taken = self.share @ self.seen**2 if len(self.share) else 0.0
         return np.asarray(self.rms * np.sqrt(np.maximum(1 - taken, 0.0)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blurred(Problem):
-    """A problem whose rows errors move too that nobody asks for: Gaussian, of size 1.
+class MarginalProblem(Problem):
+    """A problem with nuisance errors integrated out: Gaussian, of size 1.
 
     Attributes:
-        inner: what is asked.
+        inner: the problem given these errors.
         spread: d reading / d error, [error, *shape of `valid`].
-        shift: what is to be put back on the readings, of the shape of `valid`; or 0.
+        shift: offset of the readings, of the shape of `valid`; or 0.
     """
 
     inner: Problem = field(repr=False)
@@ -125,7 +128,7 @@ class Blurred(Problem):
 
     @cached_property
     def rows(self) -> Array:
-        """The signatures in rows of the inner problem, [error, row]."""
+        """The errors' signatures in rows of the inner problem, [error, row]."""
         return self.inner.as_rows(self.spread)
 
     @cached_property
@@ -138,36 +141,35 @@ class Blurred(Problem):
 
     @property
     def log_scale(self) -> float:
-        """Of the rows' density beside the exponential of chi-square: -1/2 log det of their
-        covariance, by which explanations among other small errors compare."""
+        """Log density of the rows beyond exp(-chi2 / 2): -1/2 log det of their covariance."""
         return self._root.log_scale
 
     def white(self, rows: Array) -> Array:
-        """Rows [..., row] of the inner problem in the covariance of all."""
+        """Rows [..., row] of the inner problem, whitened."""
         return self._root.white(rows)
 
     # --- the model ------------------------------------------------------------------------------
     @property
     def first(self) -> Array:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.first
 
     @property
     def free(self) -> int:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.free
 
     @property
     def freedom(self) -> int:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.freedom
 
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.sees(hypothesis)
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
-        """`view` is the inner point."""
+        """Return the model's point; its `view` is the inner problem's."""
         point = self.inner.at(causes, nuisances, kicks)
         if point.projection is None:
             return replace(point, view=point)
@@ -179,68 +181,68 @@ class Blurred(Problem):
         )
 
     def slope(self, point: Point, cause: int) -> Array:
-        """Whitened."""
+        """Return the whitened slope, [row]."""
         return self.white(self.inner.slope(point.view, cause))
 
     def moved(self, nuisances: Array, change: Array) -> Array:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.moved(nuisances, change)
 
     def metric(self, point: Point) -> Metric:
-        """As the kind has it, or signatures made and whitened."""
+        """Return the kind's own products, or those of whitened signatures."""
         assert point.projection is not None
         fast = self.inner.metric_among(point.view, self._root, point.projection)
-        return _BlurredMetric(self, point) if fast is None else fast
+        return _MarginalMetric(self, point) if fast is None else fast
 
     @property
     def kick_places(self) -> Sequence[str]:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.kick_places
 
     def kick_rows(self, point: Point, place: int) -> Array:
-        """Whitened."""
+        """Return the whitened rows, [parameter, row]."""
         return self.white(self.inner.kick_rows(point.view, place))
 
     def everywhere(self) -> Self:
-        """As the inner one."""
+        """As in the inner problem."""
         return replace(self, inner=self.inner.everywhere())
 
     @property
     def alone(self) -> bool:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.alone
 
-    def standing(self, causes: Sequence[Cause]) -> Self:
-        """The same errors of size 1 beside further fixed causes."""
-        other = replace(self, inner=self.inner.standing(causes))
+    def with_fixed(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with further fixed causes and the same errors."""
+        other = replace(self, inner=self.inner.with_fixed(causes))
         vars(other)["_root"] = self._root
         return other
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """As the inner one."""
+        """As in the inner problem."""
         return self.inner.neighbours(hypothesis, among)
 
     # --- readings -------------------------------------------------------------------------------
     @property
     def monitors(self) -> Sequence[str]:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.monitors
 
     @property
     def valid(self) -> Flags:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.valid
 
     def owner(self) -> NDArray[np.int64]:
-        """Of the inner one."""
+        """As in the inner problem."""
         return self.inner.owner()
 
     def as_rows(self, readings: Array) -> Array:
-        """Whitened."""
+        """Return whitened rows, [..., row]."""
         return self.white(self.inner.as_rows(readings))
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """What is left of each reading given those before it, where the kind has single ones."""
+        """Residual of each single reading given those before it, and its variance."""
         assert point.projection is not None
         alone, size = self.inner.left(point.view)
         clean = point.projection.out(point.residual)
@@ -250,33 +252,31 @@ class Blurred(Problem):
         return np.where(alone == 0, 0.0, left), np.ones_like(size)
 
     def without(self, dropped: Flags) -> Self:
-        """The covariance is worked out anew."""
+        """Return the problem without some readings; its covariance is computed anew."""
         if not dropped.any():
             return self
         return replace(self, inner=self.inner.without(dropped))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Among(Blurred):
-    """A problem among small errors.
+class DistributedProblem(MarginalProblem):
+    """A problem with distributed errors.
 
-    Its inner problem has the likeliest small errors among its fixed causes, its errors are the
-    coordinates of `known.mixed`, and its shift is what the amounts in the model, beyond the
-    likeliest beforehand, make of the readings.
+    The inner problem has the linearisation's amounts among its fixed causes. The errors are the
+    coordinates of `known.correlated`; the shift moves readings from these amounts to the mean.
 
     Attributes:
-        known: of the small errors beforehand.
-        about: their amounts in the model, [error].
-        open: of which family each is, and the covariance of the logarithms of their sizes where
-            those were learnt; or None.
+        known: distribution of the errors before these data.
+        linearised_at: amounts in the model, [error].
+        open: family of each error, and covariance of the log scales that were estimated; or None.
     """
 
-    known: Known = field(repr=False)
-    about: Array = field(repr=False)
+    known: DistributedErrors = field(repr=False)
+    linearised_at: Array = field(repr=False)
     open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
-        """By how the variance along it changes with the sizes of small errors."""
+        """Degrees of freedom of the variance along a hypothesis, from the scales' covariance."""
         if self.open is None or point.projection is None:
             return np.inf
         family, covariance = self.open
@@ -286,24 +286,24 @@ class Among(Blurred):
         return 2 / max(float(slope @ covariance @ slope), 1e-9)
 
     def estimate(self, clean: Array) -> Array:
-        """The likeliest amounts of the small errors beside what leaves these rows, [error]."""
+        """Most probable amounts of the errors, given the rows that remain, [error]."""
         known = self.known
-        amounts = known.amounts + known.rms * known.mixed(self.rows @ self._root.back(clean))
+        amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         return np.array([find(name).some_left(amount) for (name, _), amount in own])
 
-    def learnt(self, explained: Fit) -> Known:
-        """What is known of the small errors since, beside an explanation."""
+    def learnt(self, explained: Fit) -> DistributedErrors:
+        """Distribution of the errors given an explanation."""
         seen = explained.projection.out(self.white(self.rows))
         share, directions = np.linalg.eigh(seen @ seen.T)
-        big = share > LEAST
-        return self.known.since(self.estimate(explained.clean), share[big], directions[:, big].T)
+        big = share > MIN_SHARE
+        return self.known.updated(self.estimate(explained.clean), share[big], directions[:, big].T)
 
 
-class _BlurredMetric(Metric):
+class _MarginalMetric(Metric):
     chunk = 256
 
-    def __init__(self, problem: Blurred, point: Point) -> None:
+    def __init__(self, problem: MarginalProblem, point: Point) -> None:
         assert point.projection is not None
         super().__init__(point.projection)
         self.problem, self.inner = problem, problem.inner.metric(point.view)
@@ -312,90 +312,88 @@ class _BlurredMetric(Metric):
         return self.problem.white(self.inner.rows(hypotheses))
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Monitors have errors of their own among the small ones: none is set aside here."""
+        """Return no information: monitor errors are part of the distributed ones."""
         count = len(self.problem.monitors)
         return np.zeros((count, 1, 1)), np.zeros((count, 1))
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """Small errors as these data show them.
+class FittedErrors:
+    """Distributed errors as estimated from data.
 
     Attributes:
-        problem: among them.
-        plain: without them, with the noise as learnt.
-        before: nuisances alone.
+        problem: with these errors.
+        plain: without them, with the noise as estimated.
+        before: fit of the nuisances alone.
         sizes, errors: rms by effect; relative error of each.
-        log_evidence: over no small errors.
-        apart: log evidence that the cause given which they were taken is none of them, however
-            large its family may be; None: not asked.
+        log_evidence: over no distributed errors.
+        outlier_evidence: log evidence that the one cause is a fault rather than a member of its
+            family of errors; None: not computed.
     """
 
-    problem: Among
+    problem: DistributedProblem
     plain: Problem
     before: Fit
     sizes: Mapping[str, float]
     errors: Mapping[str, float]
     log_evidence: float
-    apart: float | None = None
+    outlier_evidence: float | None = None
 
 
-def small_errors_of(
+def fit_distributed_errors(
     problem: Problem,
-    known: Known,
+    known: DistributedErrors,
     nuisances: Array,
     causes: Sequence[Cause] = (),
     *,
     learn: bool = True,
     noisy: bool = False,
-    about: Array | None = None,
+    linearised_at: Array | None = None,
     stored: Array | None = None,
     weigh: bool = False,
-) -> Learnt:
-    """The background of a machine as these data show it, linear about its likeliest amounts.
+) -> FittedErrors:
+    """Return the distributed errors of a machine, linearised at their most probable amounts.
 
     Args:
         problem: of the design.
-        known: of the small errors beforehand; where sizes are learnt they start there.
+        known: distribution of the errors before these data, with initial scales.
         nuisances: first guess.
-        causes: what was found already: small errors are taken beside it.
-        learn: the sizes are learnt; else they are as known.
-        noisy: so is the noise, which is a guess.
-        about: amounts that it is linearised at, [error]; None: at those that are known, and then at
-            the most probable ones.
-        weigh: whether the one cause is a small error itself is weighed too.
-        stored: amounts at which a beam is stored: `about` goes so far towards them as it has to.
+        causes: causes that are fitted together with the errors.
+        learn: estimate the scales; else they stay.
+        noisy: estimate the noise too.
+        linearised_at: [error]; None: the mean of `known`, then the most probable amounts.
+        weigh: compare the one cause with a member of its family (`outlier_evidence`).
+        stored: amounts with a stored beam, towards which `linearised_at` is moved if needed.
 
     Raises:
-        UnstableRingError: the likeliest small errors leave no stored beam, alone or beside the
-            causes.
+        UnstableRingError: no beam is stored with the most probable errors.
     """
     names, belongs = families_of(known)
-    amounts = known.amounts if about is None else about
+    amounts = known.amounts if linearised_at is None else linearised_at
     stored = amounts if stored is None else stored
-    evidence, errors, opened, apart = 0.0, dict[str, float](), None, None
-    for turn in range(ROUNDS if about is None else 1):
-        inner, alone, amounts = near(problem, known, amounts, stored, causes, nuisances)
+    evidence, errors, opened, outlier_evidence = 0.0, dict[str, float](), None, None
+    for turn in range(LINEARISATIONS if linearised_at is None else 1):
+        inner, alone, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
         assert alone.projection is not None
         stored = amounts
         slopes = signatures_of(inner, alone, known.hypotheses)
-        slopes *= chains(known, amounts)[:, None]
+        slopes *= chain_factors(known, amounts)[:, None]
         shift = (amounts - known.amounts) @ slopes
-        spread = known.mixed(known.rms[:, None] * slopes)
+        spread = known.correlated(known.rms[:, None] * slopes)
         if learn:
             moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
-            keep = kept(len(moved))
+            keep = sampled_rows(len(moved))
             rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
             noise = [part[keep] for part in inner.noise_rows()] if noisy else []
             directions = alone.projection.matrix()[keep]
-            found = sizes_of(moved[keep], directions, rows[:, keep], belongs, noise)
-            if weigh:  # as one of them
+            found = components_of_rows(moved[keep], directions, rows[:, keep], belongs, noise)
+            if weigh:  # as a member of its family
                 i = known.hypotheses.index((causes[0].effect, causes[0].element))
                 some, amount = rows[:, keep], causes[0].amount
                 some[i] *= find(causes[0].effect).chain(amount)
                 whole = moved[keep] + amount / known.rms[i] * some[i]
-                other = sizes_of(whole, directions, some, belongs, noise)
-                apart = found.log_marginal - other.log_marginal
+                other = components_of_rows(whole, directions, some, belongs, noise)
+                outlier_evidence = found.log_marginal - other.log_marginal
             if noise:
                 problem, inner = (own.noisier(found.noise) for own in (problem, inner))
             evidence = found.log_evidence if turn == 0 else evidence
@@ -403,114 +401,116 @@ def small_errors_of(
             opened = (belongs, found.covariance)
             known = replace(known, rms=known.rms * found.scale[belongs])
             spread *= found.scale[belongs][:, None]
-        among = Among(
+        among = DistributedProblem(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
-            judgement=problem.judgement, inner=inner, known=known, about=amounts,
+            judgement=problem.judgement, inner=inner, known=known, linearised_at=amounts,
             spread=spread.reshape(-1, *inner.valid.shape),
             shift=shift.reshape(inner.valid.shape), open=opened,
         )  # fmt: skip
-        point = settled(among, causes, alone.nuisances)
+        point = fit_nuisances(among, causes, alone.nuisances)
         assert point.projection is not None
         nuisances = point.nuisances
         amounts = among.estimate(point.projection.out(point.residual))
     before = fit(among, (), nuisances)
     if before.point.lost:
-        raise UnstableRingError(f"{before.point.lost} without what was found beside small errors")
+        raise UnstableRingError(f"{before.point.lost} with distributed errors, without the causes")
     sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
-    return Learnt(among, problem, before, sizes, errors, evidence, apart)
+    return FittedErrors(among, problem, before, sizes, errors, evidence, outlier_evidence)
 
 
 def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
-    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where there is none.
+    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where missing.
 
-    Rows are what a kind gives; the readings' own noise is put back so that readings can be left
-    out later: `as_rows` of ones says what that is.
+    The noise is put back, so that readings can be dropped later: `as_rows` of ones gives it.
     """
     unit = problem.as_rows(np.ones(problem.valid.shape))
-    about, there = problem.everywhere().metric(point), unit > 0
+    linearised_at, there = problem.everywhere().metric(point), unit > 0
     out = np.zeros((len(hypotheses), problem.valid.size))
     count = max(AT_ONCE // len(unit), 1)
     for start in range(0, len(hypotheses), count):
         some = slice(start, start + count)
-        rows = about.rows(hypotheses[some])
+        rows = linearised_at.rows(hypotheses[some])
         out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
     return out
 
 
-def families_of(known: Known) -> tuple[list[str], NDArray[np.int64]]:
-    """Effects that have a size, and of which each error is, [error]."""
+def families_of(known: DistributedErrors) -> tuple[list[str], NDArray[np.int64]]:
+    """Effects in `known`, and the index of each error's effect, [error]."""
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
 
 
-def near(
+def linearise(
     problem: Problem,
-    known: Known,
+    known: DistributedErrors,
     amounts: Array,
     stored: Array,
     causes: Sequence[Cause],
     nuisances: Array,
 ) -> tuple[Problem, Point, Array]:
-    """The problem with small errors in it as near to some amounts as a beam is stored, the point
-    of the causes there, and those amounts.
+    """Return the problem linearised as near to some amounts as a beam is stored.
 
     Args:
-        problem, causes, nuisances, known: see `small_errors_of`.
+        problem, causes, nuisances, known: see `fit_distributed_errors`.
         amounts: wanted, [error].
-        stored: amounts at which there is a beam; the same ones: that is not known.
+        stored: amounts with a stored beam; the same object as `amounts`: unknown.
+
+    Returns:
+        The problem with these errors, the point of the causes, and the amounts.
 
     Raises:
-        UnstableRingError: there is none near enough.
+        UnstableRingError: no amounts between the two store a beam.
     """
     first = amounts is stored
-    for turn in range(HALVES):
+    for turn in range(MAX_HALVINGS):
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
-        alone = settled(inner, causes, nuisances)
+        alone = fit_nuisances(inner, causes, nuisances)
         if alone.projection is not None:
             return inner, alone, amounts
         if first:
             break
-        # too far for what is linear
-        amounts = stored if turn == HALVES - 2 else (amounts + stored) / 2
-    raise UnstableRingError(f"{alone.lost} with the small errors that the readings show")
+        # beyond the linear range
+        amounts = stored if turn == MAX_HALVINGS - 2 else (amounts + stored) / 2
+    raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
 
 
-def chains(known: Known, amounts: Array) -> Array:
-    """d readings / d amount over signatures, of each, see `Effect.chain`."""
+def chain_factors(known: DistributedErrors, amounts: Array) -> Array:
+    """Factors from signatures to d readings / d amount, [error]; see `Effect.chain`."""
     own = zip(known.hypotheses, amounts, strict=True)
     return np.array([find(name).chain(amount) for (name, _), amount in own])
 
 
-def kept(count: int) -> NDArray[np.int64]:
-    """Rows from which sizes are learnt: drawn once and for all, so that planes and monitors, which
-    come in turns, all have their share."""
+def sampled_rows(count: int) -> NDArray[np.int64]:
+    """Return rows for variance components: a fixed random sample, as rows alternate in kind."""
     if count <= ROWS:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, ROWS, replace=False))
 
 
-def sizes_of(
+def components_of_rows(
     residual: Array,
     directions: Array,
     rows: Array,
     belongs: NDArray[np.int64],
     noise: Sequence[Flags] = (),
-) -> Sizes:
-    """Sizes from some rows.
+) -> VarianceComponents:
+    """Return the variance components from a sample of rows.
 
     Args:
-        residual: what is left, [row].
+        residual: [row].
         directions: of the nuisances, [row, coordinate].
-        rows: what errors of size 1 make, [error, row].
+        rows: signatures of errors of size 1, [error, row].
         belongs: family of each error, [error].
-        noise: parts of the rows whose noise is learnt too, [row] each.
+        noise: parts of the rows whose noise is estimated too, [row] each.
     """
     launch = directions[:, np.abs(directions).max(axis=0) > 0]
     size = np.linalg.norm(launch, axis=0)
     basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(residual), 0))
-    there = basis.any(axis=1)  # nobody read the others, which have no noise
+    there = basis.any(axis=1)  # the other rows have no reading, and no noise
     there = np.any(noise, axis=0) | there if noise else np.ones_like(there)
     families = [rows[belongs == k][:, there] for k in range(belongs.max() + 1)]
-    return learn_sizes(residual[there], basis[there], families, [part[there] for part in noise])
+    return fit_variance_components(
+        residual[there], basis[there], families, [part[there] for part in noise]
+    )

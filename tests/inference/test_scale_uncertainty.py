@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference import unknown_sizes
+from tmlattice.inference import scale_uncertainty
 from tmlattice.inference.normal import Normal, solve
 from tmlattice.inference.priors import Group
-from tmlattice.inference.unknown_sizes import FACTORS, of_sizes
+from tmlattice.inference.scale_uncertainty import FACTORS, scale_covariance
 
 READINGS = 40
 
@@ -14,7 +14,7 @@ READINGS = 40
 @pytest.fixture
 def problem(monkeypatch):
     """Ten numbers that are known, and one of a kind of its own that two of them make up for."""
-    monkeypatch.setattr(unknown_sizes, "DRAWS", 3000)
+    monkeypatch.setattr(scale_uncertainty, "DRAWS", 3000)
     random = np.random.default_rng(2)
     J = random.standard_normal((READINGS, 11))
     J[:, 10] = J[:, 0] + J[:, 1] + 0.1 * J[:, 10]
@@ -51,7 +51,7 @@ def hyperprior(sizes, group):
 def test_a_size_that_the_data_hardly_tell_is_in_the_errors(problem):
     J, left, many, one = problem
     normal = Normal(J.T @ J, J.T @ left)
-    more = variance(of_sizes(normal, [many, one], np.zeros(11)))
+    more = variance(scale_covariance(normal, [many, one], np.zeros(11)))
     sizes = one.rms * np.exp(FACTORS)
     share, means, variances = one_by_one(J, left, sizes, hyperprior(sizes, one))
     posterior = solve(normal, [many, one], rounds=0)
@@ -63,10 +63,10 @@ def test_a_size_that_the_data_hardly_tell_is_in_the_errors(problem):
     assert (more[2:10] < 0.2 * stated[2:10]).all()
 
 
-def test_a_family_that_was_left_out_may_be_there(problem):
+def test_a_rejected_family_may_be_present(problem):
     J, left, many, one = problem
     normal = Normal(J.T @ J, J.T @ left)
-    more = variance(of_sizes(normal, [many, one], np.zeros(11), ["one"]))
+    more = variance(scale_covariance(normal, [many, one], np.zeros(11), ["one"]))
     sizes = one.rms * np.exp(FACTORS)
     chances = np.append(1.0, hyperprior(sizes, one))  # as likely not there as there
     share, means, variances = one_by_one(J, left, np.append(0.0, sizes), chances)
@@ -75,7 +75,7 @@ def test_a_family_that_was_left_out_may_be_there(problem):
     np.testing.assert_allclose(more, expected, rtol=0.1, atol=1e-3)
 
 
-def test_families_that_were_left_out_stand_for_one_another(problem, monkeypatch):
+def test_rejected_families_are_exchangeable(problem, monkeypatch):
     """ALS: one of two families that do nearly the same is there, and a chain that adds and takes
     away one of them at a time would stay with one."""
     monkeypatch.undo()  # draws as many as it draws
@@ -104,14 +104,14 @@ def test_families_that_were_left_out_stand_for_one_another(problem, monkeypatch)
     expected = share @ (np.array(variances) + (np.array(means) - means[0]) ** 2) - variances[0]
     assert (expected[10:] > 0.05).all()  # either may be there
     normal = Normal(J.T @ J, J.T @ left)
-    more = variance(of_sizes(normal, groups, np.zeros(12), ["one 10", "one 11"]))
+    more = variance(scale_covariance(normal, groups, np.zeros(12), ["one 10", "one 11"]))
     np.testing.assert_allclose(more[10:], expected[10:], rtol=0.35)
 
 
-def test_sizes_that_are_known_add_nothing(problem):
+def test_known_scales_add_nothing(problem):
     J, left, many, one = problem
     normal = Normal(J.T @ J, J.T @ left)
     posterior = solve(normal, [many], rounds=20)
-    assert not of_sizes(normal, posterior.groups, np.zeros(11)).any()
+    assert not scale_covariance(normal, posterior.groups, np.zeros(11)).any()
     held = Group("one", one.basis, 10.0, fixed=True)
-    assert not of_sizes(normal, [*posterior.groups, held], np.zeros(11)).any()
+    assert not scale_covariance(normal, [*posterior.groups, held], np.zeros(11)).any()
