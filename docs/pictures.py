@@ -187,7 +187,7 @@ def table(page, first):
 
 def tables():
     """Tables of measured figures as plots: blind cases, steps of PETRA III's response."""
-    head, *rows = table("trajectories.md", "single faults (tier A)")
+    head, *rows = table("blind_challenge.md", "single faults (tier A)")
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), sharey=True, layout="constrained")
     blocks = [i for i, row in enumerate(rows) if row[0].startswith("signal to noise")]
     for ax, start in zip(axes, blocks, strict=True):
@@ -204,7 +204,7 @@ def tables():
                   fontsize="small", frameon=False)  # fmt: skip
     yield "blind-rates", figure
 
-    head, *rows = table("orbit_responses.md", "step")
+    head, *rows = table("real_rings.md", "step")
     steps = [row for row in rows if "/" in row[2]]
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
     for k in range(2, len(head)):
