@@ -22,7 +22,7 @@ import numpy as np
 
 from tmlattice import diagnose, load_ring, tune_fit
 from tmlattice.beam.chain import Chain
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice.at_file import quiet_at

@@ -286,7 +286,7 @@ def drifting(data: Any, rng: np.random.Generator) -> Any:
     return replace(data, response=data.response + amounts[:, None, None] * data.rf.orbit)
 
 
-def exchanged_correctors(first: str, second: str) -> Change:
+def swapped_correctors(first: str, second: str) -> Change:
     def change(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
         pair = [data.correctors.index(first), data.correctors.index(second)]
         read[pair] = read[pair[::-1]]
@@ -294,7 +294,7 @@ def exchanged_correctors(first: str, second: str) -> Change:
     return readings(change)
 
 
-def exchanged_monitors(first: str, second: str) -> Change:
+def swapped_monitors(first: str, second: str) -> Change:
     def change(data: Any, rng: np.random.Generator) -> Any:
         pair = [data.monitors.index(first), data.monitors.index(second)]
         response, orbit = data.response.copy(), data.rf.orbit.copy()
@@ -477,7 +477,7 @@ RESPONSES = (
         small=GRADIENTS,
         found=(),
         verdicts=MANY,
-        says=("vertical_focusing",),
+        says=("vertical_focusing|vertical focusing",),
         lasts=True,
     ),
     Scenario(
@@ -503,7 +503,7 @@ RESPONSES = (
         found=(),
         verdicts=MANY | ONE,
         others=1,
-        says=("energy_offset",),
+        says=("energy_offset|energy deviation",),
         lasts=True,
     ),
     Scenario(
@@ -537,7 +537,7 @@ DEFECTS = (
     *(
         defect(
             f"exchanged correctors {a}, {b}",
-            exchanged_correctors(a, b),
+            swapped_correctors(a, b),
             verdicts=LOCATED | MANY,
             says=(f"{a} and {b}|{b} and {a}",),
             others=1,
@@ -546,7 +546,7 @@ DEFECTS = (
     ),
     defect(
         "exchanged monitors",
-        exchanged_monitors("end_1", "end_14"),
+        swapped_monitors("end_1", "end_14"),
         verdicts=LOCATED | MANY,
         says=("end_1 and end_14|end_14 and end_1",),
         others=1,
@@ -554,7 +554,7 @@ DEFECTS = (
     *(
         Scenario(
             f"response, data: exchanged correctors {a}, {b} alone",
-            damage=exchanged_correctors(a, b),
+            damage=swapped_correctors(a, b),
             verdicts=LOCATED,
             found=(Cause("exchanged", f"{a},{b}", np.nan),),
             lasts=True,
@@ -563,7 +563,7 @@ DEFECTS = (
     ),
     Scenario(
         "response, data: exchanged monitors alone",
-        damage=exchanged_monitors("end_1", "end_14"),
+        damage=swapped_monitors("end_1", "end_14"),
         verdicts=LOCATED,
         found=(Cause("exchanged", "end_1,end_14", np.nan),),
         lasts=True,
@@ -608,19 +608,19 @@ CHANGES = (
     since("a monitor's gain", Cause("monitor_gain_x", "bpm::6", 0.1)),
     since(
         "correctors exchanged",
-        damage=exchanged_correctors("v5", "v9"),
+        damage=swapped_correctors("v5", "v9"),
         verdicts=LOCATED,
         found=(Cause("exchanged", "v5,v9", np.nan),),
     ),
     since(
         "correctors exchanged on both days",
-        damage=exchanged_correctors("v5", "v9"),
-        before_damage=exchanged_correctors("v5", "v9"),
+        damage=swapped_correctors("v5", "v9"),
+        before_damage=swapped_correctors("v5", "v9"),
         verdicts=NOTHING,
     ),
     since(
         "correctors exchanged in the reference",
-        before_damage=exchanged_correctors("v5", "v9"),
+        before_damage=swapped_correctors("v5", "v9"),
         verdicts=NOTHING | LOCATED | MANY,
         others=1,
         says=("v5 and v9|v9 and v5",),

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from tmlattice import diagnose, load_ring
 from tmlattice.cli.command import tmlattice
-from tmlattice.diagnosis.response import few
+from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
@@ -167,8 +167,8 @@ def test_single_magnets_do_not_hide_a_small_change_of_their_supply(small_ring, b
 
 @pytest.mark.slow
 def test_a_limit_of_findings_does_not_make_the_others_scatter(small_ring, before, crowded):
-    few = diagnose(small_ring, crowded, reference=before, max_effects=1)
-    (own,) = few.findings
+    sparse = diagnose(small_ring, crowded, reference=before, max_effects=1)
+    (own,) = sparse.findings
     assert abs(own.amount - SINGLE[own.element]) < 4 * own.amount_sigma
     assert own.amount_sigma < 3e-4
 
@@ -195,9 +195,9 @@ def test_a_fit_of_everything_is_held_against_few_causes_in_the_planes_that_were_
         return SimpleNamespace(state=state, heldout=(None, said))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(few, "score", lambda state, held: state.said)
-        patch.setattr(few, "replace", lambda state, good: state)
-        knows = few.knows_more
+        patch.setattr(sparse, "score", lambda state, held: state.said)
+        patch.setattr(sparse, "replace", lambda state, good: state)
+        knows = sparse.outperforms
         assert knows(fit(1e-6, np.nan), fit(2e-6, np.nan))
         assert not knows(fit(2e-6, np.nan), fit(2e-6, np.nan))
         assert knows(fit(2e-6, 1e-6), fit(2e-6, 2e-6))
@@ -355,9 +355,9 @@ def test_a_change_is_one_of_the_beam_by_monitors_that_mix_the_planes(small_ring,
 def test_a_reference_of_another_kind_or_machine_is_a_sentence(small_ring, before, after):
     with pytest.raises(MeasurementError, match="give a reference of the same kind"):
         diagnose(small_ring, after, reference=object())
-    few = before.select(correctors=before.correctors[:2])
+    sparse = before.select(correctors=before.correctors[:2])
     with pytest.raises(MeasurementError, match="shares 2 of"):
-        diagnose(small_ring, after, reference=few)
+        diagnose(small_ring, after, reference=sparse)
 
 
 def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
 
@@ -116,7 +116,7 @@ def test_a_plane_of_zeros_was_not_read(small_ring, data):
     readings = data.readings.copy()
     readings[..., 1] = 0.0
     found = check_data(small_ring, replace(data, readings=readings))
-    assert next(check.sentence for check in found.told).startswith("no BPM reads y")
+    assert next(check.sentence for check in found.reported).startswith("no BPM reads y")
     the_fault_alone(diagnose(small_ring, replace(data, readings=readings)))
 
 

@@ -19,14 +19,14 @@ from tmlattice.diagnosis.families.dispersion import (
     HorizontalKicks,
     VerticalKicks,
     dispersion_by_kicks,
-    kicks_astray,
+    fitted_orbit_kicks,
     patterns_of_kicks,
 )
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.dense import fit_steps
+from tmlattice.diagnosis.families.steps import FAMILIES
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
-from tmlattice.diagnosis.response.missing import weigh
+from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
@@ -46,7 +46,7 @@ from tmlattice.observe.split import split_columns
 
 STEP = -2000.0
 """Hz."""
-WITHOUT = [step for step in STEPS if not isinstance(step.families[0], HorizontalKicks)]
+WITHOUT = [own for own in FAMILIES if not isinstance(own, HorizontalKicks)]
 
 
 def simulated(ring, causes, **how):
@@ -71,7 +71,7 @@ def with_kicks(ring, measured, more):
 def state_of(ring, measured, fit):
     data = response_data(ring, measured)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
+    return fit_families(data, split, WITHOUT).state if fit else begin(data, split)
 
 
 @pytest.fixture(scope="module")
@@ -138,9 +138,9 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
     causes, plain, kicked = measured
     amounts = {cause.element: cause.amount for cause in causes}
     missed, said = [], []
-    for own, steps in ((plain, STEPS), (kicked, STEPS), (kicked, WITHOUT)):
+    for own, steps in ((plain, FAMILIES), (kicked, FAMILIES), (kicked, WITHOUT)):
         data = response_data(small_ring, own)
-        fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
         true = [amounts[name] for name in QuadrupoleGradient().places(data)]
         missed.append(np.std(fit.state.values["gradient"] - true))
         said.append(len(list(dispersion_by_kicks(fit.state.values, data))))
@@ -351,11 +351,11 @@ def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_rin
     differences, to what these are good for."""
     design = ResponseModel(small_ring)
     where = kicking(small_ring, plane)
-    astray = np.zeros((len(small_ring.magnets), 2))
-    astray[where, plane] = 1e-4 * np.random.default_rng(0).standard_normal(len(where))
-    model = ResponseModel(small_ring, astray=astray)
+    orbit_kicks = np.zeros((len(small_ring.magnets), 2))
+    orbit_kicks[where, plane] = 1e-4 * np.random.default_rng(0).standard_normal(len(where))
+    model = ResponseModel(small_ring, orbit_kicks=orbit_kicks)
     more = (model.rf_response() - design.rf_response())[:, plane]
-    made = dispersion_of_kicks(design, 1.0, plane) @ astray[where, plane]
+    made = dispersion_of_kicks(design, 1.0, plane) @ orbit_kicks[where, plane]
     assert np.std(made) > 1e-3
     assert more == pytest.approx(made, abs=2e-3 * np.abs(made).max())  # first order in the kicks
     assert model.path == pytest.approx(design.path, abs=1e-12)  # no orbit
@@ -394,8 +394,11 @@ def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, fam
     where = kicking(small_ring, family.plane)
     design[where, family.plane] = values @ family.patterns(data).kicks
     left = {}
-    for name, astray in (("own", kicks_astray(Predicted(data, errors))), ("design", design)):
-        orbits = response_change(data, errors, data, astray).orbits
+    for name, orbit_kicks in (
+        ("own", fitted_orbit_kicks(Predicted(data, errors))),
+        ("design", design),
+    ):
+        orbits = response_change(data, errors, data, orbit_kicks).orbits
         left[name] = np.std((orbits - fitted)[-1, :, family.plane])
     made = np.std((fitted - without)[-1, :, family.plane])
     assert made > 1e-7

@@ -8,17 +8,22 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.families.steps import CHANGES, STEPS
-from tmlattice.diagnosis.response import few
+from tmlattice.diagnosis.families.steps import CHANGES, FAMILIES
+from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.before_after import ANY
-from tmlattice.diagnosis.response.dense import one_by_one
-from tmlattice.diagnosis.response.left_open import Blur, LeftOpen, and_orbits, left_open, strongest
+from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.linear import linear, with_numbers
-from tmlattice.diagnosis.response.one_change import OneChange, _Line, _peaks
 from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.single_change import SingleChange, _Line, _peaks
+from tmlattice.diagnosis.response.state import allow, begin, jump
+from tmlattice.diagnosis.response.undetermined import (
+    Blur,
+    Undetermined,
+    and_orbits,
+    strongest,
+    undetermined,
+)
 from tmlattice.diagnosis.response.weights import weight
-from tmlattice.diagnosis.response.what_changed import what_changed
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import DEFAULT
@@ -52,7 +57,7 @@ def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
     data = response_data(small_ring, before)
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    *_, (_, state) = one_by_one(begin(data, split), STEPS)
+    state = settle(jump(allow(begin(data, split), FAMILIES)))
     return state
 
 
@@ -73,9 +78,8 @@ def crowded_change(small_ring, before, fitted):
     data = response_change(first, ring_alone, second)
     split = split_columns(data, 0.2, np.random.default_rng(0))
     state = begin(data, split)
-    for _, settled in one_by_one(replace(state, exploring=False, guessed=ANY), CHANGES):
-        state = settled
-    return settle(state)
+    state = allow(replace(state, exploring=False, guessed=ANY), CHANGES)
+    return settle(settle(jump(state), alike=True))
 
 
 def chi2_per_reading(state):
@@ -110,9 +114,9 @@ def test_every_number_of_a_fit_is_told_as_what_it_does(fitted):
 
 def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
     """Against differences of the full model, with the change and without."""
-    whole = and_orbits(fitted.data.ring, left_open(fitted))
+    whole = and_orbits(fitted.data.ring, undetermined(fitted))
     alone = np.array([effect != "energy_spread" for effect, _ in whole.hypotheses])
-    open_ = LeftOpen(whole.hypotheses, whole.root * alone[:, None])  # that goes with the square
+    open_ = Undetermined(whole.hypotheses, whole.root * alone[:, None])  # that goes with the square
     change = Cause("quadrupole_gradient", "QF::3", 0.01)
     of = Blur(problem, open_).of([change])
     for error in (5, 40, open_.root.shape[1] - 3):
@@ -135,12 +139,12 @@ def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
 
 
 def test_the_strongest_errors_are_nearly_all_that_a_blur_is(fitted, problem):
-    whole, changes = left_open(fitted), [Cause("quadrupole_gradient", "QF::3", 0.01)]
-    few = strongest(problem, whole, changes)
-    assert len(few.hypotheses) < len(whole.hypotheses) / 2
+    whole, changes = undetermined(fitted), [Cause("quadrupole_gradient", "QF::3", 0.01)]
+    sparse = strongest(problem, whole, changes)
+    assert len(sparse.hypotheses) < len(whole.hypotheses) / 2
     of_all, of_few = (
         np.sum(np.where(problem.used, Blur(problem, one).of(changes), 0.0) ** 2)
-        for one in (whole, few)
+        for one in (whole, sparse)
     )
     assert of_few == pytest.approx(of_all, rel=0.02)
 
@@ -177,11 +181,13 @@ def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
     places = find("quadrupole_gradient").places(small_ring)
     errors = tuple(("quadrupole_gradient", place) for place in places)
     of_one, of_twenty = (
-        what_changed(crowded_change, DEFAULT, LeftOpen(errors, size * np.eye(len(places))))[0]
+        changed_supplies(crowded_change, DEFAULT, Undetermined(errors, size * np.eye(len(places))))[
+            0
+        ]
         for size in (0.01, 0.2)
     )
     assert {own.element for own in of_one} == set(CROWDED)
-    known, _ = what_changed(crowded_change, DEFAULT)
+    known, _ = changed_supplies(crowded_change, DEFAULT)
     off, off_of_known = (
         max(abs(own.amount - CROWDED[own.element]) / own.amount_sigma for own in found)
         for found in (of_one, known)
@@ -221,7 +227,7 @@ def test_a_supply_of_quadrupoles_is_not_one_of_its_magnets(small_ring, before):
 
 
 def test_a_change_that_readings_do_not_want_is_none(fitted, problem):
-    same = OneChange(Blur(problem, and_orbits(fitted.data.ring, left_open(fitted))))
+    same = SingleChange(Blur(problem, and_orbits(fitted.data.ring, undetermined(fitted))))
     same.left = np.zeros_like(same.left)
     assert same.likeliest(("quadrupole_gradient", "QF::3")) is None
 
@@ -241,7 +247,7 @@ def test_a_change_is_seen_beside_one_that_nearly_explains_it(
     """One of them leaves 1.11 of the noise, which it may, and the search had ended there: with a
     family of sextupoles, 140 +- 200 % strong."""
     if not known:  # what is open of the ring has to be there for one of them to explain anything
-        monkeypatch.setattr(few, "_explained", lambda *_: None)
+        monkeypatch.setattr(sparse, "_explained", lambda *_: None)
     findings = diagnose(small_ring, after_both, reference=before).findings
     assert {(own.effect, own.element) for own in findings} == set(BOTH)
     for own in findings:
@@ -287,7 +293,7 @@ def test_one_more_look_that_leads_astray_loses_nothing(small_ring, monkeypatch):
     data = response_data(
         small_ring, simulate_response(small_ring, [cause], progress=False).measured
     )
-    explain = few.explain
+    explain = sparse.explain
 
     def once(*given):
         looks.append(given)
@@ -295,9 +301,9 @@ def test_one_more_look_that_leads_astray_loses_nothing(small_ring, monkeypatch):
             raise UnstableRingError("no beam off energy")
         return explain(*given)
 
-    monkeypatch.setattr(few, "explain", once)
+    monkeypatch.setattr(sparse, "explain", once)
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    found = few.few_causes(data, split, ["quadrupole_gradient"], 5, DEFAULT)
+    found = sparse.sparse_fit(data, split, ["quadrupole_gradient"], 5, DEFAULT)
     assert found is not None
     (own,) = found.findings
     assert own.element == "QF::3"
@@ -323,7 +329,7 @@ def test_what_the_readings_want_nothing_of_is_no_change():
     problem = SimpleNamespace(
         amounts=EVEN, first=None, at=lambda causes, start: SimpleNamespace(residual=noise)
     )
-    changes = OneChange(SimpleNamespace(problem=problem))
+    changes = SingleChange(SimpleNamespace(problem=problem))
     hypothesis = ("quadrupole_gradient", "any")
     nothing = np.zeros((1, 400))
     assert changes._amount(_Line(unseen, slope, nothing), hypothesis, None) is None

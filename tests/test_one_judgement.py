@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.machine.response import simulate_response
 from tmlattice.report.tables import notes, optics_rows
 from tmlattice.report.text import small_rows, to_do, verdict_sentence

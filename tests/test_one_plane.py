@@ -7,7 +7,7 @@ import pytest
 
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.challenge.kinds import measure
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 
 PLANES = ("x", "y")
@@ -106,7 +106,7 @@ def test_the_check_states_which_plane_was_not_read(petra3, plane):
     unread = PLANES[1 - PLANES.index(plane)]
     assert planes.status == "note"
     assert planes.sentence.startswith(f"no BPM reads {unread}")
-    assert {check.name for check in found.told} == {"planes"}
+    assert {check.name for check in found.reported} == {"planes"}
 
 
 def test_both_planes_are_read(small_ring):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose
-from tmlattice.diagnosis.response.few import few_causes
+from tmlattice.diagnosis.response.sparse import sparse_fit
 from tmlattice.diagnosis.suspects import numbers
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
@@ -92,7 +92,7 @@ def test_a_strong_cause_is_one_beside_columns_that_are_fitted_by_half(small_ring
     cause = Cause("quadrupole_gradient", "QF::2", -0.05)
     data = response_data(small_ring, measured(small_ring, [cause], noise=5e-8, engine="ocelot"))
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    (found,) = few_causes(data, split, None, 1, DEFAULT).findings
+    (found,) = sparse_fit(data, split, None, 1, DEFAULT).findings
     assert (found.effect, found.element) == (cause.effect, cause.element)
 
 
@@ -110,7 +110,7 @@ def test_small_errors_everywhere_are_not_a_few(small_ring):
         small_ring, measured(small_ring, [], background={"quadrupole_gradient": 2e-3})
     )
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    assert few_causes(data, split, None, 8, DEFAULT) is None
+    assert sparse_fit(data, split, None, 8, DEFAULT) is None
 
 
 MIXED = (

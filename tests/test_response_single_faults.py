@@ -6,13 +6,13 @@ from numpy.testing import assert_allclose
 
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.families.orbit_modes import orbit_families
-from tmlattice.diagnosis.response.exchanged import planes_back, swapped
+from tmlattice.diagnosis.response.detected_faults import detected_faults
 from tmlattice.diagnosis.response.faults import Fault, as_turned
-from tmlattice.diagnosis.response.few import few_causes
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.singled_out import singled_out
 from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
+from tmlattice.diagnosis.response.sparse import sparse_fit
 from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.swaps import planes_back, swapped_planes
 from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.at_engine import AtEngine
@@ -111,7 +111,9 @@ def test_a_fault_that_no_family_holds_is_named(small_ring, measured_with):
     """A displaced sextupole focuses; the gradients of the quadrupoles beside it made that up."""
     cause = Cause("sextupole_offset_y", "sf::2", -0.003)
     data, split = parted(small_ring, measured_with(cause))
-    (fault,) = singled_out(data, split, begin(data, split), single_causes(data), 8, DEFAULT).faults
+    (fault,) = detected_faults(
+        data, split, begin(data, split), single_causes(data), 8, DEFAULT
+    ).faults
     members = fault.finding(small_ring, DEFAULT).credible_set
     assert (cause.effect, cause.element) in [(m.effect, m.element) for m in members]
 
@@ -126,9 +128,9 @@ def test_exchanged_planes_of_a_monitor_are_put_back_and_told(small_ring, measure
     """They were a bad monitor, left out without a reason."""
     measured = measured_with(Cause("monitor_swap", "end_6", 1.0))
     data, split = parted(small_ring, measured)
-    assert swapped(begin(data, split)) == ["end_6"]
+    assert swapped_planes(begin(data, split)) == ["end_6"]
     right, split = parted(small_ring, planes_back(measured, ["end_6"]))
-    assert swapped(begin(right, split)) == []
+    assert swapped_planes(begin(right, split)) == []
     result = diagnose(small_ring, measured)
     (found,) = result.findings
     assert (found.effect, found.element, found.verdict) == ("monitor_swap", "end_6", "identified")
@@ -187,7 +189,7 @@ def test_a_few_causes_that_lead_astray_are_none(small_ring):
         small_ring, [supply], background=USUAL, progress=False, seed=1384498935,
         machine_seed=1384498935, noise=tuple(1.5126369 * rms for rms in NOISE),
     ).measured  # fmt: skip
-    assert few_causes(*parted(small_ring, measured), None, 10, DEFAULT) is None
+    assert sparse_fit(*parted(small_ring, measured), None, 10, DEFAULT) is None
 
 
 def test_a_reversed_monitor_with_few_correctors_in_its_plane_is_named(small_ring, measured_with):

@@ -8,7 +8,7 @@ import pytest
 from tmlattice import diagnose
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.absent import in_the_lattice
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.effects import Cause
 from tmlattice.errors import UnknownNameError
 from tmlattice.machine.response import simulate_response
@@ -65,8 +65,8 @@ def test_of_a_reference_too(small_ring, response):
     assert sum("not in the lattice" in said for said in found.warnings) == 2
 
 
-def test_the_doctor_notes_it(small_ring, response):
-    notes = [check for check in check_data(small_ring, with_more(response)).told
+def test_the_data_checks_note_it(small_ring, response):
+    notes = [check for check in check_data(small_ring, with_more(response)).reported
              if check.name == "names"]  # fmt: skip
     assert len(notes) == 2
     assert all(check.status == "note" for check in notes)
@@ -81,7 +81,7 @@ def test_of_every_kind_that_has_monitors(small_ring, kind):
     assert kept.monitors == tuple(names[1:])
     assert said == [f"not in the lattice, and left out: 1 of {len(names)} monitors (elsewhere)"]
     assert diagnose(small_ring, strange).warnings[0] == said[0]
-    assert check_data(small_ring, strange).told[0].sentence == said[0]
+    assert check_data(small_ring, strange).reported[0].sentence == said[0]
 
 
 def test_another_ring_s_names_are_an_error(small_ring, response):

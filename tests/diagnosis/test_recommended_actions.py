@@ -19,8 +19,8 @@ from tmlattice.diagnosis.recommended_actions import (
 )
 from tmlattice.diagnosis.result import Finding, faults_of
 from tmlattice.effects import CATALOGUE, Effect, apply
+from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.newton import fit
-from tmlattice.inference.rivals import Rival
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import off_momentum, ring_tunes, twiss
@@ -295,7 +295,7 @@ def rivals_of(ring, data, *causes):
     of = of_measurement(ring, data)
     model = Model(ring, of.settings)
     problem = FirstTurns(model=model, data=of, places={c.effect: 1 for c in causes})
-    return of, [Rival((c.effect, c.element), fit(problem, [c], of.launches)) for c in causes]
+    return of, [Alternative((c.effect, c.element), fit(problem, [c], of.launches)) for c in causes]
 
 
 def test_next_measurement_is_silent_where_it_tells_nothing(small_ring):

@@ -17,10 +17,10 @@ from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.challenge.kinds import CHANGES, problem_of
 from tmlattice.challenge.oracle import REFINED, answer
 from tmlattice.effects import Cause, find, modelled
+from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.rivals import best_start
 from tmlattice.inference.scan import Scan, scan
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from tmlattice.challenge.draw import Draw
 from tmlattice.diagnosis.kinds import How, Measured, part_of, stacked
 from tmlattice.effects import Cause, Effect, LaunchEffect, find, modelled
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.among import Known, small_errors_of
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import Problem
@@ -141,8 +141,8 @@ def problem_of(
         (name, place) for name in background for place in find(name).places(ring)
         if problem.sees((name, place))
     ]  # fmt: skip
-    known = Known.usual(everywhere, background)
-    return small_errors_of(problem, known, problem.first, learn=False).problem
+    known = DistributedErrors.usual(everywhere, background)
+    return fit_distributed_errors(problem, known, problem.first, learn=False).problem
 
 
 class Ruler:

@@ -43,10 +43,10 @@ from tmlattice.challenge.record import (
 )
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError, plain
-from tmlattice.inference.judge import held_out_gap
+from tmlattice.inference.validation import held_out_gap
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import of_measurement
-from tmlattice.observe.first_turns import FirstTurns, judged
+from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 log = logging.getLogger(__name__)
 
@@ -292,5 +292,5 @@ def clean_gap(
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
     design = FirstTurns(model=Model(ring, data.settings), data=data, places={})
     found = replace(design, fixed=tuple(causes))
-    gap = held_out_gap([judged(problem) for problem in (design, found)])
+    gap = held_out_gap([held_out_residuals(problem) for problem in (design, found)])
     return {"clean_before": gap.misfits[0].rms, "clean_after": gap.misfits[-1].rms}

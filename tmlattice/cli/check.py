@@ -61,7 +61,7 @@ def check(
     from tmlattice.files import output_file, write_json
 
     with output_file(json_file) if json_file else nullcontext() as path:
-        from tmlattice.diagnosis.doctor import check_data
+        from tmlattice.diagnosis.data_checks import check_data
 
         ring = open_ring(lattice, sequence, energy)
         data, _ = read_data(measurement, ring, map_file, unit, quiet)

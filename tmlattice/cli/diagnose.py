@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
-    from tmlattice.inference.among import Known
+    from tmlattice.inference.distributed import DistributedErrors
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
 
@@ -270,9 +270,9 @@ def _read(
 
 def _not_used(lattice: str) -> list[str]:
     """What stands beside a lattice that an orbit response does not start from."""
-    from tmlattice.diagnosis.twin import known_beside
+    from tmlattice.diagnosis.twin import knowledge_file
 
-    beside = known_beside(Path(lattice))
+    beside = knowledge_file(Path(lattice))
     if not beside.is_file():
         return []
     return [
@@ -281,11 +281,11 @@ def _not_used(lattice: str) -> list[str]:
     ]
 
 
-def _known(ring: "Ring", lattice: str) -> "Known | None":
+def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
     """What an earlier diagnosis left known beside the ring as it found it."""
-    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, read_known
+    from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, read_known
 
-    beside = known_beside(Path(lattice))
+    beside = knowledge_file(Path(lattice))
     if beside.is_file():
         return read_known(beside, ring)
     if ring.model == ESTIMATED:
@@ -316,7 +316,7 @@ def _write(
         write_json(extra, document)
 
 
-def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | None":
+def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Correction | None":
     """Settings of supplies that bring the estimated ring to the design, where the covariance of its
     errors is known and they have an expected gain."""
     from tmlattice.correction import correct
@@ -336,12 +336,12 @@ def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | Non
 
 def _write_rings(
     result: "Diagnosis",
-    known: "Known | None",
+    known: "DistributedErrors | None",
     lattice_out: Path | None,
     corrected_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
-    from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document
+    from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
@@ -362,7 +362,7 @@ def _write_rings(
             written[str(beside)] = ()
         else:  # that of the ring which stood there
             beside.unlink(missing_ok=True)
-        beside = known_beside(lattice_out)
+        beside = knowledge_file(lattice_out)
         beside.unlink(missing_ok=True)  # that of the ring which stood there
         if lattice_out.is_file() and known is not None:
             with output_file(beside) as temporary:

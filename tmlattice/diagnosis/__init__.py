@@ -68,10 +68,10 @@ def diagnose(
     from threadpoolctl import threadpool_limits
 
     one = 1 if _readings(measurement) < MANY else None
-    measurement, said = _in_the_lattice(ring, measurement)
+    measurement, messages = _in_the_lattice(ring, measurement)
     for name in ("reference", "heldout"):
         options[name], more = _in_the_lattice(ring, options.get(name))
-        said += [f"the {name}: {sentence}" for sentence in more if sentence not in said]
+        messages += [f"the {name}: {sentence}" for sentence in more if sentence not in messages]
         if options[name] is None:
             del options[name]
     every = [*(measurement.values() if isinstance(measurement, Mapping) else [measurement])]
@@ -79,7 +79,7 @@ def diagnose(
     with threadpool_limits(one, "blas"):
         found = _diagnosed(ring, measurement, options)
     found = with_devices(found, devices_of(ring, every))
-    return replace(found, warnings=(*said, *found.warnings)) if said else found
+    return replace(found, warnings=(*messages, *found.warnings)) if messages else found
 
 
 def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
@@ -87,12 +87,12 @@ def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
     if not isinstance(measured, Mapping):
         return in_the_lattice(ring, measured)
     parts = {name: in_the_lattice(ring, own) for name, own in measured.items()}
-    said = [
+    messages = [
         f"{name}: {sentence}" if len(parts) > 1 else sentence
         for name, (_, some) in parts.items()
         for sentence in some
     ]
-    return {name: own for name, (own, _) in parts.items()}, said
+    return {name: own for name, (own, _) in parts.items()}, messages
 
 
 def _each_once(measurement: Any) -> None:

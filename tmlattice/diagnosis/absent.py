@@ -37,30 +37,30 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
         UnknownNameError: more than half of the monitors, or of the correctors, are not there.
     """
     own: Any = measured
-    said: list[str] = []
+    messages: list[str] = []
     if not ring.monitors:
-        return measured, said  # nothing can be read there, which others say
+        return measured, messages  # nothing can be read there, which others say
     monitors = Names("monitor", (monitor.name for monitor in ring.monitors))
     for what, find in (("monitors", monitors.__getitem__), ("correctors", ring.index)):
         names = getattr(own, what, ())
         unknown = [name for name in names if not _has(ring, monitors, name)]
         if not unknown:
             continue
-        mend = _mend(find, unknown[0])
+        mend = _hint(find, unknown[0])
         if len(unknown) > MOST * len(names):
             raise UnknownNameError(
                 f"{len(unknown)} of {len(names)} {what} are not in the lattice: {mend}"
             )
         own = own.select(**{what: [name for name in names if name not in unknown]})
         typed = MEANT in mend and len(unknown) == 1
-        said.append(
+        messages.append(
             f"not in the lattice, and left out: {len(unknown)} of {len(names)} {what} "
             f"({first_of(unknown, SHOWN)})" + (f"; {mend.partition('; ')[2]}" if typed else "")
         )
-    return own, said
+    return own, messages
 
 
-def _mend(find: Callable[[str], object], name: str) -> str:
+def _hint(find: Callable[[str], object], name: str) -> str:
     """What is said of a name that is not there."""
     try:
         find(name)

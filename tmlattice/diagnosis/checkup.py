@@ -1,4 +1,4 @@
-"""What the data doctor says: one sentence for each thing that was looked at."""
+"""The result of the data checks: one sentence for each thing that was looked at."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class Checkup:
         return "wrong" if "wrong" in found else "note" if "note" in found else "fine"
 
     @property
-    def told(self) -> tuple[Check, ...]:
+    def reported(self) -> tuple[Check, ...]:
         """Those that are not fine, the worst first."""
         order = ("wrong", "note")
         return tuple(c for status in order for c in self.checks if c.status == status)

@@ -99,7 +99,7 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
         return {}
     there = assembly(ring)
     design = _optics(there, {})
-    found = _beside(design, _optics(there, _changed(ring, ring, causes)))
+    found = _relative(design, _optics(there, _changed(ring, ring, causes)))
     told: dict[Hypothesis, Consequences] = {}
     for cause in felt:
         others = [c for c in causes if c is not cause]
@@ -108,7 +108,7 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
         told[cause.effect, cause.element] = Consequences(
             None if design is None else _pair(design.tunes),
             found,
-            _beside(design, _optics(there, changed)),
+            _relative(design, _optics(there, changed)),
         )
     return told
 
@@ -123,7 +123,7 @@ def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
     there = assembly(ring)
     design = _optics(there, {})
     felt = [cause for cause in causes if _felt(cause.effect)]
-    found = _beside(design, _optics(there, _changed(ring, ring, felt)))
+    found = _relative(design, _optics(there, _changed(ring, ring, felt)))
     return Consequences(None if design is None else _pair(design.tunes), found, None)
 
 
@@ -165,7 +165,7 @@ def _optics(there: Assembly, changed: Mapping[int, Element]) -> _Optics | None:
     )
 
 
-def _beside(design: _Optics | None, ring: _Optics | None) -> Beam | None:
+def _relative(design: _Optics | None, ring: _Optics | None) -> Beam | None:
     if design is None or ring is None:
         return None
     beat = ring.beta / design.beta - 1

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
-from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.prepare import batch, prepare
-from tmlattice.diagnosis.stored_doctor import raise_if_wrong
+from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     ClosedOrbit,
@@ -35,7 +35,7 @@ from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import split_columns
-from tmlattice.observe.stored import Kept, Stored
+from tmlattice.observe.stored import ModelCache, Stored
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
@@ -96,7 +96,7 @@ class Part:
     heldout: Problem | None = field(default=None, repr=False)
     estimated: bool = False
     dead: tuple[tuple[int, float], ...] = ()
-    said: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     hypotheses: tuple[Hypothesis, ...] | None = None
     start: Array | None = field(default=None, repr=False)
     shots: tuple[tuple[int | None, ...], tuple[int, ...]] = ((), ())
@@ -115,13 +115,13 @@ def part_of(label: str, measured: Measured, how: How) -> Part:
     raise TypeError(f"{type(measured).__name__} is no measurement")
 
 
-def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together:
+def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> CombinedProblem:
     """Measurements as one problem, beside those of a reference; stored beams of the same machine
     share the models made of it."""
-    kept = Kept()
+    cache = ModelCache()
     first, then = (
         [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            replace(own, cache=cache) if isinstance(own := part.problem, Stored) else own
             for part in some
         ]
         for some in (parts, before)
@@ -130,7 +130,7 @@ def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together
         own.first if part.start is None else part.start
         for part, own in zip((*parts, *before), (*first, *then), strict=True)
     )
-    whole = Together.of(first, then)
+    whole = CombinedProblem.of(first, then)
     return replace(whole, places=how.places, judgement=how.judgement, starts=starts)
 
 
@@ -142,15 +142,15 @@ def kind_of(measured: Measured) -> str:
 # --- the kinds ----
 def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
     ring = how.ring
-    measured = mended(ring, measured, how.assume)
-    before, held = (mended(ring, own, how.assume) for own in (how.reference, how.heldout))
-    said = consulted(ring, measured, how.radiation, before)
-    measured = batch(ring, measured, said)
-    before, held = (own and batch(ring, own, said) for own in (before, held))
+    measured = corrected_data(ring, measured, how.assume)
+    before, held = (corrected_data(ring, own, how.assume) for own in (how.reference, how.heldout))
+    messages = data_checks(ring, measured, how.radiation, before)
+    measured = batch(ring, measured, messages)
+    before, held = (own and batch(ring, own, messages) for own in (before, held))
     if held is None and how.holdout:
         measured, held = measured.split(how.holdout, how.seed)
         if held is None and not how.places:
-            said.append("one shot was measured, so none is held out")
+            messages.append("one shot was measured, so none is held out")
     options = (how.radiation, how.effects, how.judgement)
     ready = prepare(ring, measured, before, *options)
     estimated = ready.estimated
@@ -166,7 +166,7 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
         other = FirstTurns(model=model, data=data, places=how.places)
     earlier: tuple[int | None, ...] = (None,) * (0 if before is None else len(before.shots))
     return Part(
-        label, kind, ready.problem, other, estimated, ready.dead, (*said, *ready.said),
+        label, kind, ready.problem, other, estimated, ready.dead, (*messages, *ready.messages),
         ready.hypotheses, ready.before.nuisances,
         ((*earlier, *measured.shots), () if held is None else tuple(held.shots)),
     )  # fmt: skip
@@ -181,14 +181,14 @@ def _with_noise(measured: Measurement, noise: Array) -> Measurement:
 
 def _response(label: str, kind: str, measured: Any, how: How) -> Part:
     ring = how.ring
-    measured = mended(ring, measured, how.assume)
-    said = tuple(consulted(ring, measured))
+    measured = corrected_data(ring, measured, how.assume)
+    messages = tuple(data_checks(ring, measured))
     data = response_data(ring, measured)
     there = np.isfinite(data.orbits)
     base = Predicted(data, Errors.none(data)).bend()
     if not how.holdout:
         whole = Response(base=base, used=there, places=how.places, judgement=how.judgement)
-        return Part(label, kind, whole, said=said)
+        return Part(label, kind, whole, messages=messages)
     split = split_columns(data, min(how.holdout, 0.2), np.random.default_rng(how.seed))
     held = np.append(split.held[:-1], False)[:, None]
     # a held-out corrector gives half of its monitors: nothing else tells what it does itself
@@ -197,7 +197,7 @@ def _response(label: str, kind: str, measured: Any, how: How) -> Part:
                  judgement=how.judgement)
         for which in (~held | split.half, held & ~split.half)
     )  # fmt: skip
-    return Part(label, kind, fitted, judges, said=said)
+    return Part(label, kind, fitted, judges, messages=messages)
 
 
 def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
@@ -216,8 +216,10 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
         problem = make(how.ring, measured, how.places)
         if isinstance(problem, Stored):
             raise_if_wrong(how.ring, measured, problem)
-        said = problem.said if isinstance(problem, ManyTurns) else ()
-        return Part(label, kind, problem, held and make(how.ring, held, how.places), said=said)
+        messages = problem.warnings if isinstance(problem, ManyTurns) else ()
+        return Part(
+            label, kind, problem, held and make(how.ring, held, how.places), messages=messages
+        )
 
     return made
 

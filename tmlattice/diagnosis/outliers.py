@@ -9,8 +9,8 @@ import numpy as np
 
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.result import Finding
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.speaks import micrometres
@@ -34,15 +34,15 @@ def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
     silent = [name for name in names if name not in heard]
     if not silent:
         return part
-    said = f"no reading that can be used of {', '.join(silent)}: left out"
-    return replace(part, said=(*part.said, said))
+    messages = f"no reading that can be used of {', '.join(silent)}: left out"
+    return replace(part, messages=(*part.messages, messages))
 
 
-def spikes(parts: Sequence[Part], problem: Together, found: Explanation) -> Iterator[str]:
+def spikes(parts: Sequence[Part], problem: CombinedProblem, found: Explanation) -> Iterator[str]:
     """A sentence for each measurement with single readings that the search left out."""
     ends = np.cumsum([part.valid.size for part in problem.parts])
     own: dict[int, list[int]] = {}
-    for reading in found.spikes:
+    for reading in found.outliers:
         flat = int(np.ravel(reading)[-1])
         own.setdefault(int(np.searchsorted(ends, flat, side="right")), []).append(flat)
     for index, (part, one) in enumerate(zip(parts, problem.parts, strict=False)):
@@ -51,8 +51,8 @@ def spikes(parts: Sequence[Part], problem: Together, found: Explanation) -> Iter
         owners = one.owner().ravel()
         start = int(ends[index]) - one.valid.size
         count = Counter(one.monitors[owners[flat - start]] for flat in own[index])
-        told = [name if many == 1 else f"{name} ({many})" for name, many in count.items()]
-        yield f"{part.label}: single readings left out as spikes: {', '.join(told)}"
+        notes = [name if many == 1 else f"{name} ({many})" for name, many in count.items()]
+        yield f"{part.label}: single readings left out as spikes: {', '.join(notes)}"
 
 
 # --- of first turns -------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ def rejected_readings(part: Part, found: Explanation) -> tuple[dict[str, Any], .
     reference is None."""
     rows: list[dict[str, Any]] = []
     names = part.problem.monitors
-    for (flat,) in found.spikes:
+    for (flat,) in found.outliers:
         shot, reading, plane = np.unravel_index(flat, part.problem.valid.shape)
         turn, monitor = divmod(int(reading), len(names))
         rows.append({
@@ -81,18 +81,18 @@ def noise_text(noise: tuple[float, float]) -> str:
 def about_launches(part: Part, findings: Sequence[Finding]) -> list[str]:
     """What the launches that were read leave open of the findings, in sentences."""
     assert isinstance(part.problem, FirstTurns)
-    told, data = [], part.problem.data
+    notes, data = [], part.problem.data
     if not data.planes.all() and any(finding.effect is None for finding in findings):
         unread, other = ("x", "y") if data.planes[1] else ("y", "x")
-        told.append(
+        notes.append(
             f"what is located may begin upstream in {unread}, which sextupoles pass on to {other}"
         )
     if data.active.sum() == 1 and findings:
-        told.append(
+        notes.append(
             "one trajectory gives one kick at each place: it locates, but any single multipole "
             "explains it; two or more launches name the effect"
         )
-    return told
+    return notes
 
 
 SHOWN = 4

@@ -73,7 +73,7 @@ class Prepared:
     dead: tuple[tuple[int, float], ...]
     noise: tuple[float, float]
     estimated: bool
-    said: tuple[str, ...]
+    messages: tuple[str, ...]
 
 
 def prepare(
@@ -100,7 +100,7 @@ def prepare(
     places = {name: max(len(find(name).places(ring)), 1) for name in chosen}
     model = Model(ring, data.settings, data.turns, known, active=data.active)
     listed = {name.casefold() for name in measurement.monitors}
-    dead, data, said = _dead_monitors(model, data, listed, judgement)
+    dead, data, messages = _dead_monitors(model, data, listed, judgement)
     rough = data.with_sigma(np.array([ROUGH, ROUGH]))
     problem = FirstTurns(
         model=model, data=rough, places=places, rare=rare(ring, chosen), judgement=judgement
@@ -109,14 +109,14 @@ def prepare(
     data, noise, estimated = _with_noise(data, start)
     data, noise, floor = _above_the_floor(data, noise)
     _check_lattice(ring, data, start, judgement)
-    said = (*said, *floor)
+    messages = (*messages, *floor)
     problem = replace(problem, data=data, white=None)
     before = _on_its_way(fit(problem, (), start.nuisances, steps=STEPS), ring)
     hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
-    return Prepared(problem, before, hypotheses, known, dead, noise, estimated, said)
+    return Prepared(problem, before, hypotheses, known, dead, noise, estimated, messages)
 
 
-def batch(ring: Ring, measurement: Measurement, said: list[str]) -> Measurement:
+def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurement:
     """Readings that are a signal, of as many shots as find room, evenly taken.
 
     Args:
@@ -140,7 +140,7 @@ def batch(ring: Ring, measurement: Measurement, said: list[str]) -> Measurement:
     if shots <= room:
         return measurement
     taken = np.linspace(0, shots - 1, room).round().astype(int)
-    said.append(f"{room} of {shots} shots are used, evenly taken: the others find no room")
+    messages.append(f"{room} of {shots} shots are used, evenly taken: the others find no room")
     return measurement.select(shots=[measurement.shots[i] for i in taken])
 
 
@@ -193,7 +193,7 @@ def _dead_monitors(
     # readings that are all the same twice are one shot that stands twice, and no frozen monitors
     _, own = np.unique(readings.reshape(len(readings), -1), axis=0, return_index=True)
     readings, valid = readings[own], valid[own]
-    silent, frozen, half, said = [], [], [], []
+    silent, frozen, half, messages = [], [], [], []
     order = [m for m, name in enumerate(model.maps.monitors) if name.casefold() in listed]
     behind = signals.not_reached(np.asarray(~valid[:, order].any(axis=(0, 2))))
     reached = {m for m, lost in zip(order, behind, strict=True) if not lost}
@@ -210,20 +210,20 @@ def _dead_monitors(
                 frozen.append(m)
     absent = sum(1 for name in model.maps.monitors if name.casefold() not in listed)
     if absent:
-        said.append(f"{absent} of the ring's {count} monitors are not in the measurement")
+        messages.append(f"{absent} of the ring's {count} monitors are not in the measurement")
     unread = [plane for plane, read in zip("xy", data.planes, strict=True) if not read]
     if unread:
-        said.append(signals.one_plane(unread[0]))
+        messages.append(signals.one_plane(unread[0]))
     elif half:
-        said.append(f"{len(half)} monitors read one plane only: {first_of(half, 3)}")
+        messages.append(f"{len(half)} monitors read one plane only: {first_of(half, 3)}")
     if len(silent) > judgement.silent * count:
-        said.append(f"{len(silent)} monitors have no signal; they count as not there")
+        messages.append(f"{len(silent)} monitors have no signal; they count as not there")
         silent = []
     dropped = np.zeros(data.valid.shape, dtype=bool)
     for m in frozen:
         dropped[:, m::count] = True
     dead = (*((m, 1.0) for m in silent), *((m, 2.0) for m in frozen))
-    return dead, data.without(dropped), tuple(said)
+    return dead, data.without(dropped), tuple(messages)
 
 
 def _with_noise(data: Data, start: Fit) -> tuple[Data, tuple[float, float], bool]:
@@ -258,11 +258,11 @@ def _above_the_floor(
     if not (data.sigma[data.valid] < floor).any():
         return data, noise, ()
     data = replace(data, sigma=np.maximum(data.sigma, floor))
-    said = (
+    messages = (
         f"the noise, {1e6 * min(noise):.2g} µm, is less than what second-order maps leave of such "
         f"an orbit: {1e6 * floor:.2g} µm is taken"
     )
-    return data, (max(noise[0], floor), max(noise[1], floor)), (said,)
+    return data, (max(noise[0], floor), max(noise[1], floor)), (messages,)
 
 
 def _rms(values: Array) -> float:

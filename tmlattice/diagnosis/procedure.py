@@ -63,13 +63,13 @@ from tmlattice.effects import (
     rare,
 )
 from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
-from tmlattice.inference.among import Known, Learnt
+from tmlattice.inference.combined import CombinedProblem
+from tmlattice.inference.distributed import DistributedErrors, FittedErrors
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.first_turns import FirstTurns
@@ -94,7 +94,7 @@ def diagnose_together(
     *,
     reference: Mapping[str, Any] | None = None,
     background: Mapping[str, float | None] | None = None,
-    known: Known | None = None,
+    known: DistributedErrors | None = None,
     holdout: float = 0.33,
     heldout: Measurement | None = None,
     effects: Sequence[str] | None = None,
@@ -172,12 +172,12 @@ def diagnose_together(
         sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
     small = sought_out.small
     if noisy and problem.alone and small is not None:  # with the noise that was learnt
-        assert isinstance(small.plain, Together)
+        assert isinstance(small.plain, CombinedProblem)
         problem = small.plain
         own = zip(parts, problem.parts, strict=True)
         parts = [replace(part, problem=learnt) for part, learnt in own]
     progress("report")
-    return _told(
+    return _report(
         ring, parts, problem, sought_out.explanation, small, how,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
@@ -222,12 +222,12 @@ def _of_launches(effect: Effect) -> bool:
 
 
 # --- what is told ----
-def _told(
+def _report(
     ring: Ring,
     parts: Sequence[Part],
-    problem: Together,
+    problem: CombinedProblem,
     found: Explanation,
-    small: Learnt | None,
+    small: FittedErrors | None,
     how: How,
     made: Mapping[str, Any],
 ) -> Diagnosis:
@@ -242,11 +242,11 @@ def _told(
     estimated = any(part.estimated for part in parts)
     findings = findings_of(ring, found, dead, judgement)
     fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
-    verdict, findings, said = verdict_of(found, findings, fitted.p_value, estimated, judgement)
+    verdict, findings, messages = verdict_of(found, findings, fitted.p_value, estimated, judgement)
     if verdict == "none" and small is not None and small.errors and problem.alone:
         verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
-        said = (*said, f"the amounts are not settled: {result.outcome.value}")
+        messages = (*messages, f"the amounts are not settled: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
     left = found.left if causes or (found.kicks and findings) else found.first_kicks
     if result.causes and not causes:  # nothing is explained: what is left is what was there
@@ -262,18 +262,18 @@ def _told(
         heldout = held_out(parts, problem.fixed, stages, aside, since)
         # what small errors leave undetermined is not in the errors of held-out readings
         compared = compared_of(fitted, heldout if small is None else None)
-        told = (f"{part.label}: {one}" for part in parts for one in part.said)
+        told = (f"{part.label}: {one}" for part in parts for one in part.messages)
         notes = list(spikes(parts, problem, found))
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
-        told = (one for one in turns.said)
+        told = (one for one in turns.messages)
         rejected = rejected_readings(turns, found)
         notes = about_rejected(rejected)
         if turns.estimated:
             notes.append(noise_text(_noise(parts)))
         notes += about_launches(turns, findings)
-    warnings = [*told, *notes, *said, *too_large(stages)]
+    warnings = [*told, *notes, *messages, *too_large(stages)]
     corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     return Diagnosis(
@@ -335,7 +335,7 @@ def _next(
     return None
 
 
-def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:
+def _by_ring(ring: Ring, problem: CombinedProblem, found: Explanation) -> Explanation:
     """Monitors that were set aside, by their place in the ring."""
     at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
     aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}

@@ -17,18 +17,18 @@ from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, apply
-from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
 if TYPE_CHECKING:
-    from tmlattice.diagnosis.response.dense import Step
+    from tmlattice.diagnosis.response.common_factors import CommonFactors
+    from tmlattice.diagnosis.response.hierarchical import Step
     from tmlattice.diagnosis.response.inconsistencies import Inconsistency
-    from tmlattice.diagnosis.response.missing import Weighed
-    from tmlattice.diagnosis.response.reasons import Reasons
+    from tmlattice.diagnosis.response.missing_effects import Weighed
     from tmlattice.diagnosis.suspects import Suspect
 
 _MEASURES = {
@@ -212,14 +212,14 @@ class Diagnosis(ShownDiagnosis):
         errors: standard error of each one's amount, the same length.
         view: what figures need; it says what was measured.
         steps: of a dense fit, those kept; the first is the design's, the last the result's.
-        refused: those that did not help.
+        rejected_steps: families that are closed, with the figures with them.
         bad_monitors: names of those left out.
         priors: rms of small errors, as the data have them or as they were told, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
             see the family.
         degenerate: what the data alone do not settle, in words.
         reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
-        pulled_apart: what the RF's orbit and the correctors' responses disagree about, or None.
+        inconsistencies: what the RF's orbit and the correctors' responses disagree about, or None.
         hypotheses: effects that may be missing, weighed; None: not asked.
         suspects: where to look first for a fault that was not detected.
         dispersion: beside that of the ring as found, for `write_calibration`.
@@ -258,7 +258,7 @@ class Diagnosis(ShownDiagnosis):
     priors: Mapping[str, float] = field(default_factory=dict)
     prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
-    reasons: "Reasons | None" = None
+    common_factors: "CommonFactors | None" = None
     inconsistencies: "Inconsistency | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
@@ -315,7 +315,7 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def by_steps(self) -> bool:
-        """Whether families of errors were fitted step by step, as to an orbit response."""
+        """Whether families of errors were fitted, as to an orbit response."""
         return isinstance(self.view, ResponseView)
 
     @property
@@ -425,7 +425,7 @@ class Diagnosis(ShownDiagnosis):
         heldout = None
         if gap is not None:
             heldout = {
-                **both(gap.misfits[gap.since], gap.misfits[-1]),
+                **both(gap.misfits[gap.baseline], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
                 "monitors": "half" if self.by_steps else "odd",
                 "steps": [dict(vars(m)) for m in gap.misfits],
@@ -473,7 +473,9 @@ class Diagnosis(ShownDiagnosis):
                 for c, s, support in self.supported
             ],
             "correlations": [pair.as_json() for pair in self.correlations],
-            "reasons": None if self.reasons is None else self.reasons.as_json(),
+            "common_factors": None
+            if self.common_factors is None
+            else self.common_factors.as_json(),
             "inconsistencies": None
             if self.inconsistencies is None
             else self.inconsistencies.as_json(),

@@ -64,19 +64,19 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     """
     there = np.isfinite(values)
     if not np.count_nonzero(values[there]):
-        said = "every reading is zero: nothing was read; give the readings of a beam"
-        return [wrong("frozen monitors", said)]
+        text = "every reading is zero: nothing was read; give the readings of a beam"
+        return [wrong("frozen monitors", text)]
     checks = []
     checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
     ]
     if len(silent) > DEFAULT.silent * len(names):
-        said = f"{len(silent)} of {len(names)} monitors have no reading; they count as not there"
-        checks.append(note("silent monitors", said))
+        text = f"{len(silent)} of {len(names)} monitors have no reading; they count as not there"
+        checks.append(note("silent monitors", text))
     elif silent:
-        said = f"no reading of {some(silent)}"
-        checks.append(note("silent monitors", said))
+        text = f"no reading of {some(silent)}"
+        checks.append(note("silent monitors", text))
     else:
         checks.append(fine("silent monitors", f"each of {len(names)} monitors has a reading"))
     many = there.sum(axis=0) > 2
@@ -90,20 +90,20 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         if x or y
     ]
     if moved and stuck.sum() > ALIKE * max(int(many.sum()), 1):
-        said = (
+        text = (
             f"{len(frozen)} of {len(names)} monitors read the same in every shot and turn: one "
             "reading was copied over the others; give what was read each time"
         )
-        checks.append(wrong("frozen monitors", said))
+        checks.append(wrong("frozen monitors", text))
     elif frozen:
-        said = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
-        checks.append(note("frozen monitors", said))
+        text = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
+        checks.append(note("frozen monitors", text))
     else:
         checks.append(fine("frozen monitors", "no monitor always reads the same"))
     copies = _copies(ring, names, values, stuck)
     if copies:
-        said = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
-        checks.append(note("copied monitors", said))
+        text = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
+        checks.append(note("copied monitors", text))
     else:
         checks.append(fine("copied monitors", "no two monitors read the same"))
     return checks
@@ -148,12 +148,12 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
     if stops:
         shot = stops[0]
         others = f"; so have {len(stops) - 1} others" if len(stops) > 1 else ""
-        said = (
+        text = (
             f"shot {data.shots[shot]} has no reading behind {_place(ring, data, last[shot][-1])}"
             f"{others}: the beam was lost there, or the monitors behind did not record; it is "
             "used up to there"
         )
-        checks.append(note("lost beam", said))
+        checks.append(note("lost beam", text))
     else:
         checks.append(fine("lost beam", "every shot is read to its end"))
     return checks

@@ -21,7 +21,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.inference.among import Among, Known
+from tmlattice.inference.distributed import DistributedErrors, DistributedProblem
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.posterior import posterior
 from tmlattice.lattice import Ring
@@ -45,7 +45,7 @@ ROUNDED = 1e-4
 """Of the products of directions: single precision rounds them by 1e-6."""
 
 FORMAT = "tmlattice-known"
-BESIDE = ".known.json"
+SUFFIX = ".known.json"
 """What the name of a lattice file ends in besides."""
 
 
@@ -53,12 +53,12 @@ ESTIMATED = "estimated ring"
 """What a lattice file says that it is whose knowledge stands in a file of its own."""
 
 
-def known_beside(lattice: Path) -> Path:
+def knowledge_file(lattice: Path) -> Path:
     """Where the knowledge of a lattice file stands."""
-    return Path(f"{lattice}{BESIDE}")
+    return Path(f"{lattice}{SUFFIX}")
 
 
-def known_of(diagnosis: Diagnosis) -> Known | None:
+def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
     """What a diagnosis knows beside the ring as found; None: nothing of small errors.
 
     The small errors with their covariance. Of an orbit response they are linear about its dense
@@ -69,7 +69,7 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
     view = diagnosis.view
     if isinstance(view, JointView):
         found, causes = view.explanation, diagnosis.causes
-        if not isinstance(found.problem, Among):
+        if not isinstance(found.problem, DistributedProblem):
             return None
         known = found.problem.learnt(found.fit if causes else found.before)
         beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
@@ -91,7 +91,7 @@ def _together(
     view: ResponseView,
     usual: Mapping[str, float],
     everywhere: Sequence[Hypothesis],
-) -> Known:
+) -> DistributedErrors:
     """All small errors that the readings of a response allow, about its dense fit."""
     ring = diagnosis.ring
     data = response_data(ring, view.measured)
@@ -115,35 +115,37 @@ def _together(
         fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),
     )
     start = np.array([fitted.get(h, 0.0) for h in everywhere])
-    first = posterior(problem, Known.usual(everywhere, usual), about=start)
+    first = posterior(problem, DistributedErrors.usual(everywhere, usual), linearised_at=start)
     sizes = {
         name: size if first.errors[name] < HARDLY else max(size, usual[name])
         for name, size in first.sizes.items()
     }
-    known = posterior(problem, Known.usual(everywhere, sizes), learn=False, about=start).known
+    known = posterior(
+        problem, DistributedErrors.usual(everywhere, sizes), learn=False, linearised_at=start
+    ).known
     inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the ring as found has them
     return replace(
         known,
         amounts=known.amounts - np.where(inside, start, 0.0),
-        causes=tuple(c for c in problem.fixed if _beside(c)),
+        causes=tuple(c for c in problem.fixed if _held_by_ring(c)),
     )
 
 
 def _each_alone(
     diagnosis: Diagnosis, usual: Mapping[str, float], everywhere: Sequence[Hypothesis]
-) -> Known:
+) -> DistributedErrors:
     """Each error of a dense fit with its own standard deviation."""
     own = {(c.effect, c.element): s
            for c, s in zip(diagnosis.causes, diagnosis.errors, strict=True)}  # fmt: skip
     rms = [own[h] if own.get(h, 0.0) > 0 else usual[h[0]] for h in everywhere]
     count = len(everywhere)
-    return Known(
+    return DistributedErrors(
         tuple(everywhere), np.zeros(count), np.array(rms), np.zeros((0, count)), np.zeros(0),
-        tuple(c for c in diagnosis.causes if _beside(c)),
+        tuple(c for c in diagnosis.causes if _held_by_ring(c)),
     )  # fmt: skip
 
 
-def _beside(cause: Cause) -> bool:
+def _held_by_ring(cause: Cause) -> bool:
     """Whether it stands beside the ring as found: first turns have energies of
     their own."""
     return not _in_ring(cause) and not isinstance(find(cause.effect), LaunchEffect)
@@ -155,7 +157,7 @@ def _in_ring(cause: Cause) -> bool:
     return isinstance(effect, RingEffect) and not effect.calibrates
 
 
-def known_document(known: Known, lattice: Path) -> dict[str, Any]:
+def known_document(known: DistributedErrors, lattice: Path) -> dict[str, Any]:
     """As it stands in a file, beside the lattice file that it belongs to."""
     from tmlattice import __version__
 
@@ -181,14 +183,14 @@ def known_document(known: Known, lattice: Path) -> dict[str, Any]:
     }
 
 
-def read_known(path: Path, ring: Ring) -> Known:
+def read_known(path: Path, ring: Ring) -> DistributedErrors:
     """What stands beside a lattice file.
 
     Raises:
         MeasurementError: it is damaged, or of another ring, or the lattice file was changed since.
     """
     document = read_document(path, "known", FORMAT)
-    lattice = path.with_name(path.name.removesuffix(BESIDE))
+    lattice = path.with_name(path.name.removesuffix(SUFFIX))
     made_for = document.get("lattice_sha256")
     if made_for is not None and hashlib.sha256(lattice.read_bytes()).hexdigest() != made_for:
         raise MeasurementError(
@@ -210,7 +212,7 @@ def read_known(path: Path, ring: Ring) -> Known:
                 f"{path}: '{ring.name}' has no place '{row['element']}' of {name}; it is of "
                 "another ring"
             )
-    return Known(
+    return DistributedErrors(
         tuple((row["effect"], row["element"]) for row in rows),
         np.array([row["amount"] for row in rows], dtype=float),
         np.array([row["rms"] for row in rows], dtype=float),

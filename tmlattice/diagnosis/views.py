@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.numbers import NumberRead
-from tmlattice.inference.judge import Misfit
 from tmlattice.inference.search import Explanation
+from tmlattice.inference.validation import Misfit
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns

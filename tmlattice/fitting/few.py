@@ -101,7 +101,7 @@ def fit_sparse(
         raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
     monitors = [monitor.name for monitor in ring.monitors]
     data = first_turn(monitors, measurement, noise, launch_sigma, network.dimension)
-    found = few_causes(
+    found = sparse_fit(
         ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
     )
     warn_of_launches(ring, data, network.dimension, found)
@@ -157,7 +157,7 @@ def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation)
         return
     sigma = data.launch_sigma.copy()
     sigma[:, :4] = np.inf
-    free = few_causes(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
+    free = sparse_fit(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
     readings, numbers = int(data.valid.sum()), int(stated.sum())
     gain = found.fit.chi2 - free.chi2
     explained = free.chi2 <= readings + BY_CHANCE * np.sqrt(2 * readings)
@@ -184,7 +184,7 @@ def in_coordinates(launches: Array, dimension: int) -> Array:
     return states
 
 
-def few_causes(
+def sparse_fit(
     ring: Ring,
     data: Data,
     kinds: Sequence[str] = ("quadrupole", "sextupole"),
@@ -217,13 +217,14 @@ def few_causes(
         data=data,
         places=dict.fromkeys(effects, len(hypotheses) / len(effects)),  # all magnets are alike
         amounts=AmountPrior(Student(fault, np.inf), bound=LARGEST),
-        judgement=Judgement(unknown=0.0, rivals=refined, rarer=RARER),
+        judgement=Judgement(unknown=0.0, alternatives=refined, rarer=RARER),
     )
     before = fit(problem, (), data.launches)
     if before.point.lost:
         raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
     return explain(
-        Search(problem, hypotheses, largest_number, unnamed=False, by_evidence=True), before
+        Search(problem, hypotheses, largest_number, unnamed=False, by_marginal_likelihood=True),
+        before,
     )
 
 
@@ -236,7 +237,7 @@ def _settled(found: Explanation) -> Fit:
 
 def _spread(turn: RingTunes, best: Fit, tunes: Array, found: Explanation) -> Array:
     """Standard error of the tunes [2] about the best ones, over all explanations refined last."""
-    others = [rival.fit for named in found.named for rival in named.rivals[1:]]
+    others = [rival.fit for named in found.named for rival in named.alternatives[1:]]
     total, weights = np.zeros((2, 2)), 0.0
     for one in [best, *others, *(rival.fit for rival in found.beyond)]:
         weight = float(np.exp(one.log_evidence - best.log_evidence))

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from tmlattice.beam.shifts import Shifts
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.few import few_causes, in_coordinates, warn_of_launches
+from tmlattice.fitting.few import in_coordinates, sparse_fit, warn_of_launches
 from tmlattice.fitting.launches import FreeLaunches, launch_slopes
 from tmlattice.inference.dual import MostProbable, best_of, most_probable, posterior_base
 from tmlattice.inference.priors import Student
@@ -165,7 +165,7 @@ def fit_map(
     monitors, dimension = space.network.monitors, space.network.dimension
     data = first_turn(monitors, measurement, noise, launch_sigma, dimension)
     tails = prior is Prior.FAULTS
-    few = few_causes(ring, data, kinds, dimension) if tails and ring is not None else None
+    few = sparse_fit(ring, data, kinds, dimension) if tails and ring is not None else None
     if few is not None and ring is not None:
         warn_of_launches(ring, data, dimension, few)
     problem = _readings(space, data, measurement.states(dimension), few)
@@ -189,7 +189,7 @@ def fit_map(
         loss=[c * float(np.mean(problem.sigma**2)) / data.shots for c in found.chi2],
         penalty=[0.0] * len(found.chi2),
         best_epoch=len(found.chi2) - 1,
-        stopped_early=found.settled,
+        stopped_early=found.converged,
         seconds=time.perf_counter() - begun,
         options={
             "method": "map",

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from tmlattice.by_name import by_name
 from tmlattice.errors import unknown_choice
 from tmlattice.fitting.adam import FitResult, fit_adam
-from tmlattice.fitting.few import EFFECTS, few_causes, fit_sparse, warn_of_launches
+from tmlattice.fitting.few import EFFECTS, fit_sparse, sparse_fit, warn_of_launches
 from tmlattice.fitting.many import fit_map
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
@@ -86,7 +86,7 @@ def _check_launches(
     if not any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
         return
     data = first_turn(network.monitors, measurement, None, sigma, n)
-    warn_of_launches(ring, data, n, few_causes(ring, data, dimension=n))
+    warn_of_launches(ring, data, n, sparse_fit(ring, data, dimension=n))
 
 
 def _judged(result: FitResult, measurement: Measurement) -> FitResult:

@@ -1,8 +1,8 @@
 """What a measured response says of how it was made and written down, beside the design's.
 
-A wrong sign, unit or order everywhere is the data doctor's to find (`diagnosis.doctor`). Here each
-corrector and each monitor is set beside the design's own, and it is asked whether the RF frequency
-stood still or the momentum did. Nothing is mended.
+The data checks (`diagnosis.data_checks`) find a wrong sign, unit or order everywhere. Here each
+corrector and each BPM is compared with the design's, and the data decide whether the RF frequency
+or the momentum was constant. Nothing is corrected.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.diagnosis.doctor import check_data
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import UnstableRingError
 from tmlattice.importers.imported import Array, counted
 from tmlattice.lattice import Ring
@@ -67,7 +67,7 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
         measured: the response.
     """
     try:
-        told = [check.sentence for check in check_data(ring, measured).told]
+        told = [check.sentence for check in check_data(ring, measured).reported]
         model, flat = ResponseModel(ring), ResponseModel(ring, dimension=4)
     except UnstableRingError as error:
         return [], [f"the lattice has no closed orbit to compare with ({error})"]

@@ -3,7 +3,7 @@
 >>> assume(measurement, ["x-reversed", "launches-in-mm"])
 
 Each assumption is a wrong sign, unit, order or name that the data may have everywhere, and what
-undoes it. The data doctor tries them all; a user goes on with those that he has confirmed.
+undoes it. The data checks try them all; a user goes on with those that he has confirmed.
 """
 
 from collections.abc import Callable, Iterable, Sequence

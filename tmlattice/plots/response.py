@@ -23,7 +23,7 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
     plot_steps(result, ax)
-    yield "steps", "The gap on held-out readings, step by step.", figure
+    yield "steps", "The gap on held-out readings, before and after.", figure
     if any(cause.effect == "quadrupole_gradient" for cause in result.causes):
         yield (
             "gradients",

@@ -1,11 +1,11 @@
-"""What only a dense fit has to say: its steps, its errors, what may be missing."""
+"""What only a hierarchical fit reports: held-out figures, errors, what may be missing."""
 
 from collections.abc import Iterable
 
 import numpy as np
 
-from tmlattice.diagnosis.response.dense import Step
-from tmlattice.diagnosis.response.reasons import Reason
+from tmlattice.diagnosis.response.common_factors import Reason
+from tmlattice.diagnosis.response.hierarchical import Step
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import numbers
@@ -134,9 +134,9 @@ SURE = 0.95
 REASON = ("what shares an error", "gradients", "magnets", "chi2", "which would be made by")
 
 
-def reason_rows(result: Diagnosis) -> list[tuple[str, ...]]:
+def common_factor_rows(result: Diagnosis) -> list[tuple[str, ...]]:
     """The few numbers behind the gradients: name, amount in %, magnets, chi-square, makes."""
-    found = () if result.reasons is None else result.reasons.reasons
+    found = () if result.common_factors is None else result.common_factors.common_factors
     return [
         (
             own.name + _doubted(own),
@@ -157,9 +157,9 @@ def _doubted(own: Reason) -> str:
     return "" if own.probability > SURE else f" (likely to {100 * own.probability:.0f} %)"
 
 
-def reasons_sentence(result: Diagnosis) -> str:
+def common_factors_sentence(result: Diagnosis) -> str:
     """How much they hold, and what is left; empty where no gradients were fitted."""
-    own = result.reasons
+    own = result.common_factors
     if own is None:
         return ""
     families = (
@@ -168,7 +168,7 @@ def reasons_sentence(result: Diagnosis) -> str:
         if own.between
         else ""
     )
-    if not own.reasons:
+    if not own.common_factors:
         return (
             "Nothing stands out that magnets share; their gradients scatter by "
             f"{100 * own.scatter:.2g} % (rms).{families}"
@@ -184,10 +184,10 @@ INSTEAD = "The same gradients may be told otherwise:"
 
 def instead_texts(result: Diagnosis) -> list[str]:
     """Other sets of reasons for the same gradients: what is otherwise in them."""
-    found = result.reasons
+    found = result.common_factors
     if found is None:
         return []
-    first = {own.name: own.amount for own in found.reasons}
+    first = {own.name: own.amount for own in found.common_factors}
     said = []
     for one in found.instead:
         other = [
@@ -206,7 +206,7 @@ def instead_texts(result: Diagnosis) -> list[str]:
 def outlier_texts(result: Diagnosis) -> list[str]:
     """Magnets that no sound magnet is like, with the neighbours that they pull against."""
     said = []
-    for own in () if result.reasons is None else result.reasons.outliers[:SHOWN]:
+    for own in () if result.common_factors is None else result.common_factors.outliers[:SHOWN]:
         text = f"{own.element} {100 * own.amount:+.1f} ± {100 * own.amount_sigma:.1f} %"
         pulls = ", ".join(
             f"{name} ({100 * amount:+.1f} %, correlation {correlation:+.2f})"
@@ -258,15 +258,15 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
     lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
     if result.rejected_steps:
-        lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
+        lines += ["", "Closed, for held-out readings are worse with them, or no beam has so much:"]
         lines += columns([HEAD, *step_rows(result.rejected_steps)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
-    if result.reasons is not None:
+    if result.common_factors is not None:
         lines += ["", "Few reasons behind the gradients:"]
-        for name, amount, count, square, makes in reason_rows(result):
+        for name, amount, count, square, makes in common_factor_rows(result):
             head = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
             lines += wrapped(head, "   ", width)
-        lines += wrapped(reasons_sentence(result), "", width)
+        lines += wrapped(common_factors_sentence(result), "", width)
         instead = instead_texts(result)
         if instead:
             lines += ["", INSTEAD]

@@ -41,7 +41,7 @@ class Table:
 
 
 def error_tables(diagnosis: Diagnosis) -> list[Table]:
-    """Magnets, monitors, correctors and the beam of a dense fit, value and error of each effect."""
+    """Magnets, monitors, correctors and the beam of a hierarchical fit, value and error of each."""
     grouped: dict[str, list[Supported]] = {}
     for row in diagnosis.supported:
         title = TITLES.get(find(row[0].effect).group, "Magnets")

@@ -12,7 +12,7 @@ from tmlattice.diagnosis.assessment import chance_text
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.effects import CATALOGUE, find
-from tmlattice.inference.judge import Misfit
+from tmlattice.inference.validation import Misfit
 from tmlattice.report.action_texts import (
     action_text,
     consequence_text,
@@ -292,7 +292,7 @@ def gap_head(diagnosis: Diagnosis) -> tuple[str, str, str]:
     model, gap = diagnosis.ring.model, diagnosis.heldout
     if diagnosis.since_reference:
         model = "reference"
-    elif gap is not None and gap.since:
+    elif gap is not None and gap.baseline:
         model = f"{model} with small errors" if diagnosis.priors else "before"
     return "readings less model, rms", model, "with what was found"
 
@@ -306,7 +306,7 @@ def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     gap = diagnosis.heldout
     if gap is not None:
         rows.append(
-            (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.since], gap.misfits[-1])
+            (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.baseline], gap.misfits[-1])
         )
     return [
         (name, *(_misfit_text(m) for m in (before, after)))  # type: ignore[misc]

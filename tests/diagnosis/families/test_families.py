@@ -68,7 +68,7 @@ def test_causes_that_are_told_read_as_the_errors_that_were_fitted(data, rng, fam
     causes = [
         cause
         for one, own in values.items()
-        for cause, _ in one.told(errors, own, np.ones_like(own), data)
+        for cause, _ in one.causes_of(errors, own, np.ones_like(own), data)
     ]
     fitted = Predicted(data, errors).read
     told = Predicted(data, Errors.none(data).with_causes(data, causes)).read
@@ -163,7 +163,7 @@ def test_a_corrector_that_kicks_across_is_turned(data, own):
     for family, numbers in values.items():
         errors = family.put(errors, numbers, data)
     (kick, roll) = (
-        family.told(errors, numbers, np.full(18, 0.01), data)[4]
+        family.causes_of(errors, numbers, np.full(18, 0.01), data)[4]
         for family, numbers in values.items()
     )
     size = np.hypot(own, 0.8)

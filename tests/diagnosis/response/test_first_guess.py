@@ -1,21 +1,22 @@
-"""A dense fit of a design that is far from the ring that was measured, or stores no beam at all."""
+"""A fit of a design that is far from the ring that was measured, or stores no beam at all."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.doctor import check_data
-from tmlattice.diagnosis.families.steps import STEPS, CorrectorCalibration, Trial
-from tmlattice.diagnosis.response import dense, first_guess
-from tmlattice.diagnosis.response.dense import fit_steps, one_by_one
-from tmlattice.diagnosis.response.judges import score
-from tmlattice.diagnosis.response.state import begin, bend
+from tmlattice.diagnosis.data_checks import check_data
+from tmlattice.diagnosis.families.steps import FAMILIES, CorrectorCalibration
+from tmlattice.diagnosis.response import first_guess, hierarchical
+from tmlattice.diagnosis.response.hierarchical import fit_families
+from tmlattice.diagnosis.response.rounds import settle
+from tmlattice.diagnosis.response.state import allow, begin, bend, jump
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_errors import ANOTHER, ResponseJudge
+from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors
 from tmlattice.observe.split import split_columns
 
 NOISE = 2e-8
@@ -46,7 +47,7 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
     (values,) = first_guess.first_guess(design).values.values()
     own = [e.k1 > 0 for e in small_ring.elements if e.kind == "quadrupole"]
     assert (values[own] < 0).all()  # of several that resemble the readings the best one
-    fit = fit_steps(design.data, design.split, STEPS[:3])
+    fit = fit_families(design.data, design.split, FAMILIES[:4])
     assert fit.steps[0].heldout_rms_in_plane > 20 * NOISE
     assert fit.steps[-1].heldout_rms_in_plane < 1.5 * NOISE
     gradients = fit.state.values["gradient"]
@@ -57,12 +58,12 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
 def test_a_far_lattice_is_no_wrong_sign_and_no_other_ring(small_ring):
     """ALS with 3 % on its largest family: y was said to be reversed, or the ring to be another."""
     data = measured(small_ring, 0.02, 0.06)
-    assert ResponseJudge(small_ring, data).misfit(()).max() > ANOTHER
-    (check,) = check_data(small_ring, data).told
+    assert ResponseGlobalErrors(small_ring, data).misfit(()).max() > ANOTHER
+    (check,) = check_data(small_ring, data).reported
     assert check.status == "note"
     assert "is far from the ring that was measured" in check.sentence
     reversed_ones = dataclasses.replace(data, response=-data.response)
-    assert any(check.status == "wrong" for check in check_data(small_ring, reversed_ones).told)
+    assert any(check.status == "wrong" for check in check_data(small_ring, reversed_ones).reported)
 
 
 def in_mm(data):
@@ -83,7 +84,7 @@ def rf_in_mm(data):
 )
 def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
     """With kicks of their own every unit resembles the readings; the note alone was said."""
-    error, far = check_data(small_ring, change(measured(small_ring, 0.02, 0.06))).told
+    error, far = check_data(small_ring, change(measured(small_ring, 0.02, 0.06))).reported
     assert "is far from the ring that was measured" in far.sentence
     assert error.status == "wrong"
     assert said in error.sentence
@@ -92,10 +93,10 @@ def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
 def test_magnets_of_no_family_begin_there_too(small_ring):
     """Families alone had led single magnets back to nothing, and every round astray."""
     design = begun(small_ring, measured(small_ring, -0.03))
-    alone = Trial((CorrectorCalibration(),), 3, 0)
+    alone = CorrectorCalibration()
     assert first_guess.begun(design, [alone]) is design
-    near = first_guess.begun(design, [alone, STEPS[2]])
-    (_, state), *_ = one_by_one(near, [alone])
+    near = first_guess.begun(design, [alone, FAMILIES[3]])
+    state = settle(jump(allow(near, [alone])), alike=True)
     assert state.values["gradient"].any()
     assert score(state, state.split.held).in_plane < 2 * NOISE
 
@@ -109,18 +110,18 @@ def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
     design = begun(small_ring, measured(small_ring, 0.0))
     astray = [Cause("quadrupole_gradient", e.name, 0.02) for e in small_ring.elements
               if e.kind == "quadrupole"]  # fmt: skip
-    settled = dense.robust
 
-    def spoilt(state):
-        state = settled(state)
-        at = state.at.with_causes(astray)
-        return dense.replace(state, at=at, values={k: 0 * v for k, v in state.values.items()})
+    def spoilt(state, *args, **options):
+        return (
+            state
+            if state.exploring
+            else dataclasses.replace(state, at=state.at.with_causes(astray))
+        )
 
-    monkeypatch.setattr(dense, "robust", spoilt)
-    monkeypatch.setattr(dense, "settle", lambda state, *args, **options: state)
-    fit = fit_steps(design.data, design.split, STEPS[:1])
+    monkeypatch.setattr(hierarchical, "settle", spoilt)
+    fit = fit_families(design.data, design.split, FAMILIES[:1])
     assert len(fit.steps) == 1
-    assert "more of the readings that it was fitted to" in fit.said[-1]
+    assert "more of the readings that it was fitted to" in fit.messages[-1]
     assert fit.heldout[0] == fit.heldout[1]
 
 

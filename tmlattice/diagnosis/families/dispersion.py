@@ -19,7 +19,7 @@ from tmlattice.beam.kicks import (
     energy_of_way,
     kicking,
 )
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -121,7 +121,9 @@ class _Kicks(Family):
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Nothing: other kicks make the same dispersion."""
         return []
 
@@ -147,7 +149,7 @@ class VerticalKicks(_Kicks):
 
 
 def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
-    """A sentence for each plane in which the RF's orbit has something that no gradient makes.
+    """A sentence for each plane in which the RF's orbit has more than noise that no gradient makes.
 
     Args:
         values: that were found, by variable.
@@ -155,8 +157,8 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
     """
     for family, gradient in ((HorizontalKicks(), "gradient"), (VerticalKicks(), "skew gradient")):
         own = values.get(family.variable, np.zeros(0))
-        if own.any():
-            size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2))
+        size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2)) if own.any() else 0.0
+        if size > np.median(data.noise[:, family.plane]):
             yield (
                 f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} no {gradient} "
                 "makes: kicks of the closed orbit do (errors of bends, displaced quadrupoles, "
@@ -164,19 +166,19 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
             )
 
 
-def kicks_astray(at: Predicted) -> Array | None:
+def fitted_orbit_kicks(at: Predicted) -> Array | None:
     """What makes the dispersion that the errors have beside the ring's, as kicks behind each magnet
     in x and y, rad, [magnet, 2]: see `ResponseModel`. In the ring with its errors, in which other
     kicks make it than in the design. None where there is no such dispersion.
     """
-    ring, astray = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
+    ring, orbit_kicks = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
     beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
     for plane in (0, 1):
         if beside[:, plane].any():
             patterns = patterns_of_kicks(at, plane)
             amounts = np.linalg.lstsq(patterns.rf.T, beside[:, plane], rcond=None)[0]
-            astray[kicking(ring, plane), plane] = amounts @ patterns.kicks
-    return astray if astray.any() else None
+            orbit_kicks[kicking(ring, plane), plane] = amounts @ patterns.kicks
+    return orbit_kicks if orbit_kicks.any() else None
 
 
 def dispersion_beside(

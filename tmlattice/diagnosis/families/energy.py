@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.effects import Cause, expected_spread, find
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted
@@ -57,7 +57,9 @@ class EnergyOffset(_OfBeam):
         """As it stands."""
         return replace(errors, energy=float(values[0]))
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """As it stands."""
         return [(Cause(self.name, None, float(values[0])), float(sigma[0]))]
 
@@ -101,7 +103,9 @@ class EnergySpread(_OfBeam):
         """As it stands."""
         return replace(errors, spread=float(values[0]))
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """The relative rms; nothing where it is zero."""
         if not values[0] > 0:
             return []

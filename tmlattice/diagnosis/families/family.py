@@ -12,7 +12,7 @@ from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
-Told = tuple[Cause, float]
+StatedCause = tuple[Cause, float]
 """A cause and the posterior rms of its amount."""
 
 TAILS = 4.0
@@ -69,7 +69,9 @@ class Family(ABC):
         """Errors with these, instead of none."""
 
     @abstractmethod
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """As causes, with errors."""
 
     @abstractmethod

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import TAILS, Family, Told
+from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.ways import between, straights
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
@@ -69,7 +69,9 @@ class _Magnets(Family):
         )
         return replace(errors, ring=(*errors.ring, *causes))
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Of every piece."""
         return [
             (Cause(self.effect, place, share * float(value)), abs(share) * float(error))

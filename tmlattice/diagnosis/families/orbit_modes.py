@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import orbits_of_kicks
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Ring
@@ -74,7 +74,9 @@ class _Orbit(Family):
         causes = [Cause(self.effect, *one) for one in zip(self.places, amounts, strict=True)]
         return replace(errors, ring=(*errors.ring, *(c for c in causes if c.amount)))
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Nothing: other kicks make the same orbit."""
         return []
 

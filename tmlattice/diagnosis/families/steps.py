@@ -2,20 +2,20 @@
 
 To add one, write a class with its places, prior, rows, how its values are put among the errors and
 how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`, of the
-beam's energies in `energy`); and name it in `STEPS`, which says when it is tried.
+beam's energies in `energy`); and name it in `FAMILIES`.
 
 Families that move the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
 from tmlattice.diagnosis.families.energy import EnergyOffset, EnergySpread
-from tmlattice.diagnosis.families.family import TAILS, Family, Told
+from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.fields import (
     BendGradient,
     CorrectorPosition,
@@ -67,7 +67,9 @@ class MonitorGain(_Monitors):
         monitors[:, [0, 1], [0, 1]] = 1 + values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """All of x, then all of y."""
         names, gain = data.measured.monitors, Monitors.of(errors.monitors).gain
         return [
@@ -101,7 +103,9 @@ class MonitorRoll(_Monitors):
         monitors[:, [0, 1], [1, 0]] = values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Of small ones x reads (coupling + roll) y, y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
         own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
@@ -142,7 +146,7 @@ class _Columns(Family):
         ]
         return [*own, {}]
 
-    def _told(self, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def _causes_of(self, values: Array, sigma: Array, data: ResponseData) -> list[StatedCause]:
         names = data.measured.correctors
         return [
             (Cause(self.name, name, float(v)), float(s))
@@ -174,9 +178,11 @@ class CorrectorCalibration(_Columns):
         """As it stands."""
         return replace(errors, calibration=values)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """Of the whole kick, of which a rolled corrector has a part in the other plane."""
-        return self._told(errors.kick - 1, sigma, data)
+        return self._causes_of(errors.kick - 1, sigma, data)
 
 
 class CorrectorRoll(_Columns):
@@ -197,51 +203,28 @@ class CorrectorRoll(_Columns):
         """The kick in the other plane, as a share of what the corrector is told."""
         return replace(errors, roll=values)
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """The angle of its kick to its plane: a right one where it has none in that."""
-        return self._told(errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data)
+        return self._causes_of(
+            errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data
+        )
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Families that are tried together.
+FAMILIES: tuple[Family, ...] = (
+    CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), BendGradient(),
+    VerticalFocusing(), EdgeFocusing(), CorrectorPosition(), EnergySpread(), MonitorRoll(),
+    CorrectorRoll(), SkewGradient(), HorizontalKicks(), EnergyOffset(), VerticalKicks(),
+)  # fmt: skip
+"""What a ring may have wrong. All of them are open from the start, but for those of `SECOND`."""
 
-    Attributes:
-        families: the first one's block says who judges.
-        own, across: rounds in-plane, and before them rounds of the other plane.
-    """
+SECOND = ("energy_offset", "energy_spread", "horizontal kicks", "vertical kicks")
+"""Names of families of second order, or of one orbit: they are opened once the others have settled,
+for far from the ring they make up for what is not their own."""
 
-    families: tuple[Family, ...]
-    own: int
-    across: int
-
-
-STEPS = (
-    Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
-    Trial((MonitorGain(),), 2, 0),
-    Trial((QuadrupoleGradient(),), 4, 0),
-    Trial((BendGradient(),), 2, 0),
-    Trial((VerticalFocusing(),), 2, 0),
-    Trial((EdgeFocusing(),), 2, 0),
-    Trial((CorrectorPosition(),), 2, 0),
-    Trial((EnergySpread(),), 2, 0),
-    Trial((MonitorRoll(),), 0, 1),
-    Trial((CorrectorRoll(),), 0, 1),
-    Trial((SkewGradient(),), 2, 2),
-    Trial((HorizontalKicks(),), 2, 0),
-    Trial((EnergyOffset(),), 2, 0),
-    Trial((VerticalKicks(),), 0, 2),
-)
-"""What is tried, one after another. Skew gradients move the tunes to second order, which the
-gradients then take back. A beam off its energy has another dispersion: it comes in once that has
-what else may be wrong with it."""
-
-CHANGES = (
-    Trial((CorrectorCalibration(),), 3, 0),
-    Trial((MonitorGain(),), 2, 0),
-    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()), 4, 0),
-    Trial((MonitorRoll(),), 0, 1),
-    Trial((CorrectorRoll(),), 0, 1),
-    Trial((SkewGradient(),), 2, 2),
-)
+CHANGES: tuple[Family, ...] = (
+    CorrectorCalibration(), MonitorGain(), FamilyGradient(), QuadrupoleGradient(), OtherGradient(),
+    FocusingChange(), MonitorRoll(), CorrectorRoll(), SkewGradient(),
+)  # fmt: skip
 """What may have changed between two measurements of one ring."""

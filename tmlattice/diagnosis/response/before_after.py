@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.doctor import consulted, mended
-from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, kicks_astray
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks
+from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
 from tmlattice.diagnosis.families.energy import EnergyOffset
-from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
+from tmlattice.diagnosis.families.steps import CHANGES, FAMILIES
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,
@@ -35,18 +35,18 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.dense import DenseFit, Step, fit_steps, one_by_one
+from tmlattice.diagnosis.response.changed_supplies import MOST, REPRODUCED, changed_supplies
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
-from tmlattice.diagnosis.response.exchanged_since import all_right, since
-from tmlattice.diagnosis.response.few import Few, few_causes, knows_more
-from tmlattice.diagnosis.response.judges import score
-from tmlattice.diagnosis.response.left_open import LeftOpen, and_orbits, left_open
+from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, Step, fit_families
+from tmlattice.diagnosis.response.label_findings import label_findings
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
+from tmlattice.diagnosis.response.procedure import as_diagnosis, families_of, provenance
 from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.state import State, begin, bend, jump
-from tmlattice.diagnosis.response.unnamed import unnamed
-from tmlattice.diagnosis.response.what_changed import MOST, REPRODUCED, what_changed
+from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
+from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
+from tmlattice.diagnosis.response.swaps_since import all_right, since
+from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import FREE
 from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
@@ -109,32 +109,32 @@ def diagnose_change(
         UnstableRingError: no closed orbit.
     """
     started = time.perf_counter()
-    trials = trials_of(effects, CHANGES)
-    before, after = (mended(ring, one, assume) for one in (before, after))
-    said = consulted(ring, after, reference=before)
+    families = families_of(effects, CHANGES)
+    before, after = (corrected_data(ring, one, assume) for one in (before, after))
+    said = data_checks(ring, after, reference=before)
     said += _lost(before, after)
     before, after = alike(ring, before, after)
     first, second = response_data(ring, before), response_data(ring, after)
     said += assumed_of(after, second)
     same = _same(first, second)
     if same:
-        trials = []
+        families = []
         said.append("the two measurements are the same, to the last digit")
-    before, first, exchanged_before = all_right(partial(response_data, ring), before, holdout)
+    before, first, swaps_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    steps = () if same else STEPS
-    fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
-    astray = kicks_astray(fitted.at)
+    open_families = () if same else FAMILIES
+    fitted, more = _reference(first, split_columns(first, holdout, rng), open_families, progress)
+    orbit_kicks = fitted_orbit_kicks(fitted.at)
     said += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
     first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
 
     def change(measured: OrbitResponse) -> ResponseData:
-        return response_change(first, errors, response_data(ring, measured), astray)
+        return response_change(first, errors, response_data(ring, measured), orbit_kicks)
 
-    _, data, exchanged_after = all_right(change, second.measured, holdout)
+    _, data, swaps_after = all_right(change, second.measured, holdout)
     there = data.ring
-    pairs = unnamed(there, since(exchanged_before, exchanged_after, said), other="did")
+    pairs = label_findings(there, since(swaps_before, swaps_after, said), other="did")
     split = split_columns(data, holdout, rng)
     judgement = Judgement(false_alarm=false_alarm)
     options = {
@@ -142,29 +142,29 @@ def diagnose_change(
         "effects": None if effects is None else list(effects), "max_effects": max_effects,
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
-    open_ = left_open(fitted)
-    fit = _few_or_all(data, split, trials, effects, judgement, seed, progress, open_)
-    if isinstance(fit, Few):
-        causes = tuple(cause for cause, _ in fit.told)
+    open_ = undetermined(fitted)
+    fit = _sparse_or_all(data, split, families, effects, judgement, seed, progress, open_)
+    if isinstance(fit, SparseFit):
+        causes = tuple(cause for cause, _ in fit.fitted_causes)
         sought = [own for own in fit.findings if not is_drift(cause_of(own))]
         found = strongest_first([*sought[:max_effects], *pairs])
         return as_diagnosis(
-            there, fit.fit, fit.fit.state.at.errors.ring, fit.told,
+            there, fit.fit, fit.fit.state.at.errors.ring, fit.fitted_causes,
             verdict=least_certain(found, fit.verdict),
             findings=with_consequences(there, found, causes),
-            warnings=(*said, *fit.said),
+            warnings=(*said, *fit.messages),
             noise_estimated=False,
             provenance=provenance(ring, options, seed, started),
         )  # fmt: skip
     progress("what changed")
     whole = settle(_all_columns(fit.state))
-    changed, scatter = what_changed(whole, judgement, open_)
+    changed, scatter = changed_supplies(whole, judgement, open_)
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
     causes = tuple(cause_of(own) for own in named)
     known = [own.amount_sigma or 0.0 for own in named]
-    told: list[Told] = list(zip(causes, known, strict=True))
+    told: list[StatedCause] = list(zip(causes, known, strict=True))
     found = strongest_first([*named, *pairs])
     have = {(cause.effect, cause.element) for cause in causes}
     supports = [FREE] * len(told)
@@ -176,7 +176,7 @@ def diagnose_change(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
         verdict=least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
-        warnings=(*said, *_said(data, fit, whole, scatter)),
+        warnings=(*said, *_messages(data, fit, whole, scatter)),
         supports=tuple(supports),
         noise_estimated=True,
         provenance=provenance(ring, options, seed, started),
@@ -203,7 +203,7 @@ def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
 
 
 # --- the fits -------------------------------------------------------------------------------------
-def _judged_by_nobody(split: Split) -> Split:
+def _not_validated(split: Split) -> Split:
     """All correctors are fitted, and all of the RF's orbit."""
     nobody, half = np.zeros_like(split.held), split.half.copy()
     half[-1] = True
@@ -218,16 +218,16 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 
 
 def _reference(
-    data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
+    data: ResponseData, split: Split, families: Sequence[Family], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
     """What a lattice can have wrong, as one measurement has it, then fitted to all of the first.
     The design where that goes astray. And what is to be said of it."""
-    nothing = replace(begin(data, _judged_by_nobody(split)), exploring=False)
-    if not steps:
+    nothing = replace(begin(data, _not_validated(split)), exploring=False)
+    if not families:
         return nothing, []
     try:
-        fit = fit_steps(data, split, steps, len(steps), progress)
-        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.said)
+        fit = fit_families(data, split, families, progress)
+        return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.messages)
     except (TmlatticeError, np.linalg.LinAlgError):
         return nothing, ["it could not be fitted, and the change is one of the design"]
 
@@ -262,25 +262,22 @@ def _by_good_monitors(
 
 
 def _fit_change(
-    data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
-) -> DenseFit:
+    data: ResponseData, split: Split, families: Sequence[Family], progress: Callable[[str], Any]
+) -> HierarchicalFit:
     """All that may have changed, with the noise that the two measurements have."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
     before = score(design, split.held)
     steps = [Step.scored("reference", 0, before)]
-    state = design
-    for trial, settled in one_by_one(design, trials, progress):
-        state = settled
-        count = sum(family.count(data) for family in trial.families)
-        title = ", ".join(family.title for family in trial.families)
-        steps.append(Step.scored(title, count, score(state, split.held)))
-    state = settle(bend(jump(state)))
-    state = settle(_learnt_noise(state))
+    there = [f for f in families if design.reads(f.block) and f.size(data) and f.count(data)]
+    progress("all families")
+    state = settle(bend(jump(allow(design, there))), alike=True)
+    state = settle(_learnt_noise(settle(bend(jump(state)))))
     after = score(state, split.held)
-    if len(steps) > 1:
-        steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
+    if there:
+        count = sum(family.count(data) for family in there)
+        steps.append(Step.scored("all families", count, after))
     design = _with_noise(design, state.data.noise)
-    return DenseFit(design, state, tuple(steps), (), (score(design, split.held), after))
+    return HierarchicalFit(design, state, tuple(steps), (), (score(design, split.held), after))
 
 
 def _learnt_noise(state: State) -> State:
@@ -305,31 +302,31 @@ def _with_noise(state: State, noise: Array) -> State:
 
 def _all_columns(state: State) -> State:
     """To be fitted to the held-out correctors too."""
-    return replace(state, split=_judged_by_nobody(state.split))
+    return replace(state, split=_not_validated(state.split))
 
 
 # --- what is told ---------------------------------------------------------------------------------
-def _few_or_all(
+def _sparse_or_all(
     data: ResponseData,
     split: Split,
-    trials: Sequence[Trial],
+    families: Sequence[Family],
     effects: Sequence[str] | None,
     judgement: Judgement,
     seed: int,
     progress: Callable[[str], Any],
-    open_: LeftOpen,
-) -> Few | DenseFit:
+    open_: Undetermined,
+) -> SparseFit | HierarchicalFit:
     """The few causes that explain a change, or the fit of everything that may have changed."""
     asked = changes() if effects is None else effects
-    few = few_causes(
+    sparse = sparse_fit(
         data, split, asked, MOST, judgement, seed, progress, and_orbits(data.ring, open_)
     )
-    if few is not None and all(is_drift(cause) for cause, _ in few.told):
-        few = None
-    if few is not None and few.noise:
-        return few
-    fit = _fit_change(data, split, trials, progress)
-    return fit if few is None or knows_more(fit, few.fit) else few
+    if sparse is not None and all(is_drift(cause) for cause, _ in sparse.fitted_causes):
+        sparse = None
+    if sparse is not None and sparse.noise:
+        return sparse
+    fit = _fit_change(data, split, families, progress)
+    return fit if sparse is None or outperforms(fit, sparse.fit) else sparse
 
 
 def _verdict(state: State) -> str:
@@ -337,8 +334,8 @@ def _verdict(state: State) -> str:
     return "distributed" if group is not None and group.rms > EVERYWHERE else "none"
 
 
-def _said(
-    data: ResponseData, fit: DenseFit, state: State, scatter: Mapping[str, float]
+def _messages(
+    data: ResponseData, fit: HierarchicalFit, state: State, scatter: Mapping[str, float]
 ) -> list[str]:
     """How well two measurements agree, and by how much magnets, and supplies, scatter."""
     left = data.pick(state.at.left)[:-1][:, state.good]

@@ -5,29 +5,29 @@ Everybody drifts a little; who changed far more than the others is a finding.
 
 import numpy as np
 
-from tmlattice.diagnosis.families.family import Told
+from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.steps import CHANGES
 from tmlattice.diagnosis.findings import finding_of
+from tmlattice.diagnosis.response.fitted_causes import with_support
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import unwidened
-from tmlattice.diagnosis.response.told import with_support
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.support import Support
 from tmlattice.effects import Cause
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
-from tmlattice.inference.rivals import Detection
 
 DRIFT, OUTSTANDING = 0.03, 8.0
 """A monitor or a corrector is told where it changed by more than this, and by so many times as much
 as others do."""
 
 
-def drifts(state: State) -> list[tuple[Told, Support]]:
+def drifts(state: State) -> list[tuple[StatedCause, Support]]:
     """Changes of BPMs and correctors since the reference, with errors, and how much of each comes
     from the data."""
-    found: list[tuple[Told, Support]] = []
+    found: list[tuple[StatedCause, Support]] = []
     for block in (0, 1):
         own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
         if not own:
@@ -40,10 +40,10 @@ def drifts(state: State) -> list[tuple[Told, Support]]:
 
 def outstanding(state: State, judgement: Judgement) -> list[Finding]:
     """Monitors and correctors whose change is another thing than everybody's drift."""
-    told = [row for row, _ in drifts(state)]
+    changes = [row for row, _ in drifts(state)]
     found = []
-    for effect in dict.fromkeys(cause.effect for cause, _ in told):
-        rows = [row for row in told if row[0].effect == effect]
+    for effect in dict.fromkeys(cause.effect for cause, _ in changes):
+        rows = [row for row in changes if row[0].effect == effect]
         usual = float(np.median([abs(cause.amount) for cause, _ in rows])) / 0.6745
         for cause, sigma in rows:
             size = abs(cause.amount)
@@ -60,6 +60,5 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
 def is_drift(cause: Cause) -> bool:
     """Whether it is no more than what monitors and correctors do from day to day: everybody may
     have it, and the largest of them is no finding."""
-    of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
-               for name in family.effects}  # fmt: skip
+    of_each = {name for family in CHANGES if family.per != "ring" for name in family.effects}
     return cause.effect in of_each and abs(cause.amount) <= DRIFT

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
 from tmlattice.errors import UnstableRingError
 from tmlattice.lattice.supplies import magnets
@@ -36,16 +36,16 @@ STEPS = np.arange(-3, 4) * 0.01
 """Relative changes that are tried."""
 
 
-def begun(design: State, trials: Sequence[Trial]) -> State:
+def begun(design: State, families: Sequence[Family]) -> State:
     """The design, or the ring that resembles the readings more, with each quadrupole's gradient a
     number of its own from the first: one of no family would else go back to nothing.
 
     Args:
         design: with no families yet.
-        trials: that will be fitted; without quadrupoles' gradients it is the design.
+        families: that will be fitted; without quadrupoles' gradients it is the design.
     """
     family = QuadrupoleGradient()
-    if not any(own.name == family.name for trial in trials for own in trial.families):
+    if not any(own.name == family.name for own in families):
         return design
     guess = first_guess(design)
     return design if guess is None else allow(replace(design, values=guess.values), [family])

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.rf_by_others import rf_fitted
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.normal import Normal, solve
@@ -59,8 +59,7 @@ class Inconsistency:
 
     Attributes:
         missed: by how much gradients by the correctors alone miss the RF's orbit, rms, m.
-        known: by how much they would, rms, m: by their errors and the readings', as many of which
-            the fit takes for independent.
+        known: by how much they would, rms, m: by their errors and the readings'.
         chi2, readings: of the RF's orbit, with the errors of that prediction.
         pulls: gradients that stand out, the strongest first: of families, of magnets.
     """
@@ -85,7 +84,7 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
         false_alarm: chance that two are said to disagree that do not.
     """
     single = QuadrupoleGradient()
-    read, weights, left = rf_fitted(state)
+    read, weights, left = _rf_fitted(state)
     if single.variable not in state.values or not read.size:
         return None
     there, column = linear(state, 0), len(state.data.plane) - 1
@@ -107,17 +106,30 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
     kinds, members = supplied_alike(state.data.ring)
     mean = np.vstack([(members / members.sum(axis=0)).T, np.eye(len(own))])
     names = [*kinds, *(pieces[0].name for pieces in own)]
-    at, said = there.where[single.variable], []
+    at, answers = there.where[single.variable], []
     for found in (alone, both):
         spread = mean @ found.spread[at]
-        said.append((mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1)))
+        answers.append(
+            (mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1))
+        )
     return Inconsistency(
         float(np.sqrt(np.mean(missed**2))),
         float(np.sqrt(np.mean(np.diag(covariance)))),
         total,
         len(read),
-        _pulls(names, *said[0], *said[1], len(kinds)),
+        _pulls(names, *answers[0], *answers[1], len(kinds)),
     )
+
+
+def _rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
+    """The monitors at which the RF's orbit is fitted, the inverse covariance of these readings,
+    1/m2, and what is left of them, m."""
+    column = len(state.data.plane) - 1
+    own = weight(state, 0)[column]
+    read = np.flatnonzero(own > 0)
+    common = taken(state, 0)[column, read]
+    inverse = np.diag(own[read]) - common @ common.T
+    return read, inverse, state.data.pick(state.at.left)[column, read]
 
 
 def _pulls(

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Family, Told
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
@@ -59,7 +59,9 @@ class _Others(Family):
         own = zip(self.causes, (values * self.units).tolist(), strict=True)
         return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
 
-    def told(self, errors: Errors, values: Array, sigma: Array, data: ResponseData) -> list[Told]:
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
         """As they stand."""
         amounts, sigmas = (values * self.units).tolist(), (sigma * self.units).tolist()
         rows = zip(self.causes, amounts, sigmas, strict=True)

@@ -1,9 +1,9 @@
-"""Which errors close how much of a measured orbit response's gap, step by step, on held-out data.
+"""Which errors close how much of a measured orbit response's gap, on held-out data.
 
 A fifth of the correctors is never fitted. Of each of them only the kick is taken, from a random
 half of the monitors, and the other half judges; the RF's orbit is fitted on half of the monitors
-and judged on the other half. Which families of errors are kept is decided on other correctors, held
-out from the rest, so that the figures of the steps judge and choose nothing.
+and judged on the other half. What is closed is decided on other correctors, held out from the rest,
+so that these figures choose nothing.
 
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import combined_p_value
-from tmlattice.diagnosis.doctor import consulted, mended
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
-from tmlattice.diagnosis.families.family import Told
-from tmlattice.diagnosis.families.steps import STEPS, Trial
+from tmlattice.diagnosis.families.family import Family, StatedCause
+from tmlattice.diagnosis.families.steps import FAMILIES
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,
@@ -35,30 +35,35 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.dense import DenseFit, fit_chi2, fit_steps
-from tmlattice.diagnosis.response.displaced import Displaced, displaced
-from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
-from tmlattice.diagnosis.response.few import few_causes, knows_more
+from tmlattice.diagnosis.response.common_factors import explain_gradients
+from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
 from tmlattice.diagnosis.response.first_guess import FAR, strange
+from tmlattice.diagnosis.response.fitted_causes import fitted_causes
+from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, fit_chi2, fit_families
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
-from tmlattice.diagnosis.response.missing import weigh
-from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
-from tmlattice.diagnosis.response.odd_steps import beside
-from tmlattice.diagnosis.response.reasons import explain_gradients
+from tmlattice.diagnosis.response.label_findings import label_findings
+from tmlattice.diagnosis.response.misplaced import Misplaced, misplaced
+from tmlattice.diagnosis.response.missing_effects import weigh
+from tmlattice.diagnosis.response.outliers import messages, without, without_gross
 from tmlattice.diagnosis.response.remainder import remainder
-from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
+from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.strangers import ODD, Strangers, reversed_ones, strangers
-from tmlattice.diagnosis.response.told import told
-from tmlattice.diagnosis.response.unnamed import unnamed
+from tmlattice.diagnosis.response.swaps import (
+    Swaps,
+    labels_corrected,
+    mislabelled,
+    planes_back,
+    swapped_planes,
+)
+from tmlattice.diagnosis.response.unlike_model import RejectedChannels, reversed_ones, unlike_model
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
-from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import response_data
@@ -69,6 +74,8 @@ from tmlattice.optics import ring_tunes
 
 Array = NDArray[np.float64]
 
+FINDINGS = 14
+"""Findings at most."""
 PATTERNS = 8
 """The strongest patterns of what is left."""
 LARGE = 60_000
@@ -85,7 +92,7 @@ def diagnose_response(
     *,
     holdout: float = 0.2,
     effects: Sequence[str] | None = None,
-    max_effects: int = len(STEPS),
+    max_effects: int = FINDINGS,
     false_alarm: float = DEFAULT.false_alarm,
     missing: bool = False,
     assume: Sequence[str] = (),
@@ -100,7 +107,7 @@ def diagnose_response(
             learnt.
         holdout: share of the correctors that is never fitted.
         effects: only families of these are tried; else all.
-        max_effects: steps that are kept at most.
+        max_effects: findings at most.
         false_alarm: chance that the readings of a faultless ring are said to have an error.
         missing: weigh too which effect the result still lacks.
         assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone
@@ -115,30 +122,30 @@ def diagnose_response(
     """
     begun = time.perf_counter()
     estimated = measured.noise is None
-    measured = mended(ring, measured, assume)
-    trials, data = trials_of(effects), response_data(ring, measured)
-    said = [*consulted(ring, measured), *assumed_of(measured, data)]
+    measured = corrected_data(ring, measured, assume)
+    families, data = families_of(effects), response_data(ring, measured)
+    said = [*data_checks(ring, measured), *assumed_of(measured, data)]
     measured = replace(data.measured, noise=data.noise) if estimated else measured
     measured, gross = without_gross(measured, data)
     if gross:
         said, data = said + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
-    few = few_causes(data, split, effects, max_effects, judgement, seed, progress)
-    if few is None or overstated(ring, data.measured):  # to such a noise a few explain anything
-        whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
-        few = None if few is None or knows_more(whole[0], few.fit) else few
+    sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
+    if sparse is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+        whole = _families(ring, measured, families, holdout, seed, progress)
+        sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
-    if few is None:
-        fit, measured, odd, exchanges = whole
-        said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
-        rejected = tuple(exchanges.rejected)
-        fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, supports, degenerate, correlated = told(fit.state)
+    if sparse is None:
+        fit, measured, unlike, swaps = whole
+        said += unlike if measured.response.size <= LARGE else [*unlike, TOO_LARGE]
+        rejected = tuple(swaps.rejected)
+        fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
+        found, supports, degenerate, correlated = fitted_causes(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
-        fit, found, supports, degenerate, correlated = few.fit, few.told, (), (), ()
-        verdict, findings = few.verdict, few.findings
+        fit, found, supports, degenerate, correlated = sparse.fit, sparse.fitted_causes, (), (), ()
+        verdict, findings = sparse.verdict, sparse.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
         "holdout": holdout, "effects": None if effects is None else list(effects),
@@ -151,14 +158,17 @@ def diagnose_response(
         noise_estimated=estimated,
         verdict=verdict,
         findings=with_consequences(ring, findings, causes),
-        warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
+        warnings=(
+            *said, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
+            *_warnings(fit),
+        ),
         degenerate=degenerate,
         rejected_channels=rejected,
         correlations=correlated,
         supports=supports,
         hypotheses=rows,
-        reasons=None if few is not None else explain_gradients(fit.state),
-        inconsistencies=None if few is not None else inconsistencies(fit.state, false_alarm),
+        common_factors=None if sparse is not None else explain_gradients(fit.state),
+        inconsistencies=None if sparse is not None else inconsistencies(fit.state, false_alarm),
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
 
@@ -166,92 +176,91 @@ def diagnose_response(
 def _families(
     ring: Ring,
     measured: OrbitResponse,
-    trials: Sequence[Trial],
+    families: Sequence[Family],
     holdout: float,
-    most: int,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[DenseFit, OrbitResponse, list[str], PutRight]:
-    """The dense fit of what resembles the model; what was fitted, and what was done to it; and
+) -> tuple[HierarchicalFit, OrbitResponse, list[str], Swaps]:
+    """The fit of what resembles the model; what was fitted, and what was done to it; and
     what is exchanged."""
     said: list[str] = []
-    known = PutRight([], {}, {}, [])
-    fit: DenseFit | None = None
+    known = Swaps([], {}, {}, [])
+    fit: HierarchicalFit | None = None
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
-        odd = strangers(state)
-        others = set() if fit is None else _anothers(state)
-        far = fit is None and _far(state, odd)
-        right = None if far else righted(state, measured, known, odd, others)
+        unlike = unlike_model(state)
+        others = set() if fit is None else mislabelled(state)
+        far = fit is None and _far(state, unlike)
+        right = None if far else labels_corrected(state, measured, known, unlike, others)
         if right is not None:
             measured, fit = right[0], None
             said.append(right[1])
             continue
-        crossed = [name for name in swapped(state) if name not in known.planes]
+        crossed = [name for name in swapped_planes(state) if name not in known.planes]
         if crossed:
             known.planes.extend(crossed)
             measured, fit = planes_back(measured, crossed), None
             continue
-        if odd.any:
-            said += odd.said
-            known.rejected.extend([*odd.monitors, *((name, None) for name in odd.correctors)])
-            measured = odd.without(measured)
+        if unlike.any:
+            said += unlike.messages
+            known.rejected.extend([*unlike.monitors, *((name, None) for name in unlike.correctors)])
+            measured = unlike.without(measured)
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))
         elif fit is not None:
-            return fit, measured, [*said, *fit.said], known
-        fit = fit_steps(data, split, trials, most, progress)
+            return fit, measured, [*said, *fit.messages], known
+        fit = fit_families(data, split, families, progress)
 
 
-def _far(state: State, odd: Strangers) -> bool:
+def _far(state: State, unlike: RejectedChannels) -> bool:
     """Whether the ring is to be fitted before columns are exchanged: in a design that is far off
     they fit in each other's place by chance."""
-    gone = {name for name, _ in odd.monitors}
+    gone = {name for name, _ in unlike.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
 
 
-def _anothers(state: State) -> set[str]:
-    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
-    leaves far more of them than of the others."""
-    return {*(own.name for own in displaced(state)), *strangers(state, ODD).correctors}
-
-
 def _faults(
-    fit: DenseFit,
-    exchanges: PutRight,
+    fit: HierarchicalFit,
+    swaps: Swaps,
     effects: Sequence[str] | None,
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any],
-) -> tuple[DenseFit, tuple[Finding, ...]]:
+) -> tuple[HierarchicalFit, tuple[Finding, ...]]:
     """What is wrong alone among small errors, and the fit beside it."""
     state = fit.state
     ring = state.data.ring
-    found = [swap_of(state, name, judgement) for name in exchanges.planes
+    found = [swap_of(state, name, judgement) for name in swaps.planes
              if effects is None or "monitor_swap" in effects]  # fmt: skip
-    far = displaced(state)
+    far = misplaced(state)
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
         sound = _without(state, far)
-        alone = singled_out(sound.data, sound.split, sound, hypotheses, most, judgement, progress)
-        fit = beside_faults(fit, alone.state.apart) if alone.faults else fit
+        alone = detected_faults(
+            sound.data, sound.split, sound, hypotheses, most, judgement, progress
+        )
+        fit = given_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
-    found = [*strongest_first(found)[:most], *unnamed(ring, exchanges, far)]
+    found = [*strongest_first(found)[:most], *label_findings(ring, swaps, far)]
     return fit, strongest_first(found)
 
 
-def _without(state: State, far: Sequence[Displaced]) -> State:
+def _without(state: State, far: Sequence[Misplaced]) -> State:
     """As if these had not been stepped: what they leave is explained, and no single fault's."""
     gone = np.zeros(state.data.orbits.shape, dtype=bool)
     gone[[own.column for own in far]] = True
-    return beside(state, gone)
+    return without(state, gone)
 
 
 def as_diagnosis(
-    ring: Ring, fit: DenseFit, within: Sequence[Cause], found: Sequence[Told], **told: Any
+    ring: Ring,
+    fit: HierarchicalFit,
+    within: Sequence[Cause],
+    found: Sequence[StatedCause],
+    **fields: Any,
 ) -> Diagnosis:
     """What a fit of a response says, as a diagnosis.
 
@@ -260,7 +269,7 @@ def as_diagnosis(
         fit: with its steps.
         within: what the ring as found has.
         found: causes with their errors.
-        told: what else the diagnosis is to say.
+        fields: further ones of the diagnosis.
     """
     data, good = fit.state.data, fit.state.good
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
@@ -268,7 +277,7 @@ def as_diagnosis(
     corrected = apply(ring, within)
     blocks = remainder(fit.state)
     errors = tuple(sigma for _, sigma in found)
-    named = [(finding.effect or "", finding.element) for finding in told["findings"]]
+    named = [(finding.effect or "", finding.element) for finding in fields["findings"]]
     return Diagnosis(
         fit_before=_misfit(fit, fit.design.at.read),
         fit_after=_misfit(fit, fit.state.at.read),
@@ -302,11 +311,11 @@ def as_diagnosis(
             if name not in {one.name for one in fit.state.apart}
         },
         dispersion=dispersion_beside(fit.state.values, data),
-        **told,
+        **fields,
     )
 
 
-def _view(fit: DenseFit) -> ResponseView:
+def _view(fit: HierarchicalFit) -> ResponseView:
     state, data = fit.state, fit.state.data
     design, model = fit.design.at.read, state.at.read
     return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
@@ -326,26 +335,29 @@ def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dic
     }
 
 
-def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:
-    """Steps of families that may be tried."""
+def families_of(
+    effects: Sequence[str] | None, families: Sequence[Family] = FAMILIES
+) -> list[Family]:
+    """Families of some effects; None: all.
+
+    Raises:
+        MeasurementError: none of the effects acts on an orbit response.
+        UnknownNameError: an effect that does not exist.
+    """
     if effects is None:
-        return list(steps)
+        return list(families)
     wanted = set(names(effects))
-    kept = [
-        replace(trial, families=tuple(f for f in trial.families if wanted & set(f.effects)))
-        for trial in steps
-    ]
-    known = {effect for trial in steps for family in trial.families for effect in family.effects}
+    known = {effect for family in families for effect in family.effects}
     known |= {name for name in names() if find(name).responds}
     if not known & wanted:
         raise MeasurementError(
             f"an orbit response does not see {', '.join(sorted(wanted)) or 'no effect'}; it sees "
             f"{', '.join(sorted(known))}"
         )
-    return [trial for trial in kept if trial.families]
+    return [family for family in families if wanted & set(family.effects)]
 
 
-def _verdict(fit: DenseFit, false_alarm: float) -> str:
+def _verdict(fit: HierarchicalFit, false_alarm: float) -> str:
     """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
     the RF's response; else `distributed`: many small errors."""
     said = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
@@ -353,13 +365,13 @@ def _verdict(fit: DenseFit, false_alarm: float) -> str:
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
-def _warnings(fit: DenseFit) -> tuple[str, ...]:
+def _warnings(fit: HierarchicalFit) -> tuple[str, ...]:
     """What a reader should know."""
     said = dispersion_by_kicks(fit.state.values, fit.state.data)
-    return (*said, *odd_readings(fit.state))
+    return (*said, *messages(fit.state))
 
 
-def _misfit(fit: DenseFit, read: Array) -> Misfit:
+def _misfit(fit: HierarchicalFit, read: Array) -> Misfit:
     """Of the fitted correctors' readings in their own plane."""
     data, good = fit.state.data, fit.state.good
     rows = np.flatnonzero(~fit.state.split.held[:-1])
@@ -368,7 +380,7 @@ def _misfit(fit: DenseFit, read: Array) -> Misfit:
     return Misfit(float(np.sqrt(np.nanmean(miss**2))), float(np.nanmean(pull**2)))
 
 
-def _gap(fit: DenseFit) -> Gap:
+def _gap(fit: HierarchicalFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     # in units of each reading's noise: the planes differ in it
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
@@ -378,7 +390,7 @@ def _gap(fit: DenseFit) -> Gap:
     return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, seen.readings)
 
 
-def _patterns(fit: DenseFit) -> dict[str, Any]:
+def _patterns(fit: HierarchicalFit) -> dict[str, Any]:
     """What stays of the fitted correctors' readings: chi-square per reading, and the share of the
     strongest patterns in each plane."""
     state, data = fit.state, fit.state.data

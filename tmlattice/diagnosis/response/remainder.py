@@ -19,12 +19,16 @@ from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_sizes
+from tmlattice.diagnosis.response.weights import FREEDOM, patterns
 from tmlattice.inference.normal import Posterior, solve
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 BLOCKS = ("in-plane", "coupling", "RF")
+
+OUTLIER = (FREEDOM + 1) / (FREEDOM + 5.0**2)
+"""Student weight of a reading that is five standard deviations off."""
 
 
 def remainder(state: State) -> tuple[Block, ...]:
@@ -98,11 +102,9 @@ class _Sum:
         data = state.data
         self.left = data.pick(state.at.left, block)
         # outliers count in the fit, and here, as if their noise were larger
-        share = np.ones_like(self.left) if state.share is None else state.share[block].copy()
-        if state.rf_share is not None:
-            share[-1] *= state.rf_share[block]
-        with np.errstate(divide="ignore"):
-            self.noise = data.noise_of(block) / np.sqrt(share)
+        share = state.noise.share[block]
+        self.noise = data.noise_of(block) / np.sqrt(np.where(share < OUTLIER, share, 1.0))
+        self.modes = patterns(state, block)
         self.square, self.readings = 0.0, 0
         size = 0 if found is None or more is None else len(found.prior) + more.shape[1]
         self.vector, self.matrix = np.zeros(size), np.eye(size)
@@ -117,8 +119,8 @@ class _Sum:
         sigma = self.noise[column, read]
         rows = np.column_stack([self.left[column, read], *self._slopes(column, read)])
         rows /= sigma[:, None]
-        if self.state.jitter is not None:
-            orbits = self.state.jitter[self._plane(column)][:, read].T / sigma[:, None]
+        orbits = self.modes[column][:, read].T / sigma[:, None]
+        if orbits.any():
             lower = np.linalg.cholesky(np.eye(len(read)) + orbits @ orbits.T)
             rows = solve_triangular(lower, rows, lower=True)
         if free:

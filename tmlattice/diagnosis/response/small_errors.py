@@ -26,7 +26,7 @@ from tmlattice.diagnosis.families.steps import (
     MonitorGain,
     MonitorRoll,
 )
-from tmlattice.diagnosis.response.dense import ROUGH, fit_chi2
+from tmlattice.diagnosis.response.hierarchical import ROUGH, fit_chi2
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
@@ -75,6 +75,8 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     nobody = np.zeros_like(split.held)
     everybody = Split(nobody, nobody, _halves(split), np.zeros_like(split.inner_rf))
     design = replace(begin(data, everybody), good=fitted.good, exploring=False)
+    noise = replace(design.noise, kinds=fitted.noise.kinds)
+    design = replace(design, noise=noise)
     families = _families(design, fitted.families)
     beside = _from(design, families, fitted)
     few = data.orbits.size <= ANEW
@@ -85,7 +87,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # astray
             continue
-        found.append((log_evidence(state, state.good), state))
+        found.append((log_evidence(state), state))
         log.info("small errors: evidence %.1f", found[-1][0])
         if all(own.per_reading < EXPLAINED for own in fit_chi2(state)[:2]):
             break
@@ -120,7 +122,7 @@ def _families(design: State, more: Sequence[Family]) -> list[Family]:
 def _from(design: State, families: Sequence[Family], fitted: State) -> State:
     """Where the families' fit stands."""
     at = Predicted(design.data, Errors.none(design.data), fitted.at.bent)
-    state = replace(design, at=at, lacking=fitted.lacking, groups=fitted.groups)
+    state = replace(design, at=at, noise=fitted.noise, groups=fitted.groups)
     state = allow(state, families)
     return state.moved({**state.values, **{k: v for k, v in fitted.values.items()
                                            if k in state.values}})  # fmt: skip

@@ -1,12 +1,13 @@
-"""The state of a dense fit of an orbit response, and what may happen to it.
+"""The state of a hierarchical fit of an orbit response, and functions that return another one.
 
-Everything that is fitted is one frozen `State`; what happens to it is a function that gives another
-one: `bend`, `allow`, `jump`, `settle`, `look`.
+Everything that is fitted is one frozen `State`, the noise model included: `bend`, `allow`, `jump`
+and `rounds.settle` return a new one.
 """
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.priors import GUESSED, Group
+from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
@@ -55,6 +56,14 @@ class Apart:
         return f"alone: {self.cause[0]} {self.cause[1]}"
 
 
+class Outcome(Enum):
+    """How a fit ended."""
+
+    CONVERGED = "converged"
+    ROUNDS = "the fit ran out of rounds while it still gained"
+    STUCK = "no step lessened the cost, however short"
+
+
 class Kept(NamedTuple):
     """What the ring's numbers of one variable do to the readings, and where that was taken."""
 
@@ -64,51 +73,114 @@ class Kept(NamedTuple):
     at: Mapping[str, Array]
 
 
+WAVES = 4
+"""Closed-orbit waves of which each step may contain some: two of them make any phase of a betatron
+oscillation, the others what differs between the places of kicks."""
+KINDS = {
+    "waves": slice(0, WAVES),
+    "drift": slice(WAVES, WAVES + 1),
+    "place": slice(WAVES + 1, None),
+}
+"""Common modes of a step, by their patterns: beam jitter, a drift of the energy, and the field of
+the corrector at another place."""
+WAVED = ("waves in plane", "waves across")
+"""Names of the waves' kind, by block: they are admitted in each by itself."""
+DRIFT = 1e-4
+"""First guess of the rms drift of the energy within a step, in RF steps."""
+PLACE = 3e-3
+"""First guess of the rms distance of a corrector's field from its nominal place, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Variance components of the readings about the model.
+
+    The variance of a reading is that of its noise, plus the misfit of its column, plus the misfit
+    of its monitor, over its Student weight. Amounts of the common modes of each column are Gaussian
+    and integrated out.
+
+    Attributes:
+        column: misfit of each column, m^2, [block, column].
+        monitor: misfit of each monitor, m^2, [block, plane that is read, monitor].
+        share: Student weight of each reading, 1 or less, [block, column, monitor].
+        size: prior rms of the amount of each common mode, [block, column, pattern].
+        scale: of the kinds of common modes, [block, plane that is read, kind].
+        waves: orbits of unit rms, [plane that is read, pattern, monitor].
+        kinds: of common modes that are admitted, names of `KINDS` or `WAVED`. Waves are admitted by
+            validation alone: they absorb what gradients should explain.
+    """
+
+    column: Array
+    monitor: Array
+    share: Array
+    size: Array
+    scale: Array
+    waves: Array
+    kinds: tuple[str, ...] = ("drift", "place")
+
+    @classmethod
+    def first(cls, at: Predicted, left: Array) -> "Noise":
+        """The first guess: all columns alike, in-plane and across.
+
+        Args:
+            at: the design.
+            left: typical misfit of each block, m, [block].
+        """
+        data = at.data
+        columns, monitors = data.shape
+        waves = np.zeros((2, WAVES, monitors))
+        for plane in (0, 1):
+            own = data.plane[:-1] == plane
+            if not own.any():
+                continue
+            orbits = at.straight[:-1][own][:, :, plane] / data.kicks[:-1][own, None]
+            shapes = np.linalg.svd(orbits, full_matrices=False)[2][:WAVES]
+            waves[plane, : len(shapes)] = shapes * np.sqrt(monitors)
+        scale = np.tile([float(np.median(data.noise)), DRIFT, PLACE], (2, 2, 1))
+        size = np.zeros((2, columns, WAVES + 2))
+        for kind, which in enumerate(KINDS.values()):
+            size[:, :, which] = scale[0, 0, kind]
+        column = np.repeat(np.square(left)[:, None], columns, axis=1)
+        return cls(column, np.zeros((2, 2, monitors)), np.ones((2, columns, monitors)), size,
+                   scale, waves)  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Everything that is fitted.
 
     Attributes:
-        data, split: what was measured, and who judges.
+        data, split: what was measured, and who validates.
         at: what the model reads with the values.
-        lacking: what the model lacks in-plane and across in each column, m: it lessens weights as
-            noise does, so that one corrector whose field is not where the model has it spoils no
-            magnet; [block, column].
-        good: monitors that are not bad, [monitor].
-        families: that are allowed.
+        noise: variance components of the readings.
+        good: monitors that are used, [monitor].
+        families: that are open.
         values: by variable.
-        groups: the families' priors with what they have learnt, by name.
-        exploring: the inner correctors choose, and are not fitted.
-        kept: rows of the ring's variables, that stand until the ring has moved.
-        share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
-        rf_share: by which the RF's readings count, [block, monitor]; None: all alike.
+        groups: the families' priors with the scales that they have learnt, by name.
+        exploring: the inner correctors validate, and are not fitted.
+        kept: rows of the ring's variables, reused until the ring has moved.
         apart: numbers that are wrong alone.
-        independent: share of the readings that tell something of their own, see `independent`,
-            [block, plane that is read]; None: all are taken to.
-        jitter: closed orbits that each step has an unknown amount of, as large as they typically
-            are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
-        guessed: rms of the logarithm of a family's size about its first guess.
-        unneeded: families that were tried: their numbers are taken for zero, and stated errors know
-            that they may not be (those of the ring, where they are few).
+        guessed: rms of the logarithm of a family's scale about its first guess.
+        closed: families that the validation set, or physics, has closed: their numbers are taken
+            for zero, and stated errors know that they may not be (those of the ring, where they are
+            few).
+        outcome: how the last fit ended.
     """
 
     data: ResponseData
     split: Split
     at: Predicted
-    lacking: Array
+    noise: Noise
     good: Flags
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
-    share: Array | None = None
-    rf_share: Array | None = None
     apart: tuple[Apart, ...] = ()
-    independent: Array | None = None
-    jitter: Array | None = None
-    guessed: float = GUESSED
-    unneeded: tuple[Family, ...] = ()
+    guessed: float = SCALE_SPREAD
+    explained: tuple[Family, ...] = ()
+    outcome: Outcome | None = None
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""
@@ -140,11 +212,12 @@ class State:
 def begin(data: ResponseData, split: Split) -> State:
     """The design."""
     at = Predicted(data, Errors.none(data))
-    gap = data.pick(at.left)[~split.held]
-    size = float(np.nanmedian(np.abs(gap))) / 0.6745
-    return State(
-        data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
-    )
+    left = np.zeros(2)
+    for block in (0, 1):
+        gap = data.pick(at.left, block)[:-1][~split.held[:-1]]
+        if np.isfinite(gap).any():
+            left[block] = float(np.nanmedian(np.abs(gap))) / 0.6745
+    return State(data, split, at, Noise.first(at, left), np.ones(data.shape[1], dtype=bool))
 
 
 def bend(state: State) -> State:
@@ -165,7 +238,7 @@ def allow(state: State, families: Sequence[Family]) -> State:
     more = [family for family in families if not state.allows(family.name)]
     state = replace(
         state, families=(*state.families, *more), values={**values, **state.values},
-        unneeded=tuple(family for family in state.unneeded if family.name not in names),
+        explained=tuple(family for family in state.explained if family.name not in names),
     )  # fmt: skip
     return state.moved(state.values) if begun else state
 
@@ -177,8 +250,8 @@ def forbid(state: State, families: Sequence[Family]) -> State:
     left = tuple(family for family in state.families if family.name not in names)
     values = {f.variable: state.values[f.variable] for f in left}
     groups = {name: group for name, group in state.groups.items() if name not in gone}
-    unneeded = (*state.unneeded, *families)
-    return replace(state, families=left, groups=groups, unneeded=unneeded).moved(values)
+    explained = (*state.explained, *families)
+    return replace(state, families=left, groups=groups, explained=explained).moved(values)
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
@@ -197,7 +270,7 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     scale = 1 + state.at.errors.calibration[:, None]
     # a kick is (1 + calibration) (linear + bent); only in its own plane
     flat = (rows - bent, left + scale * bent) if family.block == 0 else (rows, left)
-    amounts, without, told = np.full((3, len(left)), np.nan)
+    amounts, without, sure = np.full((3, len(left)), np.nan)
     for c in np.flatnonzero(~state.split.held[:-1]):
         seen = np.isfinite(left[c]) & state.good
         near, far = seen & state.split.half[c], seen & ~state.split.half[c]
@@ -207,9 +280,9 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
         for own, read in ((rows[c], left[c]), (flat[0][c], flat[1][c])):
             (amount,), miss = amplitudes(own[:, None], read, near, far)
             mean = np.mean((miss / noise[c, far]) ** 2)
-            if not mean >= told[c]:
-                amounts[c], told[c] = amount, mean
-    return amounts, without, told
+            if not mean >= sure[c]:
+                amounts[c], sure[c] = amount, mean
+    return amounts, without, sure
 
 
 def by_monitors(state: State) -> Array:
@@ -249,8 +322,8 @@ def jump(state: State, beyond: float | None = None) -> State:
         limit = family.gross if beyond is None else beyond * family.trust
         if family.per != "column" or np.isinf(limit):
             continue
-        amounts, without, told = by_columns(state, family)
-        far = state.fitted & (np.abs(amounts) > limit) & (told < ALONE**2 * without)
+        amounts, without, sure = by_columns(state, family)
+        far = state.fitted & (np.abs(amounts) > limit) & (sure < ALONE**2 * without)
         values[family.variable] = values[family.variable] + np.where(far, amounts, 0.0)
     changed = any((values[name] != state.values[name]).any() for name in values)
     return state.moved(values) if changed else state
@@ -262,21 +335,14 @@ def rms_of(parts: Iterable[Array]) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-def amplitudes(
-    patterns: Array, data: Array, near: Flags, far: Flags, held: Array | None = None
-) -> tuple[Array, Array]:
+def amplitudes(patterns: Array, data: Array, near: Flags, far: Flags) -> tuple[Array, Array]:
     """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss.
 
     Args:
         patterns, data: m, [monitor, pattern] and [monitor].
         near, far: [monitor].
-        held: by priors about zero, noise of a reading over the amplitude's rms, [pattern]; 0: free.
     """
     size = np.abs(patterns[near]).max(axis=0)
     size[size == 0] = 1
-    rows, right = patterns[near] / size, data[near]
-    if held is not None:
-        rows = np.concatenate([rows, np.diag(held / size)])
-        right = np.concatenate([right, np.zeros(len(held))])
-    amounts = np.linalg.lstsq(rows, right, rcond=None)[0] / size
+    amounts = np.linalg.lstsq(patterns[near] / size, data[near], rcond=None)[0] / size
     return amounts, data[far] - patterns[far] @ amounts

@@ -1,0 +1,394 @@
+"""The data checks: what is wrong everywhere is named, and healthy data of sick machines are not."""
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+
+import jsonschema
+import numpy as np
+import pytest
+from command import tmlattice
+from conftest import SMALL
+
+from tmlattice.diagnosis import diagnose
+from tmlattice.diagnosis.data_checks import check_data
+from tmlattice.effects import Cause
+from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.machine import simulate
+from tmlattice.machine.response import simulate_response
+from tmlattice.measurement import write_measurement
+from tmlattice.measurement.assume import ASSUMPTIONS, assume
+from tmlattice.observe.sections import Passes, Sections
+
+FAULT = Cause("quadrupole_gradient", "QD::5", -0.2)
+
+
+@pytest.fixture(scope="module")
+def machine(small_ring):
+    """First turns of a machine with correctors set and a strong quadrupole fault."""
+    return simulate(small_ring, [FAULT], shots=6, seed=3, kicks=1e-4).measurement()
+
+
+@pytest.fixture(scope="module")
+def healthy(small_ring):
+    return simulate(small_ring, shots=6, seed=3).measurement()
+
+
+@pytest.fixture(scope="module")
+def steps(small_ring):
+    """An orbit response of a machine with the usual errors of monitors and correctors."""
+    errors = {"monitor_gain_x": 0.02, "monitor_roll": 5e-3, "corrector_calibration": 0.03}
+    return simulate_response(small_ring, background=errors, engine="ocelot", seed=1).measured
+
+
+def told(checkup, status="wrong"):
+    return [check for check in checkup.checks if check.status == status]
+
+
+def shifted(values, by):
+    return np.roll(values, by, axis=-2)
+
+
+WRONG = {
+    "x-reversed": lambda m: {"readings": m.readings * [-1, 1]},
+    "readings-reversed": lambda m: {"readings": -m.readings},
+    "planes-exchanged": lambda m: {"readings": m.readings[..., ::-1]},
+    "readings-in-mm": lambda m: {"readings": 1e3 * m.readings, "noise": 1e3 * m.noise},
+    "readings-in-um": lambda m: {"readings": 1e6 * m.readings},
+    "monitors-shifted=1": lambda m: {"readings": shifted(m.readings, 1)},
+    "monitors-shifted=-2": lambda m: {"readings": shifted(m.readings, -2)},
+    "monitors-backwards": lambda m: {"readings": m.readings[:, :, ::-1]},
+    "launches-reversed": lambda m: {"launches": -m.launches},
+    "slopes-reversed": lambda m: {"launches": m.launches * [1, -1, 1, -1, 1]},
+    "launches-exchanged": lambda m: {"launches": m.launches[:, [2, 3, 0, 1, 4]]},
+    "launches-in-mm": lambda m: {"launches": 1e3 * m.launches},
+    "slopes-in-mrad": lambda m: {"launches": m.launches * [1, 1e3, 1, 1e3, 1]},
+    "settings-reversed": lambda m: {"settings": kicked(m, -1)},
+    "turns-from-1": lambda m: {
+        "readings": np.concatenate([np.full_like(m.readings, np.nan), m.readings], axis=1)
+    },
+}
+
+
+def kicked(data, factor):
+    return tuple(
+        {n: {"kick": factor * s["kick"]} for n, s in shot.items()} for shot in data.settings
+    )
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_everywhere_is_named_beside_a_strong_fault(small_ring, machine, name):
+    data = replace(machine, **WRONG[name](machine))
+    (check,) = told(check_data(small_ring, data))
+    assert name in check.assume or f"--assume {name}" in check.sentence
+    assert check.before > 10 * check.after
+    mended = check_data(small_ring, data, assumed=check.assume)
+    assert mended.status != "wrong"
+
+
+def test_y_of_wrong_sign_is_named_with_its_mirror(small_ring, healthy):
+    """Where no vertical kick is set, launches of wrong sign in y say the same."""
+    (check,) = told(check_data(small_ring, replace(healthy, readings=healthy.readings * [1, -1])))
+    assert check.assume == ("y-reversed",)
+    assert "--assume launches-y-reversed" in check.sentence
+
+
+def test_two_global_errors_are_named_together(small_ring, machine):
+    data = replace(machine, readings=machine.readings * [-1e3, 1e3])
+    found = {name for check in told(check_data(small_ring, data)) for name in check.assume}
+    assert found == {"readings-in-mm", "x-reversed"}
+
+
+def test_a_beam_that_runs_backwards_is_told(small_ring, healthy):
+    monitors = np.arange(len(small_ring.monitors))
+    sections = Sections(small_ring, [{}] * 6, monitors)
+    ends, _ = sections.carried(healthy.launches, np.arange(6), 1)
+    data = replace(healthy, launches=ends * [1, -1, 1, -1, 1])
+    (check,) = told(check_data(small_ring, data))
+    assert check.assume == ("beam-backwards",)
+
+
+SICK = {
+    "no fault": ([], {}),
+    "a quadrupole": ([FAULT], {}),
+    "a monitor reversed in x": ([Cause("monitor_gain_x", "end_3", -2.0)], {}),
+    "three monitors exchanged": (
+        [Cause("monitor_swap", name, 1.0) for name in ("end_3", "end_4", "bpm::9")], {}),
+    "a sextupole offset": ([Cause("sextupole_offset_x", "sf::4", 2e-3)], {}),
+    "another energy": ([Cause("energy_offset", None, 5e-3)], {}),
+    "several": ([FAULT, Cause("monitor_swap", "end_3", 1.0), Cause("dipole_roll", "bend::9", 5e-3)],
+                {}),
+    "small errors everywhere": ([], {"background": {"all": None}}),
+    "small errors, one shot": ([], {"background": {"all": None}, "shots": 1}),
+    "three turns": ([FAULT], {"turns": 3}),
+    "energies of their own": ([FAULT], {"launch_sigma": (1e-4, 2e-5, 1e-4, 2e-5, 1e-3)}),
+    "correctors set": ([FAULT], {"kicks": 1e-4}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SICK)
+def test_healthy_data_of_a_sick_machine_tell_nothing(small_ring, kind):
+    causes, options = SICK[kind]
+    data = simulate(small_ring, causes, **{"shots": 6, "seed": 5, **options}).measurement()
+    told = check_data(small_ring, data).reported
+    assert [check.sentence for check in told if check.name != "noise"] == []
+    assert all("shots do not show which" in check.sentence for check in told)  # small errors
+
+
+def test_few_monitors_tell_nothing(small_ring, healthy):
+    for names in (healthy.monitors[3:5], healthy.monitors[::9], healthy.monitors[::4]):
+        data = healthy.select(monitors=names)
+        assert check_data(small_ring, data).reported == ()
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_noise_that_is_not_the_readings_is_told(small_ring, healthy, factor):
+    data = replace(healthy, noise=factor * healthy.noise)
+    (check,) = told(check_data(small_ring, data))
+    assert (check.name, check.assume) == ("noise", ("noise-from-data",))
+    assert check.before == pytest.approx(factor**-2, rel=0.5)  # of 200 readings, in few sections
+    assert told(check_data(small_ring, data, assumed=check.assume)) == []
+
+
+def test_small_errors_everywhere_are_not_taken_for_noise(small_ring):
+    """A noise of 2 um where errors leave hundreds: they are the same from shot to shot, or in
+    proportion to the orbit."""
+    for shots in (6, 12):
+        data = simulate(
+            small_ring, background={"all": None}, noise=2e-6, shots=shots, seed=2
+        ).measurement()
+        assert told(check_data(small_ring, data)) == []
+
+
+def test_readings_that_follow_no_trajectory_are_of_another_lattice(small_ring, healthy, rng):
+    order = rng.permutation(len(healthy.monitors))
+    (check,) = told(
+        check_data(small_ring, replace(healthy, readings=healthy.readings[:, :, order]))
+    )
+    assert (check.name, check.assume) == ("lattice", ())
+
+
+def test_monitors_and_readings_of_their_own_are_noted(small_ring, healthy):
+    readings = healthy.readings.copy()
+    readings[:, :, 4] = readings[:, :, 8]
+    readings[:, :, 11, 1] = 3e-4
+    readings[:, :, 14] = np.nan
+    readings[1, 0, 20, 0] += 2e-3
+    readings[4, :, 28:] = np.nan
+    found = {c.name: c.sentence for c in told(
+        check_data(small_ring, replace(healthy, readings=readings)), "note")}  # fmt: skip
+    names = [monitor.name for monitor in small_ring.monitors]
+    assert f"{names[4]} in x and {names[8]} in x" in found["copied monitors"]
+    assert f"{names[11]} in y" in found["frozen monitors"]
+    assert names[14] in found["silent monitors"]
+    assert f"{names[20]} in x, shot 1" in found["spikes"]
+    assert f"shot 4 has no reading behind {names[27]} " in found["lost beam"]
+    assert len(found) == 5
+
+
+def test_launches_far_from_the_stated_ones_are_noted(small_ring, healthy):
+    data = replace(healthy, launches=healthy.launches + np.array([1e-3, 0, 0, 0, 0]))
+    data = replace(data, launch_sigma=healthy.launch_sigma / 10)
+    (check,) = told(check_data(small_ring, data), "note")
+    assert (check.name, check.assume) == ("launches", ("launches-unknown",))
+    assert check_data(small_ring, data, assumed=check.assume).reported == ()
+
+
+def test_another_energy_than_the_lattice_is_noted(small_ring, healthy):
+    (check,) = told(check_data(small_ring, replace(healthy, energy=6.0)), "note")
+    assert "6 GeV" in check.sentence
+
+
+def test_a_slip_in_the_turns_is_told_before_anything_is_laid_out(small_ring, healthy):
+    readings = np.full((6, 1001, len(healthy.monitors), 2), np.nan)
+    readings[:, :1], readings[0, 1000, 3] = healthy.readings, 1e-3
+    (check,) = told(check_data(small_ring, replace(healthy, readings=readings)))
+    assert "turn 1000" in check.sentence
+
+
+RESPONSE = {
+    "y-reversed": "y-reversed",
+    "planes-exchanged": "planes-exchanged",
+    "readings-in-mm": "readings-in-km",
+    "readings-halved": "readings-doubled",
+    "kicks-reversed": "kicks-reversed",
+    "kicks-in-mrad": None,
+    "kicks-doubled": "kicks-halved",
+    "kicks-in-krad": "kicks-in-mrad",
+    "correctors-shifted=1": "correctors-shifted=-1",
+    "monitors-shifted=1": "monitors-shifted=-1",
+    "rf-reversed": "rf-reversed",
+}
+
+
+@pytest.mark.parametrize("name", RESPONSE)
+def test_what_is_wrong_everywhere_in_an_orbit_response_is_named(small_ring, steps, name):
+    monitors = [monitor.name for monitor in small_ring.monitors]
+    undone = RESPONSE[name]
+    if undone is None:
+        data = replace(steps, kicks=1e3 * steps.kicks)
+    else:
+        data = assume(steps, [undone], monitors)
+    (check,) = told(check_data(small_ring, data))
+    assert name in check.assume or f"--assume {name}" in check.sentence
+    assert check_data(small_ring, data, assumed=check.assume).reported == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("kicks-halved", lambda d: replace(d, kicks=2 * d.kicks)),
+        ("kicks-doubled", lambda d: replace(d, kicks=d.kicks / 2)),
+        ("kicks-in-krad", lambda d: replace(d, kicks=1e-3 * d.kicks)),
+        ("readings-in-mm", lambda d: replace(d, response=1e3 * d.response, noise=None)),
+    ],
+    ids=lambda own: own if isinstance(own, str) else "",
+)
+def test_a_scale_is_named_of_a_ring_far_from_its_design(small_ring, steps, name, change):
+    """Columns of the Siam ring are 44 % off its design."""
+    rng = np.random.default_rng(5)
+    size = np.sqrt(np.nanmean(steps.response**2, axis=(1, 2)))[:, None, None]
+    far = steps.response + 0.45 * size * rng.standard_normal(steps.response.shape)
+    far = replace(steps, response=far, rf=None)
+    assert told(check_data(small_ring, far)) == []
+    checks = told(check_data(small_ring, change(far)))
+    assert any(name in check.sentence for check in checks), checks
+
+
+def test_an_rf_orbit_in_millimetres_is_told(small_ring):
+    """`no closed orbit` had been all that was said."""
+    steps = simulate_response(small_ring, rf_step=-3000.0, engine="ocelot", seed=1).measured
+    assert told(check_data(small_ring, steps)) == []
+    scaled = replace(steps, rf=replace(steps.rf, orbit=1e3 * steps.rf.orbit))
+    (check,) = told(check_data(small_ring, scaled))
+    assert check.sentence.startswith("the RF's orbit is 1e+03 times what its step makes")
+    repeated = np.tile(scaled.rf.orbit[:5], (len(steps.monitors) // 5, 1))  # no monitor read that
+    copied = replace(scaled, rf=replace(scaled.rf, orbit=repeated))
+    assert told(check_data(small_ring, copied)) == []
+
+
+def test_a_bad_corrector_or_monitor_is_no_global_error(small_ring, steps):
+    assert check_data(small_ring, steps).reported == ()
+    response = steps.response.copy()
+    response[4] *= -1
+    response[:, 7, 0] *= -1
+    assert check_data(small_ring, replace(steps, response=response)).reported == ()
+
+
+def test_diagnose_stops_and_goes_on_with_what_is_assumed(small_ring, machine):
+    data = replace(machine, readings=machine.readings * [-1, 1])
+    with pytest.raises(MeasurementError, match=r"x has the wrong sign.*--assume x-reversed"):
+        diagnose(small_ring, data)
+    found = diagnose(small_ring, data, assume=["x-reversed"])
+    assert found.findings[0].element == FAULT.element
+    assert found.as_json()["provenance"]["options"]["assume"] == ["x-reversed"]
+
+
+def test_a_reference_is_looked_at_too(small_ring, healthy):
+    """What is wrong in one of the two alone no assumption of both mends."""
+    wrong = replace(healthy, readings=healthy.readings * [-1, 1])
+    for which, data, reference, one in (
+        ("the reference", healthy, wrong, True), ("the second measurement", wrong, healthy, True),
+        ("", wrong, wrong, False),
+    ):  # fmt: skip
+        with pytest.raises(MeasurementError, match="x has the wrong sign") as raised:
+            diagnose(small_ring, data, reference=reference)
+        said = str(raised.value)
+        assert said.startswith(f"{which} alone (mend its file") == one
+        assert "--assume x-reversed" in said
+
+
+def test_a_response_stops_and_goes_on_with_what_is_assumed(small_ring, steps):
+    data = replace(steps, kicks=-steps.kicks)
+    with pytest.raises(MeasurementError, match="--assume kicks-reversed"):
+        diagnose(small_ring, data)
+    options = {"effects": ["corrector_calibration"], "max_effects": 1}
+    found = diagnose(small_ring, data, assume=["kicks-reversed"], **options)
+    same = diagnose(small_ring, steps, **options)
+    assert found.fit_before == same.fit_before
+
+
+@pytest.mark.parametrize("causes", [[], [FAULT]])
+@pytest.mark.parametrize("amplitude", [1e-3, 3e-3])
+def test_readings_without_noise_are_the_easiest(small_ring, causes, amplitude):
+    """What second-order maps leave of a thick machine is no fault, however small the noise."""
+    data = simulate(small_ring, causes, shots=6, seed=1, noise=0, amplitude=amplitude).measurement()
+    found = diagnose(small_ring, data)
+    assert [finding.element for finding in found.findings] == [c.element for c in causes]
+    # two at one place that read the same count once, and those left see the fault between them
+    said = "noise was estimated" if causes else "second-order maps"
+    assert any(said in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("left", [17, 3])
+def test_a_beam_that_is_lost_is_used_up_to_there(small_ring, left):
+    data = simulate(small_ring, [Cause("quadrupole_gradient", "QD::0", -0.2)], shots=6, seed=3)
+    data = data.measurement()
+    readings = data.readings.copy()
+    readings[:, :, left:] = np.nan
+    found = diagnose(small_ring, replace(data, readings=readings))
+    assert any("the beam was lost there" in warning for warning in found.warnings)
+
+
+def test_one_monitor_and_unknown_assumptions_are_one_sentence(small_ring, healthy):
+    with pytest.raises(MeasurementError, match="two monitors at least"):
+        diagnose(small_ring, healthy.select(monitors=healthy.monitors[:1]))
+    with pytest.raises(UnknownNameError, match="did you mean 'x-reversed'"):
+        diagnose(small_ring, healthy, assume=["x-revers"])
+    with pytest.raises(MeasurementError, match="no meaning for first turns"):
+        check_data(small_ring, healthy, assumed=["rf-reversed"])
+    with pytest.raises(MeasurementError, match="there are readings of turn 0"):
+        check_data(small_ring, healthy, assumed=["turns-from-1"])
+
+
+def test_a_lattice_without_monitors_is_told(small_ring, healthy):
+    bare = small_ring.with_elements({})
+    bare = replace(bare, elements=tuple(e for e in bare.elements if e.kind != "monitor"))
+    with pytest.raises(MeasurementError, match="has no monitor"):
+        diagnose(bare, healthy)
+
+
+@pytest.mark.parametrize("name", [n for n, a in ASSUMPTIONS.items() if a.trajectory])
+def test_an_assumption_undoes_itself_and_touches_nothing_else(small_ring, machine, name):
+    """The given measurement stays as it is, and what comes out is a measurement still."""
+    monitors = [monitor.name for monitor in small_ring.monitors]
+    if name == "turns-from-1":
+        machine = replace(machine, **WRONG[name](machine))
+    before = machine.readings.copy(), machine.launches.copy()
+    made = assume(machine, [name], monitors)
+    assert np.array_equal(before[0], machine.readings, equal_nan=True)
+    assert np.array_equal(before[1], machine.launches)
+    replace(made)  # all checks of a measurement
+    assert made.monitors == machine.monitors
+
+
+def test_sections_follow_a_trajectory_that_the_machine_made(small_ring):
+    """Referee: the thick tracking of AT, corrector kicks and all: no reading of a section and no
+    launch is off by more than third order, less than 0.1 um where the orbit is 1 mm and more."""
+    data = simulate(
+        small_ring, shots=4, seed=1, kicks=2e-5, noise=1e-12, launch_sigma=[0] * 5
+    ).measurement()
+    count = len(small_ring.monitors)
+    sections = Sections(small_ring, data.settings, np.arange(count))
+    sigma = np.full((count, 2), 1e-7)
+    passes = Passes(data.readings[:, 0], sigma, np.zeros(4), np.arange(4), np.zeros(4, dtype=int))
+    found = sections.fit(passes)
+    assert np.abs(found.left).max() < 1
+    assert np.abs(found.start[:, 0] - data.launches[:, :4]).max() < 2e-7
+
+
+def test_check_prints_a_table_and_writes_its_schema(tmp_path, machine):
+    write_measurement(tmp_path / "good", machine)
+    write_measurement(tmp_path / "bad", replace(machine, readings=machine.readings * [-1, 1]))
+    done = tmlattice("check", SMALL, "good", "--json", "c.json", cwd=tmp_path, check=0)
+    assert "no global error" in done.stdout
+    schema = json.loads((files("tmlattice") / "schemas" / "check.schema.json").read_text())
+    jsonschema.validate(json.loads((tmp_path / "c.json").read_text()), schema)
+    done = tmlattice("check", SMALL, "bad", "--json", "c.json", cwd=tmp_path, check=1)
+    assert "--assume x-reversed" in " ".join(done.stdout.split())
+    document = json.loads((tmp_path / "c.json").read_text())
+    jsonschema.validate(document, schema)
+    assert document["status"] == "wrong"
+    tmlattice("check", SMALL, "bad", "--assume", "x-reversed", "-q", cwd=tmp_path, check=0)
+    done = tmlattice("diagnose", SMALL, "bad", cwd=tmp_path, check=2)
+    assert "x has the wrong sign at every monitor" in done.stderr

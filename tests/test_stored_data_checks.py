@@ -1,0 +1,132 @@
+"""What is wrong everywhere in turns, orbits, dispersion and tunes is told; small errors are not."""
+
+import json
+import re
+from dataclasses import replace
+from importlib import resources
+
+import jsonschema
+import numpy as np
+import pytest
+from command import tmlattice
+from conftest import SMALL
+
+from tmlattice import diagnose, write_measurement
+from tmlattice.challenge.kinds import measure
+from tmlattice.diagnosis.data_checks import check_data
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement import TuneReading
+
+KINDS = ("turn_by_turn", "closed_orbit", "dispersion", "tunes")
+
+
+@pytest.fixture(scope="module")
+def sound(small_ring):
+    """Of a machine with all usual small errors."""
+    own = {"background": {"all": None}, "seed": 3, "machine_seed": 3}
+    return {kind: measure(kind, small_ring, [], 1.0, 2, **own) for kind in KINDS}
+
+
+def wrong_in(ring, data):
+    found = [check for check in check_data(ring, data).checks if check.status == "wrong"]
+    assert len(found) == 1, [check.sentence for check in found]
+    return found[0].sentence
+
+
+def turns(data, change):
+    return replace(data, readings=change(data.readings))
+
+
+def step(data, change):
+    return replace(data, steps=(replace(data.steps[0], orbit=change(data.steps[0].orbit)),))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_small_errors_are_nothing_global(small_ring, sound, kind):
+    found = check_data(small_ring, sound[kind])
+    assert found.kind == kind
+    assert found.status != "wrong", [check.sentence for check in found.reported]
+    document = json.loads(json.dumps(found.as_json()))
+    schema = resources.files("tmlattice") / "schemas" / "check.schema.json"
+    jsonschema.validate(document, json.loads(schema.read_text()))
+
+
+CHANGES = {
+    "planes are exchanged": lambda values: values[..., ::-1],
+    "shifted by +1": lambda values: np.roll(values, 1, axis=-2),
+    "shifted by -2": lambda values: np.roll(values, -2, axis=-2),
+    "reverse order": lambda values: values[..., ::-1, :],
+}
+
+
+@pytest.mark.parametrize("said", CHANGES)
+def test_turns_in_another_order(small_ring, sound, said):
+    assert said in wrong_in(small_ring, turns(sound["turn_by_turn"], CHANGES[said]))
+
+
+def test_turns_that_are_numbered_backwards(small_ring, sound):
+    data = turns(sound["turn_by_turn"], lambda values: values[:, ::-1])
+    assert "numbered backwards" in wrong_in(small_ring, data)
+
+
+def test_a_sign_a_unit_and_the_planes_of_a_dispersion(small_ring, sound):
+    data = sound["dispersion"]
+    assert "exchanged" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
+    assert "the sign" in wrong_in(small_ring, step(data, lambda values: -values))
+    assert "1000 times too small" in wrong_in(small_ring, step(data, lambda v: 1e-3 * v))
+
+
+def test_a_diagnosis_refuses_what_is_wrong_everywhere(small_ring, sound):
+    for said, change in CHANGES.items():
+        with pytest.raises(MeasurementError, match=re.escape(said)):
+            diagnose(small_ring, turns(sound["turn_by_turn"], change))
+    flipped = step(sound["dispersion"], lambda values: -values)
+    with pytest.raises(MeasurementError, match="dispersion: the sign"):
+        diagnose(small_ring, {"tunes": sound["tunes"], "dispersion": flipped})
+
+
+def test_another_ring(small_ring, sound):
+    """Monitors in no order at all are those of no ring that is known here."""
+    mixed = np.random.default_rng(1).permutation(len(small_ring.monitors))
+    data = turns(sound["turn_by_turn"], lambda values: values[:, :, mixed])
+    assert "not those of" in wrong_in(small_ring, data)
+    other = np.random.default_rng(2).normal(0.0, 1e-3, (len(mixed), 2))
+    data = step(sound["dispersion"], lambda values: other)
+    assert "not those of" in wrong_in(small_ring, data)
+
+
+def test_orbits_whose_correctors_were_set_tell_their_sign(small_ring):
+    from tmlattice.machine.stored_beam import simulate_orbits
+
+    settings = [{"v6": {"kick": 1e-4}}, {"v6": {"kick": -1e-4}}, {}]
+    data = simulate_orbits(small_ring, [], shots=3, settings=settings, seed=1).measured
+    assert check_data(small_ring, data).status != "wrong"
+    flipped = replace(data, orbit=-data.orbit)
+    assert "sign" in wrong_in(small_ring, flipped)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda q: q[:, ::-1], "the tunes are exchanged"),
+        (lambda q: 1 - q, "both are 1 - Q"),
+        (lambda q: np.array([[1 - q[0, 0], q[0, 1]]]), "Qx is 1 - Qx"),
+        (lambda q: np.full((1, 2), 0.44), "not the ring's"),
+    ],
+)
+def test_tunes(small_ring, sound, change, said):
+    assert said in wrong_in(small_ring, TuneReading(tune=change(sound["tunes"].tune)))
+
+
+def test_nothing_is_assumed_of_them(small_ring, sound):
+    with pytest.raises(MeasurementError, match="mend the data themselves"):
+        check_data(small_ring, sound["turn_by_turn"], assumed=["planes_exchanged"])
+
+
+def test_the_command_checks_them(sound, tmp_path):
+    write_measurement(tmp_path / "good", sound["dispersion"])
+    write_measurement(tmp_path / "bad", step(sound["dispersion"], lambda values: -values))
+    told = tmlattice("check", str(SMALL), "good", cwd=tmp_path, check=0)
+    assert "ok" in told.stdout
+    told = tmlattice("check", str(SMALL), "bad", cwd=tmp_path, check=1)
+    assert "sign" in told.stdout

@@ -1,0 +1,444 @@
+"""The data checks: what is wrong with a measurement as a whole, before any fault is sought.
+
+>>> checkup = check_data(load_ring("petra3"), read_measurement("day_1"))
+>>> [check.sentence for check in checkup.told]
+
+Global before local: a wrong sign, unit or order everywhere is told in a second, with the mend and
+with what to assume to go on; then launches, noise, monitors and single readings.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.by_name import by_name
+from tmlattice.diagnosis import signals
+from tmlattice.diagnosis.absent import in_the_lattice
+from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
+from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
+from tmlattice.diagnosis.stored_data_checks import StoredData, stored_checks
+from tmlattice.effects import Cause, expected_radiation
+from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import (
+    AnyMeasurement,
+    ClosedOrbit,
+    Dispersion,
+    Measurement,
+    OrbitResponse,
+    TuneReading,
+    TurnByTurn,
+    in_words,
+)
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.measurement.lost_beam import beam_lost
+from tmlattice.observe.evidence import Names, Verdict, certain
+from tmlattice.observe.global_errors import GlobalErrors
+from tmlattice.observe.noise import PASSES, noise_scatter
+from tmlattice.observe.response_data import response_data
+from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors, ResponseVerdict
+from tmlattice.observe.sections import Passes, SectionFits
+
+Array = NDArray[np.float64]
+
+ENERGY = 0.02
+"""Share by which a stated beam energy may differ from the lattice's."""
+ALIEN = 0.85
+"""Share of the orbit that no trajectory of a section explains, of which noise or readings in no
+order leave all and strong errors everywhere 0.7: the data are of another ring."""
+CORRECTED = 0.1
+"""Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
+the lattice that is wrong."""
+FAR = 100.0
+"""Square of the sigma by which launches may differ from the stated ones, by
+benchmarks/data_checks.py."""
+EXACT = 0.01
+"""Share of the launches that gains of the first monitors spoil them by."""
+SECTIONS = 4
+"""At least, that tell what is usual."""
+SPOILT = 3.0
+"""Misfit of a section, over the typical one, from which it is not trusted."""
+OVER, UNDER = 2.5, 3.0
+"""Factors by which a stated noise may be too large, and too small."""
+_UNIT = "-in-"
+"""In the names of assumptions about a unit."""
+SCALED = 3.0
+"""Times what the design makes of it, or as small a part, no RF's orbit is."""
+SPIKE = 20.0
+"""Sigma from which one reading is wrong for once, where its neighbours agree without it."""
+
+
+@by_name
+def check_data(
+    ring: Ring,
+    data: AnyMeasurement,
+    *,
+    assumed: Sequence[str] = (),
+    radiation: bool = False,
+) -> Checkup:
+    """What is wrong with a measurement as a whole.
+
+    Args:
+        ring: the design.
+        data: of any kind.
+        assumed: what was written down wrongly, names of `ASSUMPTIONS`; it is undone first. Of first
+            turns and of orbit responses alone.
+        radiation: the model radiates as expected.
+
+    Raises:
+        MeasurementError: an assumption without meaning for these data.
+        UnknownNameError: an unknown assumption, or names that mostly are not the lattice's.
+    """
+    begun = time.perf_counter()
+    names = [monitor.name for monitor in ring.monitors]
+    data, absent = in_the_lattice(ring, data)
+    stated = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
+    if not isinstance(data, Measurement | OrbitResponse):
+        return _of_stored(ring, data, assumed, stated, begun)
+    kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
+    few = signals.few(ring, data)
+    checks = stated
+    if few is not None:
+        checks.append(few)
+    elif isinstance(data, Measurement):
+        known = tuple(expected_radiation(ring)) if radiation else ()
+        corrected = assume(in_beam_order(data, names), assumed, names)
+        checks += _of_first_turns(ring, corrected, known)
+    else:
+        checks += _of_response(ring, assume(in_beam_order(data, names), assumed, names))
+    return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
+
+
+def _of_stored(
+    ring: Ring, data: StoredData, assumed: Sequence[str], stated: Sequence[Check], begun: float
+) -> Checkup:
+    if assumed:
+        raise MeasurementError(
+            f"'{assumed[0]}' cannot be assumed of {in_words(data)}: mend the data themselves"
+        )
+    kinds = {
+        TurnByTurn: "turn_by_turn", ClosedOrbit: "closed_orbit", Dispersion: "dispersion",
+        TuneReading: "tunes",
+    }  # fmt: skip
+    checks = (*stated, *stored_checks(ring, data))
+    return Checkup(kinds[type(data)], checks, _provenance(ring, assumed, False, begun))
+
+
+_GLOBAL = "signs, units and order"
+_REPORTED = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
+"""Of what is noted, what the diagnosis does not find by itself."""
+
+
+def data_checks(
+    ring: Ring,
+    data: Measurement | OrbitResponse,
+    radiation: bool = False,
+    reference: Measurement | OrbitResponse | None = None,
+) -> list[str]:
+    """What a diagnosis of these data, and of a reference beside them, has to say of them.
+
+    Raises:
+        MeasurementError: something has to be mended first.
+        UnknownNameError: see `check_data`.
+    """
+    own = check_data(ring, data, radiation=radiation)
+    if reference is None:
+        own.stop()
+        return [check.sentence for check in own.reported if check.name in _REPORTED]
+    other = check_data(ring, reference, radiation=radiation)
+    wrong, as_wrong = (
+        {check.name for check in one.checks if check.status == "wrong"} for one in (own, other)
+    )
+    alone = "{} alone (mend its file, --assume is of both): "
+    own.stop("" if wrong <= as_wrong else alone.format("the second measurement"))
+    other.stop(alone.format("the reference"))
+    text, reported = (
+        [check.sentence for check in one.reported if check.name in _REPORTED]
+        for one in (own, other)
+    )
+    return text + [f"the reference: {sentence}" for sentence in reported if sentence not in text]
+
+
+Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)
+
+
+def corrected_data(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
+    """The data, if there are some, with what is assumed undone."""
+    if data is None or not assumed:
+        return data
+    return assume(data, assumed, [monitor.name for monitor in ring.monitors])
+
+
+def _provenance(
+    ring: Ring, assumed: Sequence[str], radiation: bool, begun: float
+) -> dict[str, object]:
+    from tmlattice import __version__
+
+    return {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"assume": list(assumed), "radiation": radiation},
+        "seconds": time.perf_counter() - begun,
+    }
+
+
+def _stated(ring: Ring, data: AnyMeasurement) -> Check:
+    """What the data say of their lattice and energy."""
+    if data.energy is None:
+        return fine("energy", "the data state no energy")
+    if abs(data.energy / ring.energy - 1) > ENERGY:
+        return note(
+            "energy",
+            f"the data state a beam energy of {data.energy:g} GeV, the lattice {ring.energy:g}: "
+            "name this machine's lattice, or its energy (--energy)",
+        )
+    return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
+
+
+# --- first turns ----------------------------------------------------------------------------------
+def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
+    lost = beam_lost(data)
+    data = lost.without
+    read = np.asarray(np.isfinite(data.readings).any(axis=(0, 1, 3)))
+    reached = ~signals.not_reached(~read)
+    flat = data.readings.reshape(-1, len(data.monitors), 2)[:, reached]
+    names = [name for name, there in zip(data.monitors, reached, strict=True) if there]
+    moved = bool(np.ptp(data.launches, axis=0).any()) or any(data.settings)
+    checks = [
+        *signals.monitors(ring, names, flat, moved), *signals.first_turns(ring, data, lost)
+    ]  # fmt: skip
+    if any(check.status == "wrong" for check in checks):
+        return checks  # nothing can be fitted to such turns
+    judge = GlobalErrors(ring, data, known)
+    verdicts = judge.verdicts()
+    for verdict in verdicts:
+        judge = judge.corrected(verdict.names)
+    passes, found = judge.found(judge.measurement)
+    lattice = _lattice(ring, judge, passes, found)
+    if lattice.status == "wrong":  # no wrong sign, unit or order mends that
+        return [*checks, lattice]
+    checks += [*_global(verdicts), lattice]
+    if any(check.status == "wrong" for check in checks):
+        return checks  # until that is mended, noise and launches mean nothing
+    return [*checks, _launches(judge), _noise(judge, passes, found), _spikes(judge, passes, found)]
+
+
+def _global(verdicts: Sequence[Verdict]) -> list[Check]:
+    """One sentence for each global error."""
+    if not verdicts:
+        return [fine(_GLOBAL, "no global error would make the data agree better")]
+    return [_sentence(verdict) for verdict in verdicts]
+
+
+def _sentence(verdict: Verdict) -> Check:
+    words, others, mend = _words(verdict.names, verdict.alike)
+    where, before, after = "", verdict.before[0], verdict.after[0]
+    if not before > 2 * after:  # the sections agree either way: the launches tell
+        where, before, after = " of the launches", verdict.before[1], verdict.after[1]
+    if not np.isfinite(before):
+        where, before, after = "", verdict.before[0], verdict.after[0]
+    sure = certain(verdict)
+    text = (
+        f"{words if sure else f'it may be that {words}'}{others}: chi-square per reading{where} "
+        f"{_number(before)} as stated, {_number(after)} with that undone; {mend}"
+    )
+    make = wrong if sure else note
+    return make("signs, units and order", text, before=before, after=after, assume=verdict.names)
+
+
+def _options(names: Iterable[str]) -> str:
+    return " ".join(f"--assume {name}" for name in names)
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:.3g}"
+
+
+def _lattice(ring: Ring, judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+    """Whether the readings follow trajectories of this ring at all."""
+    share = found.share(passes)
+    if not np.isfinite(share):
+        return fine("lattice", "too few monitors to say whether this is the machine's lattice")
+    stated = judge.measurement.noise is not None
+    if share > ALIEN and not (stated and found.level < 4):
+        return wrong(
+            "lattice",
+            f"the readings follow no trajectory of '{ring.name}': {100 * share:.0f} % of the orbit "
+            "is left even between neighbouring monitors; name the lattice of this machine, and "
+            "check the names and the order of the monitors",
+            before=found.level if stated else None,
+        )
+    return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
+
+
+def _launches(judge: GlobalErrors) -> Check:
+    """Fitted launches against the stated ones."""
+    square = max(judge.square([()]), 1.0)
+    data = judge.measurement
+    if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
+        return fine("launches", "no launch is stated; they are fitted")
+    own, misfit = judge.launches(square, EXACT)
+    good = misfit < SPOILT * square  # else a fault of the first magnets spoils the fit
+    sections = judge.found(data)[1].misfit.shape[1]
+    if not good.any() or sections < SECTIONS:
+        return fine("launches", "too few good monitors near the start to judge the launches")
+    worst = float(np.median(own[good], axis=0).max())
+    if worst > FAR:
+        return note(
+            "launches",
+            f"the fitted launches differ from the stated ones by {np.sqrt(worst):.0f} of their "
+            "launch_sigma, unless something is wrong before the first monitors: mend the launches "
+            "or their rms, or go on with --assume launches-unknown",
+            before=worst, assume=("launches-unknown",),
+        )  # fmt: skip
+    return fine("launches", "the fitted launches are the stated ones")
+
+
+def _noise(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+    """The stated noise against what neighbouring monitors leave."""
+    level = float(np.sqrt(found.level))
+    if not np.isfinite(level):
+        return fine("noise", "too few monitors to judge the noise")
+    typical = float(np.median(passes.sigma))
+    if judge.measurement.noise is None:
+        return fine("noise", f"none is stated; the readings leave {_micro(level * typical)}")
+    if level < 1 / OVER:
+        return wrong(
+            "noise",
+            f"the stated noise of {_micro(typical)} is {1 / level:.1f} times what neighbouring "
+            f"monitors leave ({_micro(level * typical)}; chi-square per reading {level**2:.2g}): "
+            "state the noise of one reading, or go on with --assume noise-from-data",
+            before=level**2, after=1.0, assume=("noise-from-data",),
+        )  # fmt: skip
+    random = noise_scatter(passes, found)
+    if random is not None and random > UNDER:
+        return wrong(
+            "noise",
+            f"the stated noise of {_micro(typical)} is too small: from shot to shot the readings "
+            f"scatter by {_micro(random * typical)} about the trajectories that their neighbours "
+            f"follow (chi-square per reading {level**2:.3g}): state the noise of one reading, or "
+            "go on with --assume noise-from-data",
+            before=level**2, after=1.0, assume=("noise-from-data",),
+        )  # fmt: skip
+    text = f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}"
+    if level <= UNDER:
+        return fine("noise", text)
+    if random is None:
+        return note(
+            "noise",
+            f"{text}: the noise is larger than stated, or errors all along the ring are as large; "
+            f"{len(judge.measurement.shots)} shots do not show which: take {PASSES} or more",
+        )
+    return fine(
+        "noise",
+        f"{_micro(typical)} is stated, and the scatter from shot to shot is no larger; neighbours "
+        f"leave {_micro(level * typical)}, the same or in proportion in all shots: errors of the "
+        "machine",
+    )
+
+
+def _micro(metres: float) -> str:
+    return f"{1e6 * metres:.3g} µm"
+
+
+def _spikes(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+    """Single readings far off, where the same section of other shots agrees."""
+    none = fine("spikes", "no single reading is far off")
+    there = found.freedom > 2
+    if len(found.misfit) < 3 or not there.any():
+        return none
+    square = found.level
+    usual = np.median(found.misfit, axis=0) < SPOILT * square  # [section]
+    odd = there & (found.misfit > SPOILT * square) & usual
+    reported = []
+    for p, w in np.argwhere(odd):
+        alone = found.left[p, w] ** 2 / np.maximum(found.free[p, w], 0.05)
+        worst = int(alone.argmax())
+        rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
+        if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
+            name = judge.measurement.monitors[found.owner[w, worst]]
+            shot = judge.measurement.shots[passes.shot[p]]
+            reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
+    if not reported:
+        return none
+    return note("spikes", f"single readings far off: {signals.some(reported)}; leave them empty")
+
+
+# --- an orbit response ----------------------------------------------------------------------------
+def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
+    checks = signals.monitors(ring, data.monitors, data.response)
+    if any(check.status == "wrong" for check in checks):
+        return checks
+    judge = ResponseGlobalErrors(ring, data)
+    verdicts = judge.verdicts()
+    for verdict in verdicts:
+        judge = judge.corrected(verdict.names)
+    left = judge.misfit(())
+    typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
+    if typical > (CORRECTED if verdicts else ANOTHER):
+        guess = _far(ring, data)
+        if guess is not None and guess.left < BETTER * typical:
+            far = note(
+                "lattice",
+                f"the lattice of '{ring.name}' is far from the ring that was measured, which it "
+                f"resembles with all focusing quadrupoles changed by {100 * guess.focusing:+.0f} % "
+                f"and all defocusing ones by {100 * guess.defocusing:+.0f} %; signs and the order "
+                "of the data are not looked at",
+            )
+            # a wrong unit is seen with any lattice
+            units = [own for own in verdicts if all(_UNIT in name for name in own.names)]
+            return [*checks, *map(_of_all, units), *_rf_step(judge), far]
+    if typical > ANOTHER:  # no wrong sign, unit or order mends that
+        return [*checks, wrong(
+            "lattice",
+            f"the response is not that of '{ring.name}': the typical column differs from the "
+            f"design's by {100 * np.sqrt(typical):.0f} % of its size; name the lattice of this "
+            "machine, and check the names and the order of monitors and correctors",
+        )]  # fmt: skip
+    if not verdicts:
+        checks.append(fine(_GLOBAL, "no global error would make the response agree better"))
+    text = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
+    return [*checks, *map(_of_all, verdicts), *_rf_step(judge), fine("lattice", text)]
+
+
+def _of_all(verdict: ResponseVerdict) -> Check:
+    words, others, mend = _words(verdict.names, verdict.alike)
+    before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
+    text = (
+        f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
+        f"stated, by {after:.0f} % with that undone; {mend}"
+    )
+    return wrong(_GLOBAL, text, assume=verdict.names)
+
+
+def _rf_step(judge: ResponseGlobalErrors) -> list[Check]:
+    scale = judge.rf_scale()
+    if not max(abs(scale), 1 / abs(scale)) > SCALED:
+        return []
+    text = (
+        f"the RF's orbit is {scale:.3g} times what its step makes of the design's: mend its unit "
+        "(m) or the step's (Hz), or leave it out"
+    )
+    return [wrong("RF step", text)]
+
+
+def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
+    """Where the design would resemble the data, if it is far from them."""
+    try:
+        return elsewhere(response_data(ring, data))
+    except TmlatticeError:  # of which more is said by who needs it
+        return None
+
+
+def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
+    """What is wrong, what else it might be, and the mend."""
+    words = " and ".join(ASSUMPTIONS[n].words for n in names)
+    others = "; ".join(
+        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}" for own in alike
+    )
+    mends = ", ".join(dict.fromkeys(ASSUMPTIONS[n].mend for n in names))
+    return words, f" ({others})" if others else "", f"{mends}, or go on with {_options(names)}"

@@ -1,0 +1,214 @@
+"""Which supplies, magnets and devices changed: candidates weighed by evidence.
+
+>>> findings, scatter = what_changed(state, judgement, left_open(reference))
+
+Magnets of a supply scatter in their change, and by how much says how well a change of a supply is
+known. What a fit of every magnet learns of it has the changes of single magnets in it; so the
+scatter, too, is what the evidence of the candidates beside it wants. Where some supplies changed
+others may have, too, that cannot be told one by one: by how much is learnt in the same way.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from tmlattice.diagnosis.families.family import Family
+from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.findings import cause_of, finding_of
+from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, strongest
+from tmlattice.diagnosis.result import Finding
+from tmlattice.effects import Cause
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.alternatives import Detection
+from tmlattice.inference.common_factors import CommonFactor, FactorModel, GivenOthers
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.normal import solve
+from tmlattice.lattice import Ring
+from tmlattice.lattice.supplies import supplied_alike
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_problem import Response
+
+Array = NDArray[np.float64]
+
+MOST = 40
+"""Changes of a plane at most: many supplies may be changed on purpose."""
+REPRODUCED = 1e-4
+"""Relative: as well a magnet comes back, and half of it a supply; a smaller change is none."""
+STRAY = 3e-5
+"""1/m: as well a gradient beside the quadrupoles comes back: the orbit in a sextupole moves."""
+USUAL = 1e-2
+"""Prior rms of a change: relative, or of integrated gradients in 1/m."""
+ALONE = 2.0
+"""Log odds of a supply that changed against one of its magnets alone, or a field elsewhere."""
+AGAIN = 3
+"""How often it is asked anew what changed, beside what the ring's errors make of what was found."""
+FINER = 0.5
+"""Steps in which less scatter is tried."""
+OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
+"""Rms of the changes of supplies that cannot be told, relative, that are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """What may have changed, as causes of amount one, and what each moves."""
+
+    causes: tuple[tuple[str, str], ...]
+    members: Array  # [number, candidate]
+    scatter: Array  # covariance of single numbers, [number, number]
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """Candidates beside some scatter, those that are there, and the log evidence of all that."""
+
+    among: _Candidates
+    there: GivenOthers
+    evidence: float
+
+
+def changed_supplies(
+    state: State, judgement: Judgement, open_: Undetermined | None = None
+) -> tuple[list[Finding], dict[str, float]]:
+    """Supplies, magnets and devices that changed: all of them, for what is left out is scatter.
+
+    Args:
+        state: of a fit of the change.
+        judgement: of the sets of rivals.
+        open_: what is not known of the ring that changed; None: it is known.
+
+    Returns:
+        The findings; and by how much magnets of a supply scatter in their change, rms, relative,
+        and supplies that are not told (0: they did not), by the effects' names; empty where no
+        quadrupoles were fitted.
+    """
+    found, scatter = _found(state, judgement, {})
+    if open_ is None or not found:
+        return found, scatter
+    data = state.data
+    base = Predicted(data, Errors.none(data)).bend()
+    problem = Response(base=base, used=np.isfinite(data.orbits), places={})
+    for _ in range(AGAIN):
+        before = {(own.effect, own.element) for own in found}
+        try:
+            blurred = _blurred(problem, open_, found)
+        except UnstableRingError:  # what was found is too much for the ring
+            break
+        found, scatter = _found(state, judgement, blurred)
+        if not found or {(own.effect, own.element) for own in found} == before:
+            break
+    return found, scatter
+
+
+def _blurred(problem: Response, open_: Undetermined, found: Sequence[Finding]) -> dict[int, Array]:
+    """What errors of the ring that are not known make of what changed, m, of each block [error,
+    column, monitor]."""
+    data = problem.base.data
+    causes = [cause_of(own) for own in found]
+    spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
+    return {
+        block: np.array([data.pick(own, block) for own in spread]).reshape(-1, *data.shape)
+        for block in (0, 1)
+    }
+
+
+def _found(
+    state: State, judgement: Judgement, blurred: Mapping[int, Array]
+) -> tuple[list[Finding], dict[str, float]]:
+    found: list[Finding] = []
+    of_magnets: dict[str, float] = {}
+    for block in (0, 1):
+        fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}
+        if not fitted:
+            continue
+        there = linear(state, block)
+        if block in blurred:
+            there = with_numbers(there, state, block, "left open", blurred[block])
+        scatter, own = _by_evidence(state, block, there, fitted)
+        if QuadrupoleGradient.name in scatter:
+            of_magnets = {**scatter, FamilyGradient.name: own.there.rms}
+        found += [
+            _finding(state.data.ring, own.among.causes, reason, judgement)
+            for reason in own.there.levels.reasons(own.there.chosen, own.there.over)
+        ]
+    return found, of_magnets
+
+
+def _by_evidence(
+    state: State, block: int, there: Linear, fitted: Mapping[str, Family]
+) -> tuple[dict[str, float], _Weighed]:
+    """The scatter of each family, at most what a fit of all has learnt, and what is there."""
+    information, pull = marginal(there, list(fitted))
+    wider = _widened(state, block, there)
+
+    def weighed(scatter: Mapping[str, float]) -> _Weighed:
+        among = _candidates(state, fitted.values(), scatter)
+        odds = [0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]
+        levels = FactorModel(
+            information / wider**2, pull / wider**2, among.members, among.scatter,
+            np.full(len(odds), USUAL), np.array(odds),
+        )  # fmt: skip
+        supplies = [i for i, (name, _) in enumerate(among.causes) if name == FamilyGradient.name]
+        there = levels.given_others(levels.choose(MOST), supplies, OTHERS)
+        evidence = there.levels.background + there.levels.log_evidence(there.chosen)
+        return _Weighed(among, there, evidence)
+
+    least = {
+        f.name: REPRODUCED if isinstance(f, QuadrupoleGradient) else STRAY for f in fitted.values()
+    }
+    known = {name: group.rms for name, group in state.groups.items()}
+    scatter = {name: max(known.get(name, 0.0), lowest) for name, lowest in least.items()}
+    best = weighed(scatter)
+    for name, learnt in dict(scatter).items():
+        finer = learnt
+        while finer > least[name]:
+            finer = max(FINER * finer, least[name])
+            other = weighed({**scatter, name: finer})
+            if other.evidence > best.evidence:
+                best, scatter = other, {**scatter, name: finer}
+    return scatter, best
+
+
+def _candidates(
+    state: State, fitted: Iterable[Family], scatter: Mapping[str, float]
+) -> _Candidates:
+    causes: list[tuple[str, str]] = []
+    blocks: list[Array] = []
+    covariance: list[Array] = []
+    for family in fitted:
+        places = family.places(state.data)  # type: ignore[attr-defined]
+        own = np.eye(len(places))
+        quadrupoles = isinstance(family, QuadrupoleGradient)
+        name = QuadrupoleGradient.name if quadrupoles else family.name
+        alone = scatter[family.name] ** 2 * own
+        if quadrupoles:
+            kinds, members = supplied_alike(state.data.ring)
+            alone = alone + (REPRODUCED / 2) ** 2 * members @ members.T
+            causes += [(FamilyGradient.name, kind) for kind in kinds]
+            own = np.hstack([members, own])
+        covariance.append(alone)
+        causes += [(name, place) for place in places]
+        blocks.append(own)
+    return _Candidates(tuple(causes), block_diag(*blocks), block_diag(*covariance))
+
+
+def _widened(state: State, block: int, there: Linear) -> float:
+    """By what errors grow, for the noise was learnt from readings that were fitted."""
+    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    fitted = float(np.sum(1 - np.diag(posterior.covariance)))
+    count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
+    return float(np.sqrt(count / max(count - fitted, count / 4)))
+
+
+def _finding(
+    ring: Ring, names: Sequence[tuple[str, str]], own: CommonFactor, judgement: Judgement
+) -> Finding:
+    chance = np.array([p for _, p in own.alternatives])
+    causes = [Cause(*names[c], own.amount) for c, _ in own.alternatives]
+    shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
+    seen = Detection.among(own.statistic, len(names))
+    return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)

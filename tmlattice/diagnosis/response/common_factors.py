@@ -1,0 +1,321 @@
+"""Few reasons behind many gradient errors: one scale, focusing, regions, types, families, magnets.
+
+>>> found = explain_gradients(fit.state)
+>>> [(own.kind, own.name, own.amount, own.amount_sigma) for own in found.reasons]
+
+A dense fit ends in an error of every quadrupole. Here the same readings are asked which few numbers
+that many magnets share explain them: candidates of every level are weighed by evidence
+(`inference.levels`), beside other sets of them that say the same (`inference.sets`), with the
+scatter of single magnets, as the fit has learnt it, in every error. Single magnets that stay far
+off all the same are flagged, with the neighbours they pull against.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.response.linear import linear, marginal
+from tmlattice.diagnosis.response.sharing import Candidates, candidates
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.stated import of_readings, of_sizes
+from tmlattice.diagnosis.support import share_from_data
+from tmlattice.inference.common_factors import MIN_CHI2, FactorModel
+from tmlattice.inference.normal import solve
+from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
+from tmlattice.lattice.supplies import magnets
+
+Array = NDArray[np.float64]
+
+USUAL = 1e-2
+"""Prior rms of a shared error, relative."""
+LEAST_SCATTER = 1e-4
+"""Relative: no two magnets are more alike."""
+TOLERANCE = 0.02
+"""Relative: no sound magnet is further from its family."""
+BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
+"""By how much families may differ from one another, relative rms."""
+MORE = 3.0
+"""Log evidence that is asked for them to differ at all."""
+FEWEST = 3
+"""Families that tell by how much they differ."""
+MOST = 20
+"""Reasons at most: more are no explanation."""
+SETS, LIKELY = 3, 0.05
+"""Other sets of reasons that are told at most, and how likely they have to be."""
+AGAINST = 0.4
+"""Correlation from which magnets pull against each other."""
+SHOWN = 3
+"""Neighbours that are named."""
+COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
+"""Log odds against a reason of each kind, beside those of how many there are."""
+MAKES = {
+    "all": "the beam's energy is other than the magnets' by as much with the other sign, or all "
+    "gradients are calibrated so: the response does not part the two",
+    "focusing": "the calibration of one polarity: its supplies, or the tunes were set so",
+    "region": "one supply, or one setting, of the magnets there; or the beam's orbit and fringe "
+    "fields there are not the model's",
+    "type": "the calibration or the fringe field of this type of magnet",
+    "family": "their supply: its current, its calibration curve, or a wrong setting in the lattice "
+    "file",
+    "magnet": "this magnet alone: a shorted turn, a wrong tap, or a field beside it that the "
+    "lattice does not have",
+}
+"""What would make a reason of each kind."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One number that many magnets share, or one magnet.
+
+    Attributes:
+        kind: see `MAKES`.
+        name: of what shares it.
+        members: the magnets, by their first pieces.
+        amount, amount_sigma: relative change of the gradients; in the error are the scatter of
+            single magnets, and what the amount is in other sets of reasons as likely as they are.
+        probability: that it is there, of all sets of reasons.
+        statistic: chi-square that it explains beside all the others.
+        makes: what would make it.
+        rivals: what the data do not exclude in its place, with probabilities.
+        share_from_data: of the amount, 1 - posterior variance / prior variance.
+    """
+
+    kind: str
+    name: str
+    members: tuple[str, ...]
+    amount: float
+    amount_sigma: float
+    probability: float
+    statistic: float
+    makes: str
+    rivals: tuple[tuple[str, float], ...]
+    share_from_data: float = 1.0
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        rivals = [{"name": name, "probability": p} for name, p in self.rivals]
+        return {**vars(self), "members": list(self.members), "rivals": rivals}
+
+
+@dataclass(frozen=True)
+class Instead:
+    """Another set of reasons for the same gradients.
+
+    Attributes:
+        probability: among all sets.
+        amounts: of each reason in it: name, amount and error, relative.
+    """
+
+    probability: float
+    amounts: tuple[tuple[str, float, float], ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        common_factors = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
+        return {"probability": self.probability, "common_factors": common_factors}
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A magnet further from its reasons than magnets are.
+
+    Attributes:
+        element: its first piece.
+        amount, amount_sigma: relative, beyond what it shares.
+        share_from_data: of the amount, 1 - posterior variance / prior variance.
+        against: neighbours that it pulls against: name, amount and correlation.
+    """
+
+    element: str
+    amount: float
+    amount_sigma: float
+    against: tuple[tuple[str, float, float], ...]
+    share_from_data: float
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        against = [{"element": n, "amount": a, "correlation": c} for n, a, c in self.against]
+        return {**vars(self), "against": against}
+
+
+@dataclass(frozen=True)
+class CommonFactors:
+    """What is behind the gradients.
+
+    Attributes:
+        reasons: by falling chi-square; the likeliest set.
+        instead: other sets that are likely, by falling probability.
+        outliers: by falling size.
+        share: of the gradients' mean square, that the reasons hold.
+        scatter: rms of single magnets about them, relative.
+        between: rms of families about what they share, relative; 0 where they are alike, or are a
+            reason one by one.
+    """
+
+    common_factors: tuple[Reason, ...]
+    instead: tuple[Instead, ...]
+    outliers: tuple[Outlier, ...]
+    share: float
+    scatter: float
+    between: float
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {
+            "common_factors": [own.as_json() for own in self.common_factors],
+            "instead": [own.as_json() for own in self.instead],
+            "outliers": [own.as_json() for own in self.outliers],
+            "share": self.share,
+            "scatter": self.scatter,
+            "between_families": self.between,
+        }
+
+
+def explain_gradients(state: State) -> CommonFactors | None:
+    """The few reasons behind the gradients of a dense fit; None where none were fitted."""
+    family = QuadrupoleGradient()
+    if family.variable not in state.values or not family.size(state.data):
+        return None
+    there = linear(state, 0)
+    information, pull = marginal(there, [family.variable])
+    own = magnets(state.data.ring, ("quadrupole",), True)
+    among = candidates(state.data.ring, own)
+    kinds, names, members, _ = among
+    known = state.groups.get(family.name)
+    scatter = max(LEAST_SCATTER if known is None else known.rms, LEAST_SCATTER)
+    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    rows = there.where[family.variable]
+    spread = posterior.spread[rows]
+    covariance = spread @ posterior.covariance @ spread.T
+    # what the stated errors have more than the posterior's is no scatter of the magnets; but it is
+    # in every error as that is
+    plain = np.maximum(np.diag(covariance), 1e-24)
+    wider = of_readings(state, 0, there, posterior)[rows] / np.sqrt(plain)
+    sizes = of_sizes(state, 0, there)[rows]
+    more = np.sqrt(np.maximum(wider**2 - 1, 0))
+    beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
+    covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
+    between, levels, sets = weighed(information, pull, among, beside)
+    found = [
+        (one, chance)
+        for one, chance in over_sets(levels, sets)
+        if one.statistic >= MIN_CHI2  # families that do not stand out are in the sets all the same
+    ]
+    places = [pieces[0].name for pieces in own]
+    common_factors = tuple(
+        Reason(
+            kinds[one.candidate], names[one.candidate],
+            tuple(places[i] for i in np.flatnonzero(members[:, one.candidate])),
+            one.amount, one.sigma, chance, one.statistic, MAKES[kinds[one.candidate]],
+            tuple((names[c], p) for c, p in one.alternatives[1:]),
+            share_from_data(one.sigma, float(levels.slab[one.candidate])),
+        )
+        for one, chance in found
+    )  # fmt: skip
+    values = state.values[family.variable]
+    shared = sum((sets[0].amount(c) * members[:, c] for c in sets[0].chosen
+                  if kinds[c] != "magnet"), np.zeros(len(own)))  # fmt: skip
+    size = float(np.sum(values**2))
+    left = values - shared
+    instead = tuple(
+        Instead(one.probability, tuple(
+            (names[c], one.amount(c), float(np.sqrt(one.variance(c))))
+            for c, square in zip(one.chosen, levels.squares(one.chosen), strict=True)
+            if square >= MIN_CHI2
+        ))
+        for one in sets[1 : SETS + 1] if one.probability > LIKELY
+    )  # fmt: skip
+    return CommonFactors(
+        common_factors,
+        instead,
+        _outliers(
+            places,
+            left,
+            values,
+            sigma,
+            covariance / np.outer(sigma, sigma),
+            np.sqrt(np.sum(spread**2, axis=1)),
+        ),
+        1 - float(np.sum(left**2)) / size if size else 0.0,
+        float(np.sqrt(np.mean(left**2))),
+        between,
+    )
+
+
+def weighed(
+    information: Array, pull: Array, among: Candidates, beside: Array
+) -> tuple[float, FactorModel, list[LikelySet]]:
+    """How much families differ, by evidence, and the sets of reasons beside that.
+
+    Where families differ by no more than their magnets, one that is off is a reason as others are.
+    Where each has a calibration of its own, no sum of a few reasons is right, and all are in every
+    set, with the prior that their scatter is: else the errors of what many of them share would be
+    those of families that are alike. A magnet without a family is one of its own.
+
+    Args:
+        information: J^T W J of the gradients, nuisances taken out, [magnet, magnet].
+        pull: J^T W y with all gradients at zero, [magnet].
+        among: the candidates.
+        beside: covariance of the scatter of single magnets, [magnet, magnet].
+
+    Returns:
+        Rms of families about what they share, relative, 0 where they are alike; the candidates
+        weighed beside one another; the likely sets of them.
+    """
+    cost = np.array([COST[kind] for kind in among.kinds])
+    families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)
+    alone = np.diag(1.0 - np.minimum(among.members[:, families].sum(axis=1), 1.0))
+
+    def levels(at: NDArray[np.int64], between: float) -> FactorModel:
+        share = among.members[:, families] * between
+        scatter = beside + share @ share.T + between**2 * alone
+        slab = np.full(len(at), max(USUAL, between))
+        return FactorModel(information, pull, among.members[:, at], scatter, slab, cost[at])
+
+    alike = levels(np.arange(len(cost)), 0.0)
+    best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + MORE
+    for between in BETWEEN if len(families) >= FEWEST else ():
+        tried = levels(others, between)
+        evidence = tried.background + tried.log_evidence(tried.choose(MOST))
+        if evidence > known:
+            best, known = between, evidence
+    if not best:
+        return 0.0, alike, likely_sets(alike, MOST)
+    slab = np.full(len(cost), max(USUAL, best))
+    slab[families] = best
+    whole = FactorModel(information, pull, among.members, beside + best**2 * alone, slab, cost)
+    sets = []
+    for one in likely_sets(levels(others, best), MOST):
+        chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())
+        sets.append(LikelySet(chosen, one.probability, *whole.fitted(chosen)))
+    return best, whole, sets
+
+
+def _outliers(
+    places: Sequence[str],
+    left: Array,
+    values: Array,
+    sigma: Array,
+    correlation: Array,
+    prior: Array,
+) -> tuple[Outlier, ...]:
+    found = []
+    for i in np.flatnonzero(np.abs(left) - sigma > TOLERANCE).tolist():
+        other = np.argsort(-np.abs(correlation[i]))
+        pulls = [int(j) for j in other if j != i and abs(correlation[i, j]) > AGAINST][:SHOWN]
+        against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)
+        found.append(
+            Outlier(
+                places[i],
+                float(left[i]),
+                float(sigma[i]),
+                against,
+                share_from_data(float(sigma[i]), float(prior[i])),
+            )
+        )
+    return tuple(sorted(found, key=lambda one: -abs(one.amount)))

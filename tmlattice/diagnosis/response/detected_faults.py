@@ -1,0 +1,410 @@
+"""Single faults of an orbit response among small errors everywhere.
+
+>>> found = singled_out(data, split, fit.state, hypotheses, judgement)
+>>> [(one.cause, one.sigma, one.statistic) for one in found.faults]
+
+One cause after another is given a prior of its own beside all usual small errors
+(`small_errors`), whose sizes are learnt again without it, and everything settles anew, not
+linearised. It is a fault where it stands out by five standard deviations of what its family does,
+and by more than chance among so many causes and families of so many members.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from tmlattice.diagnosis.families.orbit_modes import HorizontalOrbit, VerticalOrbit
+from tmlattice.diagnosis.recommended_actions import recommended_action
+from tmlattice.diagnosis.response.faults import Fault, as_turned
+from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, Step, fit_chi2
+from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.others import KINDS, with_number
+from tmlattice.diagnosis.response.rounds import log_evidence, settle
+from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
+from tmlattice.diagnosis.response.state import Apart, State, allow, bend
+from tmlattice.diagnosis.response.stated import doubt
+from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
+from tmlattice.diagnosis.response.validation import Chi2, score
+from tmlattice.effects import Cause, find, rare
+from tmlattice.errors import TmlatticeError
+from tmlattice.inference.alternatives import linear_evidence
+from tmlattice.inference.common_factors import MIN_CHI2
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.normal import solve
+from tmlattice.inference.priors import Group
+from tmlattice.inference.scan import Scan
+from tmlattice.observe.orbit_response import Hypothesis
+from tmlattice.observe.response_data import ResponseData
+from tmlattice.observe.response_problem import Response
+from tmlattice.observe.split import Split
+
+Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+ORBITS = (HorizontalOrbit.name, VerticalOrbit.name)
+FAULTS = 8
+"""At most: more are a family."""
+WORTH, HIDDEN = 15.0, 8.0
+"""Statistic, with sizes not yet learnt without it, from which on a cause is tried: of one number of
+a family, and of others, which make all patterns of an orbit larger."""
+TRIES = 3
+"""Causes that are tried at a step; one alone in a response of many readings."""
+NEAR, SHARE = 8.0, 0.1
+"""Log evidence by which another one may be behind the likeliest to be tried beside it, and what of
+the statistic adds to it: the linear model errs by a share of that."""
+BEHIND = 2.0
+"""Log evidence by which a rival has to be ahead, where a cause was put in, to be tried instead."""
+LISTED = 24
+"""Rivals of a fault that are told apart."""
+BEYOND = 1.5
+"""Times the largest fault: a larger amount is none."""
+LACKS = 2.0
+"""Chi-square per reading of each plane beside small errors, up to which faults are sought in any
+case."""
+WORSE = 1.02
+"""What held-out correctors may be left more with the faults than without, at most."""
+MEMBERS = 16
+"""As many as an orbit's patterns, where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedFaults:
+    """What stands out.
+
+    Attributes:
+        state: small errors, and beside them the faults.
+        faults: by falling statistic.
+    """
+
+    state: State
+    faults: tuple[Fault, ...]
+
+
+def detected_faults(
+    data: ResponseData,
+    split: Split,
+    fitted: State,
+    hypotheses: Sequence[Hypothesis],
+    most: int,
+    judgement: Judgement,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> DetectedFaults:
+    """Faults one after another, each beside those before it.
+
+    Args:
+        data, split: what was measured, and who judges.
+        fitted: a dense fit of it.
+        hypotheses: what may be wrong alone.
+        most: faults at most.
+        judgement: thresholds.
+        progress: told what is being done.
+    """
+    progress("small errors")
+    search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
+    progress("what stands out")
+    seen_before: list[set[Hypothesis]] = []
+    while not search.drowned() and len(search.state.apart) < min(most, FAULTS):
+        state = search.next()
+        if state is None:
+            break
+        search.state = state
+        chosen = {one.cause for one in state.apart}
+        log.info("stands out: %s", chosen)
+        if chosen in seen_before:
+            break
+        seen_before.append(chosen)
+    seen = search.seen(search.state)
+    errors = search.state.at.errors
+    faults = [as_turned(search.fault(seen, one), errors, data) for one in search.state.apart]
+    return DetectedFaults(search.state, tuple(sorted(faults, key=lambda fault: -fault.statistic)))
+
+
+class _Search:
+    def __init__(
+        self, state: State, hypotheses: Sequence[Hypothesis], judgement: Judgement
+    ) -> None:
+        self.state, self.hypotheses, self.judgement = state, list(hypotheses), judgement
+        self.tries = TRIES if state.data.orbits.size <= ANEW else 1
+        count = [name for name, _ in hypotheses]
+        places = {name: count.count(name) for name in dict.fromkeys(count)}
+        self.problem = Response(  # for the priors alone
+            base=state.at, used=np.isfinite(state.data.orbits), places=places,
+            rare=rare(state.data.ring, list(places)), judgement=judgement,
+        )  # fmt: skip
+
+    def drowned(self) -> bool:
+        """Whether far more than noise is left, and no single cause makes most of that: the model
+        lacks something, and what stands out may be that."""
+        planes = fit_chi2(self.state)[:2]
+        worst = max((0, 1), key=lambda plane: planes[plane].per_reading)
+        own = planes[worst]
+        if own.per_reading <= LACKS or self.state.apart:
+            return False
+        # by the noise alone: what one cause leaves in a column takes that column's weight
+        left = [self.left_beside(*leader)[worst].total for leader in self.leaders()]
+        return min(left, default=np.inf) > (own.total + own.readings) / 2
+
+    def left_beside(
+        self, cause: Hypothesis, amount: float, information: Array
+    ) -> tuple[Chi2, Chi2, Chi2]:
+        """Chi-square with one cause more, nothing else moved; infinite where no beam is stored."""
+        state, suspect = _as_number(self.state, cause, information)
+        assert suspect.members is not None
+        values = state.values[suspect.variable] + amount * suspect.members
+        try:
+            return fit_chi2(state.moved({**state.values, suspect.variable: values}))
+        except TmlatticeError:
+            return (Chi2(np.inf, 1),) * 3
+
+    def seen(self, state: State) -> Seen:
+        """All suspects there."""
+        return Seen(state, suspects_of(state, self.hypotheses))
+
+    def evidence(self, seen: Seen, own: Weighed) -> Array:
+        """Log evidence of each suspect, linear, [suspect]."""
+        information = np.where(np.isfinite(own.sigma), own.sigma**-2.0, 0.0)
+        causes = tuple(one.cause for one in seen.suspects)
+        largest = np.array([find(name).largest for name, _ in causes])
+        possible = np.abs(own.amount) < BEYOND * largest
+        messages = linear_evidence(
+            self.problem, Scan(causes, own.statistic, own.amount, information, 1.0)
+        )
+        return np.where(possible, messages, -np.inf)
+
+    def next(self) -> State | None:
+        """With one cause more, the likeliest that stands out; None: none does."""
+        tried: list[tuple[float, State]] = []
+        for cause, _, information in self.leaders():
+            state = self.put(self.state, cause, information)
+            if state is not None:
+                tried.append((log_evidence(state) + self.problem.prior(cause), state))
+        for _, state in sorted(tried, key=lambda one: -one[0]):
+            state = self.better(state, state.apart[-1])  # noqa: PLW2901
+            if self.clear(self.seen(state), state.apart[-1]):
+                return self.revised(state)
+        return None
+
+    def leaders(self) -> list[tuple[Hypothesis, float, Array]]:
+        """What is tried: the likeliest by the linear model, one of each action; its amount, and
+        what each block knows of it."""
+        ring = self.state.data.ring
+        seen = self.seen(self.state)
+        if not seen.suspects:
+            return []
+        own = seen.beside()
+        evidence = self.evidence(seen, own)
+        worth = [HIDDEN if one.block is None else WORTH for one in seen.suspects]
+        evidence[own.statistic < worth] = -np.inf
+        first = int(np.argmax(evidence))
+        least = evidence[first] - NEAR - SHARE * own.statistic[first]
+        order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
+        found: dict[str, tuple[Hypothesis, float, Array]] = {}
+        have = [one.cause for one in self.state.apart]
+        for h in order:
+            cause = seen.suspects[h].cause
+            same = recommended_action(ring, Cause(*cause, float(own.amount[h])))
+            if cause not in have and len(found) < self.tries:
+                found.setdefault(same, (cause, float(own.amount[h]), own.information[:, h]))
+        return list(found.values())
+
+    def put(self, state: State, cause: Hypothesis, information: Array) -> State | None:
+        """Settled beside one cause more; None where no beam is stored.
+
+        Args:
+            state: without.
+            cause: of the suspects.
+            information: of each block on it, [2].
+        """
+        return _settled(_apart(_as_number(state, cause, information)[0], cause))
+
+    def better(self, state: State, one: Apart) -> State:
+        """Another cause in the place of one, where that explains more."""
+        seen = self.seen(state)
+        own = seen.beside(one.name)
+        evidence = self.evidence(seen, own)
+        here = _place(seen, one)
+        have = [other.cause for other in state.apart if other is not one]
+        evidence[[h for h, s in enumerate(seen.suspects) if s.cause in have]] = -np.inf
+        best = int(np.argmax(evidence))
+        if not evidence[best] > evidence[here] + BEHIND:
+            return state
+        other = self.put(_without(state, one), seen.suspects[best].cause, own.information[:, best])
+        if other is None:
+            return state
+        prior = self.problem.prior
+        gained = log_evidence(other) - log_evidence(state)
+        gained += prior(other.apart[-1].cause) - prior(one.cause)
+        return other if gained > 0 else state
+
+    def revised(self, state: State) -> State:
+        """Each earlier cause held against its rivals again, and without those that the others make
+        needless."""
+        for one in state.apart[:-1]:
+            state = self.better(state, one)
+        while len(state.apart) > 1:
+            seen = self.seen(state)
+            worth = [_shown(seen, one)[0] for one in state.apart]
+            if min(worth) > MIN_CHI2:
+                break
+            least = state.apart[int(np.argmin(worth))]
+            fewer = _settled(_without(state, least))
+            if fewer is None:
+                break
+            state = self.better(fewer, fewer.apart[-1])
+        return state
+
+    def members(self, state: State, one: Apart) -> int:
+        """Numbers that the size of errors rests on which the statistic has: of the family, or the
+        patterns of the orbit."""
+        if one.variable not in (kind.variable for kind in KINDS):
+            return max(len(one.members) - 1, 1)
+        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block)
+                 if f.name in ORBITS]  # fmt: skip
+        return max(min(orbit, default=MEMBERS) - 1, 1)
+
+    def p_value(self, seen: Seen, statistic: float, one: Apart) -> float:
+        """Chance that the largest of so many errors stands out like this."""
+        members = self.members(seen.state, one)
+        own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), members))
+        return min(1.0, own * len(self.hypotheses))
+
+    def clear(self, seen: Seen, one: Apart) -> bool:
+        """Whether it stands out."""
+        statistic, cause, _ = _shown(seen, one)
+        if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
+            return False
+        return (
+            statistic > MIN_CHI2 and self.p_value(seen, statistic, one) < self.judgement.false_alarm
+        )
+
+    def fault(self, seen: Seen, one: Apart) -> Fault:
+        """With its amount, its error and its rivals."""
+        own = seen.beside(one.name)
+        evidence = self.evidence(seen, own)
+        here = _place(seen, one)
+        order = [int(h) for h in np.argsort(-evidence)[:LISTED] if np.isfinite(evidence[h])]
+        order = [here, *(h for h in order if h != here)]
+        statistic, cause, sigma = _shown(seen, one)
+        return Fault(
+            cause,
+            sigma,
+            statistic,
+            self.p_value(seen, statistic, one),
+            tuple(Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in order),
+            evidence[order],
+        )
+
+
+def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Suspect]:
+    """With a number of the fit for a cause, of the block that knows more of it, and which it is."""
+    (suspect,) = suspects_of(state, [cause])
+    if suspect.block is None:
+        state = with_number(state, cause, int(np.argmax(information)))
+        (suspect,) = suspects_of(state, [cause])
+    return state, suspect
+
+
+def _apart(state: State, cause: Hypothesis) -> State:
+    """With a prior of its own for a number of the fit."""
+    (suspect,) = suspects_of(state, [cause])
+    assert suspect.block is not None
+    assert suspect.members is not None
+    own = Apart(cause, suspect.variable, suspect.block, suspect.members, find(cause[0]).largest)
+    return replace(state, apart=(*state.apart, own))
+
+
+def _place(seen: Seen, one: Apart) -> int:
+    return next(h for h, suspect in enumerate(seen.suspects) if suspect.cause == one.cause)
+
+
+def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
+    """Of what is wrong alone: by how much it stands out, its amount and its error, where single
+    columns or monitors that contradict all others count."""
+    own, here = seen.beside(one.name), _place(seen, one)
+    it = seen.blocks[one.block]
+    posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
+    wider = doubt(seen.state, one, it.there, posterior)
+    amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
+    # a small error multiplies with the fault: of a kick three times as strong it is three times
+    share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
+    variance += (share**2 - 1) * _scatter(it.there, it.sizes, one) ** 2
+    return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
+
+
+def _scatter(there: Linear, sizes: Sequence[Group], one: Apart) -> float:
+    """rms of the amount by the small errors of its family."""
+    along = np.zeros(len(there.start))
+    along[there.where[one.variable]] = one.members / float(one.members @ one.members)
+    return float(np.sqrt(sum(np.sum((along @ group.basis * group.scale) ** 2)
+                             for group in sizes if group.name != one.name)))  # fmt: skip
+
+
+def _without(state: State, one: Apart) -> State:
+    """Not settled anew: the next step takes its number back."""
+    return replace(state, apart=tuple(other for other in state.apart if other is not one))
+
+
+def _settled(state: State) -> State | None:
+    """Everything, from as far as the linear model goes, or from where it is; None where no beam is
+    stored, or an amount has gone beyond what a fault can have. Sizes are learnt anew: one that fell
+    to nothing beside a fault would not grow."""
+    state = replace(state, groups={})
+    for begin in (_stepped, replace):
+        try:
+            rough = settle(begin(state), gain=ROUGH, possible=_possible)
+            return settle(bend(rough)) if _possible(rough) else None
+        except (TmlatticeError, np.linalg.LinAlgError):
+            continue
+    return None
+
+
+def _possible(state: State) -> bool:
+    """Whether what is wrong alone, with what its family has of it, is no more than a fault."""
+    amounts = [
+        float(state.values[one.variable] @ one.members / (one.members @ one.members))
+        for one in state.apart
+    ]
+    return all(abs(a) < BEYOND * one.wide for a, one in zip(amounts, state.apart, strict=True))
+
+
+def _stepped(state: State) -> State:
+    """By one step of Gauss and Newton as far as it goes, with sizes as of what is not alone."""
+    values, groups = dict(state.values), dict(state.groups)
+    for block in (block for block in (0, 1) if state.of_block(block)):
+        there = linear(state, block)
+        sizes = sizes_in(there)
+        found = solve(there.normal, sizes, there.start, rounds=0)
+        values |= {name: found.values[at] for name, at in there.where.items()}
+        groups |= {group.name: group for group in sizes}
+    return replace(state, groups=groups).moved(values)
+
+
+# --- what is told ---------------------------------------------------------------------------------
+def given_faults(fit: HierarchicalFit, apart: Sequence[Apart]) -> HierarchicalFit:
+    """The dense fit with the faults' numbers free of their families, as a step more; as it was,
+    where held-out correctors want none of it."""
+    state = fit.state
+    for one in apart:
+        if one.variable in (kind.variable for kind in KINDS):
+            state = with_number(state, one.cause, one.block)
+        elif one.variable not in state.values:
+            state = allow(state, [f for f in USUAL if f.variable == one.variable])
+    own = {one.cause: one for one in apart}
+    for cause in own:
+        state = _apart(state, cause)
+    settled = _settled(state)
+    if settled is None:
+        return fit
+    after = score(settled, settled.split.held)
+    before = fit.heldout[1]
+    if after.in_plane > WORSE * before.in_plane or after.coupling > WORSE * before.coupling:
+        return fit
+    title = ", ".join(f"{effect} {place}" for effect, place in own)
+    steps = (*fit.steps, Step.scored(title, len(own), after))
+    return replace(fit, state=settled, steps=steps, heldout=(fit.heldout[0], after))

@@ -1,0 +1,141 @@
+"""What a hierarchical fit of an orbit response found, as causes with errors."""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.correlations import Correlation, correlations_of
+from tmlattice.diagnosis.families.family import Family, StatedCause
+from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.stated import Stated, stated
+from tmlattice.diagnosis.support import Support, share_from_data
+from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.problem import Hypothesis
+
+Array = NDArray[np.float64]
+
+AGAINST, SHOWN = 0.4, 3
+"""Posterior correlation from which on numbers are degenerate, and how many are named."""
+
+
+def fitted_causes(
+    state: State,
+) -> tuple[list[StatedCause], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...]]:
+    """Causes with stated errors; how much of each comes from the data; what the data alone do not
+    settle, in words; and the amounts that they hardly separate."""
+    found: list[StatedCause] = []
+    supports: list[Support] = []
+    messages: tuple[str, ...] = ()
+    pairs: list[Correlation] = []
+    for block in (0, 1):
+        families = {f.variable: f for f in state.of_block(block)}
+        if not families:
+            continue
+        there = linear(state, block)
+        posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        known = stated(state, block, there, posterior)
+        for row, support in with_support(state, families.values(), there, known):
+            if row[0].amount != 0 or row[1] != 0:
+                found.append(row)
+                supports.append(support)
+        pairs += _correlated(state, families.values(), there, known.covariance)
+        if block == 0:
+            messages = _degenerate(state, there, posterior)
+    return found, tuple(supports), messages, tuple(pairs)
+
+
+def _correlated(
+    state: State, families: Iterable[Family], there: Linear, covariance: Array
+) -> tuple[Correlation, ...]:
+    """Amounts of the magnets' families that the readings hardly separate; each number is named for
+    the first that it moves."""
+    amounts: list[Hypothesis] = []
+    numbers: list[int] = []
+    for family in families:
+        if family.per == "ring":
+            first = there.where[family.variable].start
+            for i, moves in enumerate(family.moves(state.data)):
+                if moves:
+                    amounts.append(next(iter(moves)))
+                    numbers.append(first + i)
+    if not numbers:
+        return ()
+    return correlations_of(amounts, covariance[np.ix_(numbers, numbers)])
+
+
+def with_support(
+    state: State, families: Collection[Family], there: Linear, known: Stated
+) -> Iterator[tuple[StatedCause, Support]]:
+    """Yield the causes of some families of a block, and how much of each comes from the data.
+
+    Args:
+        state, there: where the fit stands, and `linear` of the block.
+        families: with a variable each.
+        known: what is stated of the numbers of the block.
+    """
+    numbers = _numbers(state, families, there)
+    for family in families:
+        own, values = there.where[family.variable], state.values[family.variable]
+        rows = family.causes_of(state.at.errors, values, known.sigma[own], state.data)
+        # the errors before the data in the units of the causes
+        before = family.causes_of(state.at.errors, values, known.prior[own], state.data)
+        for row, (_, prior) in zip(rows, before, strict=True):
+            yield row, _support(row, prior, own, known.covariance, numbers)
+
+
+Hypotheses = Mapping[int, Mapping[Hypothesis, float]]
+
+
+def _numbers(state: State, families: Iterable[Family], there: Linear) -> Hypotheses:
+    """What each number of the fit is of the catalogue's effects, by its place in the fit."""
+    numbers: dict[int, Mapping[Hypothesis, float]] = {}
+    for family in families:
+        first = there.where[family.variable].start
+        numbers |= {first + i: own for i, own in enumerate(family.moves(state.data)) if own}
+    return numbers
+
+
+def _support(
+    row: StatedCause, prior: float, own: slice, covariance: Array, numbers: Hypotheses
+) -> Support:
+    """Of one cause, with its error before the data; `own` are its family's numbers."""
+    cause, sigma = row
+    support = Support(share_from_data(sigma, prior))
+    if support.determined:
+        return support
+    here = (cause.effect, cause.element)
+    mine = [i for i in range(own.start, own.stop) if here in numbers.get(i, {})]
+    width = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    near: dict[int, float] = {}
+    for i in mine:
+        correlation = covariance[i] / (width[i] * width)
+        for j in np.argsort(-np.abs(correlation))[: SHOWN + len(mine)].tolist():
+            if j not in mine and j in numbers and abs(correlation[j]) > AGAINST:
+                near[j] = max(near.get(j, 0.0), float(correlation[j]), key=abs)
+    order = sorted(near, key=lambda j: -abs(near[j]))[:SHOWN]
+    return replace(
+        support, degenerate_with=tuple((*next(iter(numbers[j])), near[j]) for j in order)
+    )
+
+
+def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
+    """The scale that gains and calibrations share."""
+    messages = []
+    columns, monitors = state.data.shape
+    m = 2 * monitors
+    spread = posterior.spread
+    factor = np.linalg.cholesky(posterior.covariance + 1e-12 * np.eye(len(spread.T)))
+    draws = spread @ factor
+    scale = draws[:m].mean(axis=0)
+    kick = draws[m : m + columns - 1].mean(axis=0)
+    if scale.any() and kick.any():  # both are fitted
+        both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
+        messages.append(
+            f"mean monitor gain against mean corrector scale: known to "
+            f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
+            f"{both:+.2f}"
+        )
+    return tuple(messages)

@@ -1,0 +1,130 @@
+"""Single correctors that answer as if they stood elsewhere than in the lattice.
+
+A kick at a place d further along is, seen from where the lattice has it, the same kick and a
+position jump of -d times the kick. All correctors have some of that (their fields are no points);
+one that is far beyond the others, and agrees once it is moved, has a wrong place, or name.
+
+>>> found = displaced(state)
+>>> [(own.name, own.by) for own in found]
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.response.state import State, amplitudes
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FAR = 5.0
+"""So many times the usual of a plane's correctors one is left with, and displaced by."""
+AGREES = 0.3
+"""Share of what it was left with, at most, that is left once it is moved."""
+SPARED = 0.1
+"""Share of the readings that may lie between the two places, and do not count."""
+MARGIN = 1.5
+"""So far beyond where it is said to be, as a share of the way, a monitor lies between."""
+SAME = 1e-6
+"""m: nearer elements stand in one place."""
+LEAST = 0.05
+"""m: what is nearer is in any field's shape."""
+FEWEST = 8
+"""Readings, and correctors of a plane, that it takes."""
+_MAD = 1.4826  # of a Gaussian
+
+
+class Misplaced(NamedTuple):
+    """A corrector that answers as if it stood elsewhere.
+
+    Attributes:
+        name, column: of the corrector, and of the response.
+        left, moved: what its readings are left with where it stands, and elsewhere, rms, m.
+        by: how far downstream, m.
+        gain: by which chi-square falls there.
+    """
+
+    name: str
+    column: int
+    left: float
+    moved: float
+    by: float
+    gain: float
+
+
+def misplaced(state: State) -> list[Misplaced]:
+    """Those that are.
+
+    Args:
+        state: a fit's; held-out correctors are looked at too.
+    """
+    data, at = state.data, state.at
+    beam, jumps = (data.pick(at.seen(own)) for own in (at.beam, at.jumps))
+    orbits = data.pick(data.orbits)
+    far: list[Misplaced] = []
+    for plane in (0, 1):
+        found: list[Misplaced] = []
+        for c in np.flatnonzero(data.plane[:-1] == plane):
+            seen = np.isfinite(orbits[c]) & state.good
+            if seen.sum() < FEWEST or not jumps[c, seen].any():
+                continue
+            both = np.stack([beam[c], jumps[c]], axis=1)
+            seen = clear(state, int(c), both, orbits[c], seen)
+            (kick, jump), moved = amplitudes(both, orbits[c], seen, seen)
+            _, left = amplitudes(beam[c][:, None], orbits[c], seen, seen)
+            size, less = (float(np.sqrt(np.mean(own**2))) for own in (left, moved))
+            by = -jump / (kick * data.kicks[c]) if kick else 0.0
+            noise = data.noise_of(0)[c, seen]
+            gain = float(np.sum((left**2 - moved**2) / noise**2))
+            name = data.measured.correctors[c]
+            found.append(Misplaced(name, int(c), size, less, float(by), gain))
+        if len(found) < FEWEST:
+            continue
+        usual = float(np.median([own.left for own in found]))
+        away = max(_MAD * float(np.median([abs(own.by) for own in found])), LEAST / FAR)
+        far += [
+            own
+            for own in found
+            if own.left > FAR * usual and own.moved < AGREES * own.left and abs(own.by) > FAR * away
+        ]
+    return far
+
+
+def clear(
+    state: State, column: int, patterns: Array, orbit: Array, seen: Flags, kick: float = 0.0
+) -> Flags:
+    """Readings but for those of monitors between the place of a corrector and where it seems to
+    stand: they have the kick on their other side. Anything else that is missed counts, for outside
+    of the way between them a kick at any place is one here and a jump.
+
+    Args:
+        state: of the fit.
+        column: of the corrector.
+        patterns: of kick and jump, [monitor, 2].
+        orbit: what is to be explained, [monitor].
+        seen: readings that there are.
+        kick: of which the pattern of the kick is on top, in its units.
+    """
+    data = state.data
+    missed = np.abs(amplitudes(patterns, orbit, seen, seen)[1])
+    most = seen.copy()
+    most[seen] = missed <= np.quantile(missed, 1 - SPARED)
+    (more, jump), _ = amplitudes(patterns, orbit, most, most)
+    if not kick + more:
+        return seen
+    by = -jump / ((kick + more) * data.kicks[column])
+    place = data.ring[data.measured.correctors[column]].s
+    way = np.array([data.ring[name].s for name in data.measured.monitors]) - place
+    beyond = (np.sign(by) * way + SAME) % data.ring.length - SAME
+    between = beyond <= MARGIN * abs(by)
+    few = (between & seen).sum() <= max(SPARED * seen.sum(), 1)
+    return seen & ~between if few else seen
+
+
+def moved_text(own: Misplaced) -> str:
+    """How far off it is, and what that mends."""
+    return (
+        f"{abs(own.by):.2g} m {'down' if own.by > 0 else 'up'}stream ({1e6 * own.left:.2g} µm are "
+        f"left where it stands, {1e6 * own.moved:.2g} there)"
+    )

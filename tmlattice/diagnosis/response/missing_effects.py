@@ -1,0 +1,373 @@
+"""Which effect a fitted orbit response still lacks: each hypothesis weighed on held-out readings.
+
+>>> fit = fit_families(data, split)
+>>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
+
+A hypothesis is a set of patterns: what the readings would change by for one unit of each of its
+parameters. Patterns are fitted together with everything that the fit already has, linearly about
+it, to the same correctors; the held-out ones judge. What every corrector has of its own (its place,
+the machine's drift while it was stepped) is taken from a held-out corrector's near monitors, as its
+kick is.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
+from scipy.sparse import csr_array
+
+from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
+from tmlattice.diagnosis.response.linear import linear
+from tmlattice.diagnosis.response.state import State, rms_of
+from tmlattice.diagnosis.response.weights import weight
+
+Array = NDArray[np.float64]
+Patterns: TypeAlias = Array | csr_array
+
+FREE = 30.0
+"""Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
+FEW = 6
+"""So many amounts stand alone."""
+CONTROL = 17
+"""Seed of the random parameters that patterns of single columns are held against."""
+SPARSE = 0.1
+"""Patterns are kept sparse where fewer of their readings are not zero."""
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A hypothesis and what held-out readings say of it.
+
+    Attributes:
+        effect, unit, expected: see `Hypothesis`.
+        parameters: how many.
+        amount: the parameter, or the rms of several.
+        amount_sigma: its posterior rms, or the median one of several.
+        heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
+        on_top_in_plane, on_top_position: with it and all others that are wanted together, m.
+        evidence: by which the log evidence of the fitted readings grows with it alone: the misfit
+            that it explains, less what its parameters cost.
+        control_in_plane: with as many random parameters in its stead, m; None where columns have no
+            amounts of their own. See `control`.
+        judgement: "helps", on top of all that help more; "helps, not on top", where those leave it
+            nothing; "as random ones do" (no more than its control); "unphysical" (it would help, by
+            more than physics allows); "excluded" (held-out readings do not want it).
+    """
+
+    effect: str
+    unit: str
+    expected: str
+    parameters: int
+    amount: float
+    amount_sigma: float
+    heldout_rms_in_plane: float
+    heldout_rms_position: float
+    on_top_in_plane: float
+    on_top_position: float
+    evidence: float
+    control_in_plane: float | None
+    judgement: str
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in the diagnosis."""
+        return {k: v for k, v in vars(self).items() if k != "unit"}
+
+
+HELPS = 0.98
+"""Held-out rms falls to this share at least where a hypothesis helps."""
+
+
+def weigh(
+    state: State,
+    wanted: Iterable[str] | None = None,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> list[Weighed]:
+    """Every hypothesis alone and on top of the others; the first row is the fit without any.
+
+    Those that physics allows are taken together, the best first, as long as each lowers the
+    held-out rms on top of those before it; then every other is weighed once more beside them.
+
+    Args:
+        state: after the fit.
+        wanted: names of `HYPOTHESES`; None: all.
+        progress: called with each name.
+    """
+    fitted = Fitted(state)
+    base = fitted.weigh([])
+    found: list[Hypothesis] = []
+    for name in HYPOTHESES if wanted is None else wanted:
+        progress(name)
+        hypothesis = HYPOTHESES[name](state)
+        # nothing where the ring has no such places, or no reading that is fitted would move
+        if hypothesis is not None and fitted.sees(hypothesis):
+            found.append(hypothesis)
+    alone = [fitted.weigh([hypothesis]) for hypothesis in found]
+    random = [fitted.weigh([control(own)]).in_plane if own.own else None for own in found]
+    progress("hypotheses together")
+    together, chosen = base, list[int]()
+
+    def take(candidates: list[int]) -> None:
+        """The best of them, as long as it helps on top of those that were taken."""
+        nonlocal together
+        left = list(candidates)
+        while left:
+            beside = [found[k] for k in chosen]
+            answers = {i: fitted.weigh([*beside, found[i]]) for i in left}
+            left = [i for i in left if _helps(found[i], answers[i], together)]
+            if left:
+                best = min(left, key=lambda i, said=answers: said[i].in_plane)  # type: ignore[misc]
+                together = answers[best]
+                chosen.append(best)
+                left.remove(best)
+
+    helpful = [
+        i for i, (answer, rms) in enumerate(zip(alone, random, strict=True))
+        if rms is None or answer.in_plane < HELPS * rms
+    ]  # fmt: skip
+    helpers = [i for i in helpful if _helps(found[i], alone[i], base)]
+    take(helpers)
+    first = [found[k] for k in chosen]
+    on_top = {
+        i: fitted.weigh([*first, hypothesis])
+        for i, hypothesis in enumerate(found)
+        if i not in chosen
+    }
+    before = together
+    take([i for i, answer in on_top.items() if i in helpful and _helps(found[i], answer, before)])
+    four = base.in_plane, base.position, together.in_plane, together.position
+    out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
+    for i, hypothesis in enumerate(found):
+        beside = together if i in chosen else on_top[i]
+        if i in chosen:
+            judgement = "helps"
+        elif i in helpers:
+            judgement = "helps, not on top"
+        elif i not in helpful and _helps(hypothesis, alone[i], base):
+            judgement = "as random ones do"
+        else:
+            judgement = _refusal(hypothesis, alone[i], beside, base, before)
+        amounts, sigma, in_plane, position, evidence = alone[i]
+        out.append(
+            Weighed(
+                hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
+                _size(amounts), float(np.median(sigma)), in_plane, position, beside.in_plane,
+                beside.position, evidence, random[i], judgement,
+            )
+        )  # fmt: skip
+    return out
+
+
+def _refusal(
+    hypothesis: Hypothesis, alone: "Answer", beside: "Answer", base: "Answer", before: "Answer"
+) -> str:
+    best = min(alone.in_plane / base.in_plane, beside.in_plane / before.in_plane)
+    unphysical = best < HELPS and not _sensible(hypothesis, beside)
+    return "unphysical" if unphysical else "excluded"
+
+
+def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
+    gains = answer.in_plane < HELPS * before.in_plane and answer.evidence > before.evidence
+    return gains and _sensible(hypothesis, answer)
+
+
+def control(hypothesis: Hypothesis) -> Hypothesis:
+    """As many parameters of the same size and as smooth along the ring, that have nothing to do
+    with their columns: each column's patterns, carried on by a random number of monitors.
+
+    What columns have of their own is taken from half of a held-out one's monitors: a few smooth
+    orbits, whatever they are, describe the other half better than none.
+    """
+    rng = np.random.default_rng(CONTROL)
+    patterns = hypothesis.patterns.copy()
+    monitors = patterns.shape[2]
+    for c in range(patterns.shape[1]):
+        by = int(rng.integers(monitors // 4, monitors - monitors // 4))
+        patterns[:, c] = np.roll(patterns[:, c], by, axis=1)
+    return replace(hypothesis, patterns=patterns)
+
+
+def _size(amounts: Array) -> float:
+    return float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
+
+
+def _sensible(hypothesis: Hypothesis, answer: "Answer") -> bool:
+    return abs(_size(answer.amounts)) < hypothesis.most
+
+
+class Answer(NamedTuple):
+    """Amounts of the last hypothesis, their errors, held-out rms without and with a jump, m, and
+    the log evidence of all of them."""
+
+    amounts: Array
+    sigma: Array
+    in_plane: float
+    position: float
+    evidence: float
+
+
+class Fitted:
+    """The linearised fit, to which patterns can be added."""
+
+    def __init__(self, state: State) -> None:
+        # common modes are hypotheses among the others here
+        state = replace(state, noise=replace(state.noise, kinds=()))
+        self.state, data = state, state.data
+        there = linear(state, 0)
+        normal, self.start = there.normal, there.start
+        self.slopes = there.by_ring
+        # one that does nothing stands there where no family of errors was kept
+        basis = np.zeros((len(self.start), 1))
+        basis = np.concatenate([basis, *(g.basis for g in there.groups)], axis=1)
+        prior = np.concatenate([np.ones(1), *(g.scale for g in there.groups)])
+        self.spread = basis * prior
+        A = self.spread.T @ normal.matrix @ self.spread
+        self.factor = cho_factor(A + np.eye(len(A)), lower=True)
+        self.vector = self.spread.T @ (normal.vector + normal.matrix @ self.start)
+        self.weight = weight(state, 0)
+        self.by_monitor, self.by_column = there.by_monitor, there.by_column
+        self.read = data.pick(state.at.read)
+        # readings by the monitors' and the columns' own parameters, [reading, parameter]
+        columns, monitors = self.weight.shape
+        reading = np.arange(self.weight.size)
+        by_monitor = 2 * (reading % monitors) + np.repeat(data.plane, monitors)
+        by_column = 2 * monitors + reading // monitors
+        self.own = csr_array(
+            (
+                np.concatenate([self.by_monitor.ravel(), self.by_column.ravel()]),
+                (np.tile(reading, 2), np.concatenate([by_monitor, by_column])),
+            ),
+            shape=(len(reading), 2 * monitors + columns),
+        )
+        self._parts: dict[int, _Part] = {}
+        residual = np.where(self.weight > 0, data.pick(state.at.left), 0.0)
+        self.target = residual + self.change(self.start)
+
+    def change(self, values: Array) -> Array:
+        """Readings [column, monitor] for a change of the base parameters."""
+        data = self.state.data
+        m, c = 2 * len(data.at), len(data.plane)
+        out = values[:m].reshape(-1, 2)[:, data.plane].T * self.by_monitor
+        out = out + values[m : m + c, None] * self.by_column
+        if len(self.slopes):
+            out = out + np.tensordot(values[m + c :], self.slopes, 1)
+        return np.asarray(out)
+
+    def across(self, flat: Patterns) -> Array:
+        """J^T W H, [base parameter, pattern], of patterns [pattern, reading]."""
+        weighted = _scaled(flat, self.weight.ravel())
+        ring = self.slopes.reshape(len(self.slopes), self.weight.size).T
+        own = _dense(weighted @ self.own)
+        return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
+
+    def sees(self, hypothesis: Hypothesis) -> bool:
+        """Whether it would move a reading that is fitted."""
+        return bool(hypothesis.patterns.any() and self._part(hypothesis).flat.shape[0])
+
+    def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
+        """What held-out readings say of these hypotheses together."""
+        if not hypotheses:  # the same linear step as with one: the fit itself may still move
+            moved = cho_solve(self.factor, self.vector)
+            in_plane, position = self._score(self.change(self.spread @ moved - self.start), None)
+            return Answer(np.zeros(0), np.zeros(0), in_plane, position, 0.0)
+        parts = [self._part(hypothesis) for hypothesis in hypotheses]
+        edge = np.cumsum([0, *(part.across.shape[1] for part in parts)])
+        B = np.concatenate([part.across for part in parts], axis=1)
+        half = cho_solve(self.factor, B)
+        weight = self.weight.ravel()
+        C = np.empty((edge[-1],) * 2)
+        for i, one in enumerate(parts):
+            for k, other in enumerate(parts[: i + 1]):
+                both = _dense(_scaled(one.flat, weight) @ other.flat.T)
+                C[edge[i] : edge[i + 1], edge[k] : edge[k + 1]] = both
+                C[edge[k] : edge[k + 1], edge[i] : edge[i + 1]] = both.T
+        C -= B.T @ half
+        target = weight * self.target.ravel()
+        r = np.concatenate([part.flat @ target for part in parts]) - half.T @ self.vector
+        # one or a few amounts are free; many have the scale that the evidence finds, within physics
+        owner = np.repeat(np.arange(len(parts)), np.diff(edge))
+        many = [len(part.across.T) > FEW for part in parts]
+        most = [one.most if m else FREE * min(one.most, 1e3)
+                for one, m in zip(hypotheses, many, strict=True)]  # fmt: skip
+        spread = np.array(most)[owner]
+        for _ in range(12 if any(many) else 1):
+            # in units of the priors, so that the matrix is well scaled
+            root = cho_factor(C * np.outer(spread, spread) + np.eye(len(C)), lower=True)
+            amounts = spread * cho_solve(root, spread * r)
+            variance = np.diag(dpotri(root[0], lower=1)[0]) * spread**2
+            for i in (i for i, m in enumerate(many) if m):
+                mine = owner == i
+                scale = float(np.sqrt(np.mean(amounts[mine] ** 2 + variance[mine])))
+                spread[mine] = min(scale, most[i])
+        moved = cho_solve(self.factor, self.vector - B @ amounts)
+        change = self.change(self.spread @ moved - self.start)
+        for i, (hypothesis, part) in enumerate(zip(hypotheses, parts, strict=True)):
+            if not hypothesis.own:
+                change = change + (amounts[owner == i] @ part.flat).reshape(change.shape)
+        own = [hypothesis.patterns for hypothesis in hypotheses if hypothesis.own]
+        last = owner == len(parts) - 1
+        rms, jumped = self._score(change, np.concatenate(own) if own else None)
+        evidence = 0.5 * float(r @ amounts) - float(np.log(np.diag(root[0])).sum())
+        return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped, evidence)
+
+    def _part(self, hypothesis: Hypothesis) -> "_Part":
+        """Its patterns that fitted readings see."""
+        key = id(hypothesis)
+        if key not in self._parts:
+            flat = hypothesis.patterns.reshape(len(hypothesis.patterns), -1)
+            if hypothesis.own:
+                flat = _by_column(hypothesis.patterns)
+            elif np.count_nonzero(flat) < SPARSE * flat.size:
+                flat = csr_array(flat)
+            flat = flat[np.flatnonzero(abs(flat) @ self.weight.ravel() > 0)]
+            self._parts[key] = _Part(hypothesis, flat, self.spread.T @ self.across(flat))
+        return self._parts[key]
+
+    def _score(self, change: Array, own: Array | None) -> tuple[float, float]:
+        state, split = self.state, self.state.split
+        read = self.read + change
+        data = state.data.pick(state.data.orbits)
+        jumps = state.data.pick(state.at.seen(state.at.jumps))
+        inside: list[Array] = []
+        jumped: list[Array] = []
+        for c in np.flatnonzero(split.held):
+            patterns = [read[c], *([] if own is None else own[:, c])]
+            patterns = [p for p in patterns if np.abs(p).max() > 0]
+            seen = np.isfinite(data[c]) & state.good
+            near, far = seen & split.half[c], seen & ~split.half[c]
+            for more, into in (([], inside), ([jumps[c]], jumped)):
+                both = np.stack([*patterns, *more], axis=1)
+                scale = np.abs(both[near]).max(axis=0)
+                amounts = np.linalg.lstsq(both[near] / scale, data[c, near], rcond=None)[0]
+                into.append(data[c, far] - (both[far] / scale) @ amounts)
+        return rms_of(inside), rms_of(jumped)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A hypothesis as rows of readings, and what they share with the fit."""
+
+    hypothesis: Hypothesis
+    flat: Patterns  # [pattern, reading]
+    across: Array
+
+
+def _scaled(flat: Patterns, by: Array) -> Patterns:
+    """Every reading times a number of its own."""
+    return csr_array(flat.multiply(by)) if isinstance(flat, csr_array) else flat * by
+
+
+def _dense(values: Patterns) -> Array:
+    return values.toarray() if isinstance(values, csr_array) else np.asarray(values)
+
+
+def _by_column(patterns: Array) -> csr_array:
+    """One parameter for each column that a pattern is not zero in, [parameter, reading]."""
+    count, columns, monitors = patterns.shape
+    rows = np.repeat(np.arange(count * columns), monitors)
+    at = np.tile(np.arange(columns * monitors), count)
+    whole = csr_array((patterns.ravel(), (rows, at)), shape=(count * columns, columns * monitors))
+    return whole[np.flatnonzero(abs(patterns).max(axis=2).ravel() > 0)]

@@ -1,0 +1,217 @@
+"""Correctors whose columns are exchanged: each answers as the other one should.
+Monitors whose readings are; and those whose planes are.
+
+A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
+the model's far too well for a stranger: it seems displaced by the way to its neighbour.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.diagnosis.response.misplaced import misplaced
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.unlike_model import ODD, RejectedChannels, unlike_model
+from tmlattice.measurement import OrbitResponse
+
+Array = NDArray[np.float64]
+
+SHARE = 0.25
+"""Of the mean square left of each of the two columns, left at most once they are exchanged."""
+
+Pair = tuple[str, str]
+
+
+class Swaps(NamedTuple):
+    """What was exchanged: planes of monitors; pairs of correctors, and of monitors, and by how much
+    chi-square fell once they were put right, with the typical noise. And what was rejected: a
+    monitor with its plane, or a corrector with None."""
+
+    planes: list[str]
+    correctors: dict[Pair, float]
+    monitors: dict[Pair, float]
+    rejected: list[tuple[str, str | None]]
+
+
+def labels_corrected(
+    state: State,
+    measured: OrbitResponse,
+    known: Swaps,
+    odd: RejectedChannels,
+    among: Collection[str],
+) -> tuple[OrbitResponse, str] | None:
+    """The measurement with pairs exchanged that were not known, and what they are, in words; None
+    where there are none.
+
+    Args:
+        state: what the model makes of the readings.
+        measured: what they are of.
+        known: pairs that were put right before; new ones are added.
+        odd: what resembles nothing.
+        among: correctors that may answer as others should.
+    """
+    pairs = _new(swaps(state, {*odd.correctors, *among}), known.correctors)
+    if pairs:
+        return correctors_back(measured, pairs), swap_message(pairs)
+    pairs = _new(swapped_monitors(state, {name for name, _ in odd.monitors}), known.monitors)
+    return (monitors_back(measured, pairs), swap_message(pairs, "monitors")) if pairs else None
+
+
+def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
+    """Pairs that were not known; they are now."""
+    new = [pair for pair in found if pair not in known]
+    known.update((pair, found[pair]) for pair in new)
+    return new
+
+
+def mislabelled(state: State) -> set[str]:
+    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
+    leaves far more of them than of the others."""
+    return {*(own.name for own in misplaced(state)), *unlike_model(state, ODD).correctors}
+
+
+def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
+    """Pairs, and by how much chi-square falls: neighbours of a plane, in beam order, then any two
+    of some that may be exchanged, and any two that move the beam in each other's plane. None
+    stands in two of them.
+
+    Args:
+        state: what the model makes of the readings.
+        among: names of those that may be exchanged with one another anywhere in the ring.
+    """
+    data = state.data
+    model, names = state.at.seen(state.at.beam), data.measured.correctors
+
+    def left(column: int, as_one: int, planes: list[int]) -> float:
+        own = data.orbits[column][:, planes]
+        seen = np.isfinite(own) & state.good[:, None]
+        u, d = model[as_one][:, planes][seen], own[seen]
+        gain = max(float(u @ d) / max(float(u @ u), 1e-300), 0.0)
+        return float(np.sum((d - gain * u) ** 2))
+
+    found: dict[Pair, float] = {}
+    for planes, pairs in _suspects(state, among):
+        noise = float(np.median(data.noise[:, planes]))
+        for a, b in pairs:
+            if any(names[c] in pair for pair in found for c in (a, b)):
+                continue
+            stays = left(a, a, planes), left(b, b, planes)
+            crossed = left(a, b, planes), left(b, a, planes)
+            if all(one < SHARE * other for one, other in zip(crossed, stays, strict=True)):
+                found[names[a], names[b]] = (sum(stays) - sum(crossed)) / noise**2
+    return found
+
+
+def _suspects(
+    state: State, among: Collection[str]
+) -> Iterator[tuple[list[int], Iterable[tuple[int, int]]]]:
+    """Columns that may be exchanged, two by two, and the planes in which they tell."""
+    data, names = state.data, state.data.measured.correctors
+    for p in (0, 1):
+        mine = np.flatnonzero(data.plane[:-1] == p)
+        order = mine[np.argsort([data.ring[names[c]].s for c in mine])]
+        far = combinations([c for c in order if names[c] in among], 2)
+        yield [p], (*zip(order, np.roll(order, -1), strict=True), *far)
+    own, across = (
+        np.nansum(data.pick(data.orbits, block)[:-1, state.good] ** 2, axis=1) for block in (0, 1)
+    )
+    turned = np.flatnonzero(across > own)
+    yield [0, 1], product(*(turned[data.plane[turned] == p] for p in (0, 1)))
+
+
+def swap_message(pairs: Iterable[Pair], what: str = "correctors") -> str:
+    """In words."""
+    both = ", ".join(f"{a} and {b}" for a, b in pairs)
+    return (
+        f"{what} that answer each as the other one should, taken as exchanged: {both}; look at "
+        "their cables and at the table of names"
+    )
+
+
+def correctors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
+    """The measurement with their columns exchanged."""
+    order = np.arange(len(measured.correctors))
+    for pair in pairs:
+        a, b = (measured.correctors.index(name) for name in pair)
+        order[[a, b]] = b, a
+    return replace(
+        measured, response=measured.response[order], kicks=np.asarray(measured.kicks)[order]
+    )
+
+
+def swapped_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
+    """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains, and by
+    how much chi-square falls; none stands in two.
+
+    Args:
+        state: what the model makes of the readings.
+        among: those that resemble nothing: of a design with another phase advance many others seem
+            to be read one cell further on.
+    """
+    data, read = state.data, state.at.seen(state.at.beam)
+    model, orbits = data.pick(read)[:-1], data.pick(data.orbits)[:-1]
+    left = np.zeros((data.shape[1],) * 2)  # of a's readings as b's, [a, b]
+    for p in (0, 1):
+        rows = data.plane[:-1] == p
+        there = np.isfinite(orbits[rows])
+        d, u = np.where(there, orbits[rows], 0.0), model[rows]
+        both, size = np.maximum(d.T @ u, 0.0), there.T.astype(float) @ u**2
+        left += (d**2).sum(axis=0)[:, None] - both**2 / np.maximum(size, 1e-300)
+    names = data.measured.monitors
+    odd = [m for m, name in enumerate(names) if name in among]
+    stays = np.diagonal(left)
+    found: dict[Pair, float] = {}
+    for a, b in combinations(odd, 2):
+        crossed = left[a, b] < SHARE * stays[a] and left[b, a] < SHARE * stays[b]
+        if crossed and not any(names[own] in pair for own in (a, b) for pair in found):
+            gain = stays[a] + stays[b] - left[a, b] - left[b, a]
+            found[names[a], names[b]] = float(gain / np.median(data.noise) ** 2)
+    return found
+
+
+def monitors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
+    """The measurement with the readings of monitors exchanged, their noise and the RF's too."""
+    order = np.arange(len(measured.monitors))
+    for pair in pairs:
+        a, b = (measured.monitors.index(name) for name in pair)
+        order[[a, b]] = b, a
+    rf = measured.rf
+    if rf is not None and rf.orbit is not None:
+        rf = replace(rf, orbit=rf.orbit[order])
+    noise = None if measured.noise is None else measured.noise[order]
+    return replace(measured, response=measured.response[:, order], noise=noise, rf=rf)
+
+
+def swapped_planes(state: State) -> list[str]:
+    """Monitors that read in each plane what the model has in the other one, whatever their gain."""
+    data, read = state.data, state.at.seen(state.at.beam)
+    found = []
+    for m, name in enumerate(data.measured.monitors):
+        seen = np.isfinite(data.orbits[:-1, m]).all(axis=1)
+        d, u = data.orbits[:-1, m][seen], read[:-1, m][seen]
+        if len(d) and _left(d, u[:, ::-1]) < SHARE * _left(d, u):
+            found.append(name)
+    return found
+
+
+def _left(measured: Array, model: Array) -> float:
+    """Of readings [column, 2], with a gain of each plane that is not negative."""
+    gain = np.maximum((measured * model).sum(axis=0), 0.0)
+    gain = gain / np.maximum((model**2).sum(axis=0), 1e-300)
+    return float(np.sum((measured - gain * model) ** 2))
+
+
+def planes_back(measured: OrbitResponse, monitors: Sequence[str]) -> OrbitResponse:
+    """The measurement with the planes of some monitors exchanged."""
+    at = [measured.monitors.index(name) for name in monitors]
+    response, rf = measured.response.copy(), measured.rf
+    response[:, at] = response[:, at, ::-1]
+    if rf is not None and rf.orbit is not None:
+        orbit = rf.orbit.copy()
+        orbit[at] = orbit[at, ::-1]
+        rf = replace(rf, orbit=orbit)
+    return replace(measured, response=response, rf=rf)

@@ -1,0 +1,55 @@
+"""What was exchanged on one of two days: pairs of correctors, or of monitors.
+
+>>> measured, data, before = all_right(partial(response_data, ring), measured, 0.2)
+>>> since(before, after, said)
+
+The first day is held against the design, the second one against the first.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.swaps import Swaps, labels_corrected, swap_message
+from tmlattice.diagnosis.response.unlike_model import unlike_model
+from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.response_data import ResponseData
+from tmlattice.observe.split import split_columns
+
+
+def all_right(
+    made: Callable[[OrbitResponse], ResponseData], measured: OrbitResponse, holdout: float
+) -> tuple[OrbitResponse, ResponseData, Swaps]:
+    """A measurement with exchanged pairs of correctors and monitors put right, what was made of it,
+    and which these are.
+
+    Args:
+        made: readings in a model, of a measurement.
+        measured: as it was read.
+        holdout: share of the correctors that are held out.
+    """
+    known = Swaps([], {}, {}, [])
+    while True:
+        data = made(measured)
+        state = begin(data, split_columns(data, holdout, np.random.default_rng(0)))
+        right = labels_corrected(state, measured, known, unlike_model(state), ())
+        if right is None:
+            return measured, data, known
+        measured = right[0]
+
+
+def since(first: Swaps, second: Swaps, messages: list[str]) -> Swaps:
+    """Pairs that were exchanged on one of two days; those of both are added to what is `said`."""
+    found = []
+    for what, a, b in (
+        ("correctors", first.correctors, second.correctors),
+        ("monitors", first.monitors, second.monitors),
+    ):
+        before = {frozenset(pair): pair for pair in a}
+        now = {frozenset(pair): pair for pair in b}
+        if both := [pair for key, pair in now.items() if key in before]:
+            messages.append(f"on both days {swap_message(both, what)}")
+        alone = {pair: a[pair] for key, pair in before.items() if key not in now}
+        found.append(alone | {pair: b[pair] for key, pair in now.items() if key not in before})
+    return Swaps([], found[0], found[1], [])

@@ -1,0 +1,155 @@
+"""What a dense fit leaves open of a machine, and what a change of it looks like because of that.
+
+A change between two measurements is seen in the machine that was fitted to the first one, whose
+numbers are known with errors. What is not known of them moves no reading by itself, for it was
+there before; but it moves what the change makes of the readings, by as much as the change is large.
+So far the readings are blurred: amounts, rivals and statistics know it, of one change
+(`inference.among.Blurred`) and of many (`linear.with_numbers`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from tmlattice.diagnosis.response.linear import linear
+from tmlattice.diagnosis.response.state import State
+from tmlattice.effects import Cause, background_rms, find
+from tmlattice.inference.distributed import MarginalProblem
+from tmlattice.inference.normal import solve
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.lattice import Ring
+from tmlattice.observe.response_problem import Response
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Undetermined:
+    """Errors of a machine that are not known, Gaussian.
+
+    Attributes:
+        hypotheses: what they are errors of.
+        root: their amounts by independent ones of size 1, [hypothesis, error].
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    root: Array
+
+    def size(self, problem: Response) -> int:
+        """Numbers that have to be held."""
+        return len(self.hypotheses) * problem.used.size
+
+
+ORBITS = (
+    "quadrupole_offset_x", "quadrupole_offset_y", "dipole_field", "dipole_roll",
+    "sextupole_offset_x", "sextupole_offset_y",
+)  # fmt: skip
+"""What makes orbits, and what sextupoles make of them: a response shows hardly anything of it, and
+a change of sextupoles does."""
+
+
+def undetermined(state: State) -> Undetermined:
+    """By a fit that has settled, with its priors."""
+    blocks: list[dict[Hypothesis, Array]] = []
+    for block in (block for block in (0, 1) if state.of_block(block)):
+        there = linear(state, block)
+        found = solve(there.normal, there.groups, there.start, rounds=0)
+        numbers = found.spread @ np.linalg.cholesky(found.covariance)
+        amounts: dict[Hypothesis, Array] = {}
+        for family in {f.variable: f for f in state.of_block(block)}.values():
+            moved = zip(
+                numbers[there.where[family.variable]], family.moves(state.data), strict=True
+            )
+            for number, moves in moved:
+                for hypothesis, share in moves.items():
+                    amounts[hypothesis] = share * number + amounts.get(hypothesis, 0.0)
+        if amounts:
+            blocks.append(amounts)
+    hypotheses = tuple(dict.fromkeys(h for own in blocks for h in own))
+    where = {h: i for i, h in enumerate(hypotheses)}
+    roots = []
+    for own in blocks:
+        root = np.zeros((len(hypotheses), len(next(iter(own.values())))))
+        for hypothesis, number in own.items():
+            root[where[hypothesis]] = number
+        roots.append(root)
+    return Undetermined(hypotheses, np.hstack([np.zeros((len(hypotheses), 0)), *roots]))
+
+
+def and_orbits(ring: Ring, open_: Undetermined) -> Undetermined:
+    """With orbits as large as usual errors make them."""
+    usual = background_rms(dict.fromkeys(ORBITS))
+    unseen = [(name, place) for name in ORBITS for place in find(name).places(ring)]
+    alone = np.diag([usual[name] for name, _ in unseen])
+    return Undetermined((*open_.hypotheses, *unseen), block_diag(open_.root, alone))
+
+
+STRONGEST, HARDLY = 200, 0.1
+"""Errors that are kept where all are too many, and what one has to make of the readings, in units
+of their noise."""
+
+
+def strongest(problem: Response, open_: Undetermined, causes: Sequence[Cause]) -> Undetermined:
+    """Of the errors those, with what is known of them together, that move most what causes make of
+    the readings.
+
+    Raises:
+        UnstableRingError: no closed orbit with the causes.
+    """
+    views = problem.view(()), problem.view(causes)
+    slopes = (view.signatures(open_.hypotheses) for view in views)
+    noise = np.broadcast_to(problem.base.data.noise, problem.used.shape)[problem.used]
+    moved = np.array([
+        np.linalg.norm((with_them - without)[problem.used] / noise)
+        for without, with_them in zip(*slopes, strict=True)
+    ])  # fmt: skip
+    moved *= np.sqrt(np.sum(open_.root**2, axis=1))
+    order = np.argsort(-moved, kind="stable")[:STRONGEST]
+    kept = np.sort(order[moved[order] > HARDLY])
+    root = np.linalg.qr(open_.root[kept].T)[1].T
+    return Undetermined(tuple(open_.hypotheses[i] for i in kept), root)
+
+
+class Blur:
+    """What is not known of what causes do, in one machine.
+
+    Args:
+        problem: of the response in that machine.
+        open_: what is not known of it.
+    """
+
+    def __init__(self, problem: Response, open_: Undetermined) -> None:
+        self.problem, self.open = problem, open_
+
+    @cached_property
+    def _without(self) -> Array:
+        """Signatures where nothing changed, [hypothesis, reading]."""
+        return self._signatures(())
+
+    def _signatures(self, causes: Sequence[Cause]) -> Array:
+        view = self.problem.view((*self.problem.fixed, *causes))
+        out = np.empty((len(self.open.hypotheses), self.problem.used.size))
+        for row, signature in zip(out, view.signatures(self.open.hypotheses), strict=True):
+            row[:] = signature.ravel()
+        return out
+
+    def of(self, causes: Sequence[Cause]) -> Array:
+        """d reading / d error, m, [error, *shape of the readings].
+
+        Raises:
+            UnstableRingError: no closed orbit with them.
+        """
+        spread = self.open.root.T @ (self._signatures(causes) - self._without)
+        return np.asarray(spread.reshape(-1, *self.problem.used.shape))
+
+    def among(self, spread: Array) -> MarginalProblem:
+        """The problem among errors that make so much of the readings."""
+        own = self.problem
+        return MarginalProblem(
+            inner=own, spread=spread, places=own.places, rare=own.rare, amounts=own.amounts,
+            judgement=own.judgement,
+        )  # fmt: skip
