@@ -262,7 +262,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
         lines += columns([HEAD, *step_rows(result.rejected_steps)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.common_factors is not None:
-        lines += ["", "Few reasons behind the gradients:"]
+        lines += ["", "Common factors of the gradients:"]
         for name, amount, count, square, makes in common_factor_rows(result):
             head = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
             lines += wrapped(head, "   ", width)
