@@ -8,7 +8,7 @@ import importlib.util
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -50,16 +50,33 @@ def read_ocelot(
 
     Source: the naming rule is the measurement format's, version 1 (docs/coordinates.md, "Names").
     """
-    module = _run_as_module(path)
-    variables = vars(module)
-    chosen = _sequence(path, variables, sequence)
-    places = list(_flatten(chosen))
+    variables = vars(_run_as_module(path))
+    return ring_of_elements(_sequence(path, variables, sequence), path, name, energy, variables)
+
+
+def ring_of_elements(
+    sequence: Any,
+    path: Path,
+    name: str,
+    energy: float | None = None,
+    variables: Mapping[str, Any] = {},  # noqa: B006  (it is only read)
+) -> Ring:
+    """The ring of a list of OCELOT elements or of a `MagneticLattice`; see `read_ocelot`.
+
+    Args:
+        sequence: elements, nested lists of them, or a MagneticLattice.
+        path: of its file, or the object's name, for messages.
+        name: of the ring.
+        energy: GeV; else that of the variables.
+        variables: of the file: names of elements and the energy.
+    """
+    places = list(_flatten(sequence))
     if not places:
         raise LatticeError(f"the sequence of '{path}' is empty; name another with sequence=")
     return Ring(
         name=name,
         elements=_name_places(places, variables),
-        energy=_energy(path, variables, chosen) if energy is None else energy,
+        energy=_energy(path, variables) if energy is None else energy,
     )
 
 
@@ -155,7 +172,7 @@ def _thin_bend(source: Any) -> Any:
     return CombinedMultipole(angle=angle, k1=k1, k2=k2, tilt=source.tilt, eid=source.id)
 
 
-def _name_places(places: list[Any], variables: dict[str, Any]) -> tuple[Element, ...]:
+def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Element, ...]:
     by_object: dict[int, str] = {}
     for variable in sorted(variables, reverse=True):  # so that the lowest-sorting one stays
         by_object[id(variables[variable])] = variable
@@ -169,7 +186,7 @@ def _name_places(places: list[Any], variables: dict[str, Any]) -> tuple[Element,
     return place_elements(families, [mended[id(source)] for source in places])
 
 
-def _energy(path: Path, variables: dict[str, Any], sequence: Any) -> float:
+def _energy(path: Path, variables: Mapping[str, Any]) -> float:
     for name in ("energy", "Energy", "ENERGY", "E0", "beam_energy"):
         if isinstance(variables.get(name), int | float):
             return float(variables[name])

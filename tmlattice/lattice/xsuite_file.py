@@ -116,14 +116,23 @@ def read_xsuite(
         raise LatticeError(f"'{path}' is larger than {MOST_BYTES / 1e9:g} GB; save one line")
     content = json_of(path, LatticeError, finite=False)
     try:
-        return _ring(path, content, name, sequence, energy)
+        return ring_of_content(path, content, name, sequence, energy)
     except LatticeError as error:
         if str(error).startswith(f"'{path}'"):
             raise
         raise LatticeError(f"'{path}' cannot be read as Xsuite's JSON: {error}") from error
 
 
-def _ring(path: Path, content: Any, name: str, sequence: str | None, energy: float | None) -> Ring:
+def ring_of_content(
+    path: Path, content: Any, name: str, sequence: str | None, energy: float | None
+) -> Ring:
+    """The ring of what `xtrack.Line.to_dict` or `Environment.to_dict` returns; see `read_xsuite`.
+
+    Args:
+        path: of its file, or the object's name, for messages.
+        content: the dictionary.
+        name, sequence, energy: see `read_xsuite`.
+    """
     beside: Mapping[str, Any] = {}
     if isinstance(content.get("line"), dict):
         content, beside = content["line"], content
