@@ -1,4 +1,4 @@
-"""One function for all lattices: files by their suffix, objects of other packages by their class."""
+"""One function for all lattices: files by their suffix, other packages' objects by their class."""
 
 import os
 import warnings

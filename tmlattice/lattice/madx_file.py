@@ -287,13 +287,15 @@ def _with_errors_of(
         values[key] = np.pad(own, (0, max(0, len(acting) - len(own))))
         values[key][: len(acting)] += acting
         if part.keyword == "multipole":  # the design's bend stays
-            values.setdefault("angle", float(part.list("knl")[0]) if part.list("knl").any() else 0)
+            if part.list("ksl")[:1].any():
+                raise LatticeError(f"EFCOMP of {named}, which bends vertically, is not modelled")
+            values.setdefault("angle", float(part.list("knl")[:1].sum()))
     if any(kicks):
-        own = part.number("kick")
+        alone = part.number("kick")
         plane = {"hkicker": "hkick", "vkicker": "vkick"}.get(part.keyword)
-        if own and plane:
+        if alone and plane:
             values.pop("kick")
-            values[plane] = own
+            values[plane] = alone
         for key, amount in zip(("hkick", "vkick"), kicks, strict=True):
             values[key] = float(values.get(key, 0.0)) + amount
     return replace(part, values=values)

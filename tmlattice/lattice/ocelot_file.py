@@ -18,6 +18,7 @@ from typing import Any
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice.places import place_elements, source_kind
 from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.source import copied
 
 SEQUENCES = ("ring", "cell", "lattice")
 """Variables that may hold the sequence, in the order in which they are looked for."""
@@ -59,7 +60,7 @@ def ring_of_elements(
     path: Path,
     name: str,
     energy: float | None = None,
-    variables: Mapping[str, Any] = {},  # noqa: B006  (it is only read)
+    variables: Mapping[str, Any] = {},
 ) -> Ring:
     """The ring of a list of OCELOT elements or of a `MagneticLattice`; see `read_ocelot`.
 
@@ -149,9 +150,14 @@ def _flatten(sequence: Any) -> Iterator[Any]:
 
 
 def _mend(source: Any) -> Any:
-    """The element; a copy of a matrix element that was born without a longitudinal block; a thin
-    bend in the place of a multipole that bends the design orbit."""
+    """The element; a copy of a matrix element that was born without a longitudinal block, or of a
+    displaced one without its offset; a thin bend in the place of a multipole that bends the design
+    orbit."""
     from tmlattice.lattice.ocelot import elements
+
+    if _displaced(source):
+        source = copied(source)
+        source.dx = source.dy = 0.0
 
     if isinstance(source, elements.Matrix) and source.r[4, 4] == 0 and source.r[5, 5] == 0:
         source = copy.deepcopy(source)
@@ -183,7 +189,19 @@ def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Eleme
         for source in places
     ]
     mended = {id(source): _mend(source) for source in {id(p): p for p in places}.values()}
-    return place_elements(families, [mended[id(source)] for source in places])
+    elements = place_elements(families, [mended[id(source)] for source in places])
+    return tuple(
+        e.with_errors(dx=float(source.dx), dy=float(source.dy)) if _displaced(source) else e
+        for e, source in zip(elements, places, strict=True)
+    )
+
+
+def _displaced(source: Any) -> bool:
+    """Whether an element has its field beside the axis; in `Element` that is one of its errors."""
+    return bool(source.dx or source.dy) and type(source).__name__ in _WITH_OFFSET
+
+
+_WITH_OFFSET = ("Quadrupole", "Sextupole", "Octupole", "SBend", "RBend", "Bend", "Solenoid")
 
 
 def _energy(path: Path, variables: Mapping[str, Any]) -> float:

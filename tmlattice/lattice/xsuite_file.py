@@ -9,6 +9,7 @@ import cmath
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -268,6 +269,10 @@ class _Reader:
         variables = (content.get("_var_management_data") or {}).get("var_values") or {}
         self.variables = {k: v for k, v in variables.items() if isinstance(v, int | float)}
         self._arithmetic = Arithmetic((math.sqrt, math.sin, math.cos, math.tan, math.exp))
+        self._steering = {
+            key: {str(name).partition("::")[0] for name in own or ()}
+            for key, own in (line.get("_extra_config") or {}).items() if key.startswith("steering_")
+        }  # fmt: skip
         self._made: dict[str, list[Part]] = {}
         self._length = 0.0
 
@@ -285,9 +290,33 @@ class _Reader:
                 parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
                 continue
             if item not in self._made:
-                self._made[item] = self._converted(self._fields(item), item.lower())
+                own = self._converted(self._fields(item), item.lower())
+                self._made[item] = [self._steered(item, part) for part in own]
             parts += self._made[item]
         return parts
+
+    def _steered(self, name: str, part: Part) -> Part:
+        """A marker or way among the monitors of the line's steering as a monitor, a dipole field
+        among its correctors as a corrector."""
+        x, y, read_x, read_y = (
+            name in self._steering.get(f"steering_{what}", ())
+            for what in ("correctors_x", "correctors_y", "monitors_x", "monitors_y")
+        )
+        if (read_x or read_y) and part.keyword in ("marker", "drift"):
+            return replace(part, keyword="monitor")
+        if not (x or y) or part.keyword != "multipole" or part.number("angle"):
+            return part
+        knl, ksl = part.list("knl"), part.list("ksl")
+        moved = any(part.number(key) for key in ("dx", "dy", "ds", "dpsi"))
+        if knl[1:].any() or ksl[1:].any() or moved:
+            return part
+        kick_x, kick_y = -float(knl[:1].sum()), float(ksl[:1].sum())
+        values = {"l": part.number("l"), "tilt": part.number("tilt")}
+        if x and not y and not kick_y:
+            return replace(part, keyword="hkicker", values={**values, "kick": kick_x})
+        if y and not x and not kick_x:
+            return replace(part, keyword="vkicker", values={**values, "kick": kick_y})
+        return replace(part, keyword="kicker", values={**values, "hkick": kick_x, "vkick": kick_y})
 
     # --- the order of a line's elements ---------------------------------------------------------
     def _names(self, line: Mapping[str, Any], depth: int) -> list[str | float]:
