@@ -345,6 +345,10 @@ class Ring(Speaks):
             raise unknown_name("element like", name, dict.fromkeys(e.family for e in self.elements))
         return found  # type: ignore[return-value]
 
+    def __contains__(self, name: object) -> bool:
+        """Whether it has an element of this name."""
+        return isinstance(name, str) and name.strip().casefold() in self._index
+
     def __iter__(self) -> Iterator[Element]:
         """Its elements in beam order."""
         return iter(self.elements)

@@ -16,6 +16,8 @@ from tmlattice.lattice.ring import Element, Ring
 Array = NDArray[np.float64]
 
 LIGHT = 299792458.0
+STEP = 0.035
+"""rad; phase sqrt(|k1|) l of a step of AT's integrator: the tunes of a ring are right to 1e-5."""
 
 
 def holds(element: Element) -> tuple[str, ...]:
@@ -46,6 +48,10 @@ def at_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
 
     left_out: Counter[str] = Counter()
     line = [_element(element, ring, left_out) for element in ring.elements]
+    for element, made in zip(ring.elements, line, strict=True):
+        if isinstance(made, at.Multipole):
+            steps = math.ceil(math.sqrt(abs(element.k1)) * element.length / STEP)
+            made.NumIntSteps = max(steps, made.NumIntSteps)
     name = Path(ring.name).stem
     with quiet_at():  # which warns of particles that are slower than light
         particle = at.Particle("relativistic")

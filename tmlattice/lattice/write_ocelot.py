@@ -43,15 +43,21 @@ def magnetic_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
     Args:
         ring: of `plain`, with the errors that OCELOT `holds`.
     """
-    from tmlattice.lattice.ocelot import SecondTM
+    from tmlattice.lattice.ocelot import SecondTM, elements
 
     lattices = import_module("ocelot.cpbd.magnetic_lattice")  # after OCELOT, without its greeting
     sequence = []
+    off = 0
     for element in displaced(ring).elements:
         source = copied(element.source)
+        if element.kind == "cavity":  # it would accelerate the reference; a thin one has no map
+            off += bool(getattr(source, "v", 0.0))
+            source = elements.Drift(l=element.length) if element.length else elements.Marker()
         source.id = element.family
         sequence.append(source)
-    return lattices.MagneticLattice(tuple(sequence), method={"global": SecondTM}), _lacks(ring)
+    told = (f"{off} cavities are off, as drifts or markers",) if off else ()
+    lattice = lattices.MagneticLattice(tuple(sequence), method={"global": SecondTM})
+    return lattice, (*_lacks(ring), *told)
 
 
 def _lacks(ring: Ring) -> tuple[str, ...]:

@@ -159,6 +159,8 @@ def _bend(element: Element, left_out: Counter[str]) -> dict[str, Any]:
         for key, value in (("angle", e), ("hgap", source.gap / 2), ("fint", fint))
         if value
     }
+    if element.k1:  # else its gradient is in a few kicks
+        edges["model"] = "mat-kick-mat"
     return _magnet("Bend", element, [], length=element.length, angle=element.angle,
                    k1=element.k1, k2=element.k2, **edges)  # fmt: skip
 

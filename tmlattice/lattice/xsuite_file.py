@@ -88,6 +88,9 @@ MOST_KICKS = 1000
 LUMPED = 2e-5
 """1/m; by so much a magnet's focusing may differ for its gradient's being spread over its length:
 1e-5 of a tune at a beta of 10 m."""
+COARSE = 0.25
+"""|k1| l^2 of a bend above which the seven kicks that Xsuite has for it are too few: 1e-5 of its
+matrix; 2e-3 at 1.8."""
 SKEW_SHARE = 0.1
 """Weight of skew gradients there: they act on the tunes in second order."""
 ROUNDING = 1e-9
@@ -639,7 +642,8 @@ class _Reader:
         exact = ["mat-kick-mat", "mat-kick-mat-exact", "expanded"]
         if rule not in ("uniform", "teapot"):
             exact += ["adaptive", "full", "0"]
-        if fields.number("num_multipole_kicks") and model not in exact:
+        coarse = not model.startswith("mat") and abs(fields.number("k1")) * _way_of(fields) ** 2
+        if (fields.number("num_multipole_kicks") and model not in exact) or coarse > COARSE:
             self.report.left_out("the finite number of kicks", name)
 
     def _straight(self, fields: _Fields, name: str, where: str) -> list[Part]:
