@@ -56,6 +56,6 @@ def _is_path(value: Any) -> bool:
 
 
 def _ring(lattice: Any) -> Any:
-    from tmlattice.lattice import Ring, load_ring
+    from tmlattice.lattice import load_ring
 
-    return lattice if isinstance(lattice, Ring) else load_ring(lattice)
+    return load_ring(lattice)

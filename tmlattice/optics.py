@@ -316,7 +316,7 @@ def twiss(ring: Ring | LayerChain | Any) -> Twiss:
         end = total[-1]
         path, total = path[:-1], total[:-1]
     else:
-        ring = ring if isinstance(ring, Ring) else load_ring(ring)
+        ring = load_ring(ring)
         names = tuple(element.name for element in ring.elements)
         s = np.cumsum([element.length for element in ring.elements])
         path, total = _through(ring, _on_closed_orbit(Chain.from_ring(ring, 6))[0][0])

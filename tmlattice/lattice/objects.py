@@ -105,6 +105,8 @@ def _of_xtrack(lattice: Any, name: str, sequence: str | None, energy: float | No
 
     if not hasattr(lattice, "lines"):
         _one_alone(lattice, sequence)
+        if not len(lattice.element_names):
+            raise LatticeError("the Line has no elements; give one with elements")
     elif not len(lattice.lines):
         raise LatticeError("the Environment has no line; give one with a line")
     return ring_of_content(Path(name), lattice.to_dict(), name, sequence, energy)

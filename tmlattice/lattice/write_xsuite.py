@@ -168,10 +168,10 @@ def _bend(element: Element, left_out: Counter[str]) -> dict[str, Any]:
 def _cavity(element: Element, ring: Ring) -> dict[str, Any]:
     """At the phase where nothing is lost, of the side on which the motion is stable."""
     source = element.source
-    voltage = 1e9 * float(source.v) * (-1.0 if ring.radiates else 1.0)  # of the charge's sign
-    content = {"__class__": "Cavity", "voltage": voltage, "frequency": float(source.freq)}
+    voltage, frequency = 1e9 * float(source.v), float(source.freq)
+    content = {"__class__": "Cavity", "voltage": voltage, "frequency": frequency}
     if element.length:
         content["length"] = element.length
-    if float(source.v) and slip(ring) > 0:
+    if voltage and slip(ring) > 0:  # Xsuite takes the charge without its sign
         content["lag"] = math.degrees(math.pi)
     return content

@@ -78,9 +78,10 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
 
     Args:
         measured: of any kind.
-        ring: along which, with its lattice below; else by the number of the monitor.
+        ring: along which, with its lattice below (all that `load_ring` takes); else by the number
+            of the monitor.
     """
-    known = ring if ring is None or isinstance(ring, Ring) else load_ring(ring)  # type: ignore[arg-type]
+    known = None if ring is None else load_ring(ring)
     if isinstance(measured, TuneReading):
         return _tunes(measured, known)
     heights = [3, 3, 0.8] if known is not None else [3, 3]
