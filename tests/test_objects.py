@@ -355,7 +355,7 @@ FIELDS = [
 ]
 """What AT and Xsuite hold too; MAD-X only the bends'."""
 ESTIMATED = {
-    # what is allowed of tunes, the closed orbit (m) and the dispersion (m); twice what was measured.
+    # Allowed of tunes, closed orbit (m) and dispersion (m): twice what was measured.
     # xtrack: the third order in an orbit of half a millimetre. AT: its bends lack
     # h x (px^2 + py^2) / 2. MAD-X: bends with another K0 focus. OCELOT: its matrix of a turn is
     # about the axis, not about the closed orbit.
