@@ -108,6 +108,20 @@ def test_in_python_too(place, monkeypatch):
     right(finding.recommended_action)
 
 
+def test_objects_of_other_packages(place, monkeypatch):
+    monkeypatch.chdir(place)
+    before = sorted(place.iterdir())
+    names = {}
+    exec("\n".join(blocks("objects.md", "python")), names)
+    (finding,) = names["diagnosis"].findings
+    right(finding.remedy)
+    tunes, design = (names[k].get_tune()[:2] for k in ("estimated", "lattice"))
+    assert abs(tunes - design).max() > 1e-3
+    assert names["magnet"] in names["family"]
+    assert names["table"].mux.iloc[-1] == pytest.approx(names["optics"].total_tunes[0])
+    assert sorted(place.iterdir()) == before
+
+
 def test_what_several_measurements_say_together(place, monkeypatch):
     monkeypatch.chdir(place)
     (code,) = blocks("together.md", "python")

@@ -1,4 +1,4 @@
-"""A built-in name or a path where a ring is taken, a path where a measurement is.
+"""All that `load_ring` takes where a ring is taken, a path where a measurement is.
 
 >>> @by_name
 ... def diagnose(ring, measurement): ...
@@ -22,8 +22,8 @@ _open = Method("tmlattice.importers.speaking", "measured", "A measurement by its
 
 
 def by_name(function: F) -> F:
-    """The function, which takes a built-in name or a path too where it takes a ring, and a path
-    where it takes a measurement: `ring`, `measurement`, `data`, `reference`."""
+    """The function, which takes all that `load_ring` does where it takes a ring, and a path where
+    it takes a measurement: `ring`, `measurement`, `data`, `reference`."""
     signature = inspect.signature(function)
     more = "options" in signature.parameters
     wanted = [name for name in ("ring", *MEASURED) if more or name in signature.parameters]
@@ -37,7 +37,7 @@ def by_name(function: F) -> F:
             value = given_to.get(name)
             ring = given.get("ring", given.get("options", {}).get("ring"))
             if name == "ring":
-                if _is_path(value):
+                if value is not None:
                     given_to[name] = _ring(value)
             elif _is_path(value):
                 given_to[name] = _open.function(value, ring)
@@ -55,7 +55,7 @@ def _is_path(value: Any) -> bool:
     return isinstance(value, str | os.PathLike)
 
 
-def _ring(name: Any) -> Any:
+def _ring(lattice: Any) -> Any:
     from tmlattice.lattice import load_ring
 
-    return load_ring(name)
+    return load_ring(lattice)

@@ -64,10 +64,10 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "problem": None,
     }
     try:
-        functions = twiss(Chain.from_ring(ring))
+        functions = twiss(ring)
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
-        facts["closed_orbit_max"] = abs(functions.orbit).max(axis=0).tolist()
+        facts["closed_orbit_max"] = [float(abs(own).max()) for own in (functions.x, functions.y)]
         energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
         # per momentum, not per energy dE / (p0 c) = beta delta; and of the path, not of its time
         beta, lag = (1.0, 0.0) if ring.gamma > 1e3 else (ring.beta, ring.gamma**-2)

@@ -28,7 +28,7 @@ from tmlattice.correction.solve import (
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import TmlatticeError, UnstableRingError
-from tmlattice.lattice import Ring
+from tmlattice.lattice import Ring, load_ring
 
 __all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_knobs"]
 
@@ -45,9 +45,9 @@ SIGMAS = 3.0
 
 
 def correct(
-    diagnosis: Diagnosis | Estimate | Ring,
+    diagnosis: Diagnosis | Estimate | Ring | Any,
     *,
-    goal: Ring | None = None,
+    goal: Ring | Any | None = None,
     knobs: Sequence[Knob] | Iterable[str] | str | Path | None = None,
     targets: Iterable[str] | Mapping[str, float | None] | None = None,
     seed: int = 0,
@@ -56,7 +56,8 @@ def correct(
     """Settings of knobs that bring the ring, as the data have it, closest to a goal.
 
     Args:
-        diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain.
+        diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain, as all
+            that `load_ring` takes.
         goal: the ring whose optics are wanted, and whose strengths are the present settings of a
             ring that is given as one; None: the diagnosis's design.
         knobs: devices; kinds of `default_knobs`; or the path of a table. None: quadrupole supplies
@@ -72,6 +73,7 @@ def correct(
         UnstableRingError: the estimated ring, or the goal, stores no beam.
     """
     begun = time.perf_counter()
+    goal = None if goal is None else load_ring(goal)
     chosen = targets
     if chosen is None:
         orbit = isinstance(diagnosis, Diagnosis) and "closed_orbit" in diagnosis.measured
@@ -100,14 +102,14 @@ def correct(
     return Correction(**found, ring=estimate.settings, provenance=made)
 
 
-def _estimate(diagnosis: Diagnosis | Estimate | Ring, goal: Ring | None) -> Estimate:
+def _estimate(diagnosis: Diagnosis | Estimate | Any, goal: Ring | None) -> Estimate:
     if isinstance(diagnosis, Estimate):
         return diagnosis
     if isinstance(diagnosis, Diagnosis):
         return estimate_of(diagnosis)
     if goal is None:
         raise TmlatticeError("a lattice alone has no goal; give the design (goal=, --design)")
-    return estimate_with(diagnosis, goal, None)
+    return estimate_with(load_ring(diagnosis), goal, None)
 
 
 def _knobs(

@@ -6,6 +6,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from tmlattice.by_name import by_name
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.bring_in import Options, bring_in
 from tmlattice.importers.columns import CSV, HDF5, SDDS
@@ -18,6 +19,7 @@ from tmlattice.measurement.tables import Unit
 log = logging.getLogger(__name__)
 
 
+@by_name
 def read_measurement(
     path: str | PathLike[str],
     monitors: Sequence[str] | None = None,
