@@ -12,7 +12,7 @@ from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.remedies import Remedy, undone
+from tmlattice.diagnosis.remedies import Remedy, compensated
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
@@ -400,7 +400,7 @@ class Diagnosis(ShownDiagnosis):
         Loaded into the machine as it was found, these settings make it the design again: see
         `remedies.undone`.
         """
-        return undone(self.ring, self.faults)
+        return compensated(self.ring, self.faults)
 
     @property
     def gap(self) -> dict[str, Any]:

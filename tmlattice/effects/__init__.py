@@ -43,7 +43,7 @@ from tmlattice.effects.effect import (
 )
 from tmlattice.effects.radiation import expected_loss, expected_radiation, expected_spread
 from tmlattice.effects.reading import Monitors
-from tmlattice.effects.sizes import background_rms, rare
+from tmlattice.effects.priors import background_rms, rare
 
 __all__ = [
     "CATALOGUE",

@@ -43,7 +43,7 @@ class DipoleField(_OnBend):
         """Another field."""
         it.scale *= 1 + amount
 
-    def undone(self, element: Element, amount: float) -> Element | None:
+    def compensated(self, element: Element, amount: float) -> Element | None:
         """The opposite kick: the design's geometry stays."""
         return self.changed(element, -amount, 0.0)
 
@@ -100,6 +100,6 @@ class BendGradient(_OnBend):
         """Another gradient."""
         it.k1 += amount
 
-    def undone(self, element: Element, amount: float) -> Element | None:
+    def compensated(self, element: Element, amount: float) -> Element | None:
         """As much less."""
         return self.changed(element, -amount, 0.0)

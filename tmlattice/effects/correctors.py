@@ -27,7 +27,7 @@ class _Kick(_OnCorrector):
     )
     own: ClassVar[Kind]
 
-    def undone(self, element: Element, amount: float) -> Element | None:
+    def compensated(self, element: Element, amount: float) -> Element | None:
         """The opposite setting, where it is its own plane and the corrector is upright."""
         plane = 0.0 if self.own == "hcorrector" else math.pi / 2  # OCELOT tilts a vertical one
         if element.kind != self.own or abs(element.tilt + element.errors.roll - plane) > 1e-9:

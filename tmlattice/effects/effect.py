@@ -30,7 +30,7 @@ Group = Literal[
 """Effects that a figure draws in one colour."""
 
 
-LEAST_LEFT = 0.01
+MIN_STRENGTH = 0.01
 """Share of a strength below which nothing is left of it."""
 
 
@@ -110,7 +110,7 @@ class Effect(ABC):
     def places(self, ring: Ring) -> list[str | None]:
         """The elements, or families, that it can sit on, in beam order; [None] for the beam."""
 
-    def stands_for(self, element: Element) -> tuple[str, float]:
+    def corrected_as(self, element: Element) -> tuple[str, float]:
         """The effect whose remedy takes this one away too, and its amount for 1 of this one.
 
         At one element two effects share a remedy where the same adjustment of the element takes
@@ -126,21 +126,21 @@ class Effect(ABC):
         """
         if not self.multiplies:
             return float(self.power * amount ** (self.power - 1))
-        return float(1 / (1 + self.some_left(amount)))
+        return float(1 / (1 + self.floored(amount)))
 
     def joined(self, one: float, other: float) -> float:
         """The amount that does what two of them do."""
         return (1 + one) * (1 + other) - 1 if self.multiplies else one + other
 
-    def some_left(self, amount: float) -> float:
+    def floored(self, amount: float) -> float:
         """The amount; of a strength that would be gone, `LEAST_LEFT` is kept.
 
         Two amounts of it act as (1 + a)(1 + b): at a = -1 more of the effect has nothing to act on.
         """
         left = 1 + amount
-        if not self.multiplies or abs(left) >= LEAST_LEFT:
+        if not self.multiplies or abs(left) >= MIN_STRENGTH:
             return amount
-        return float(np.copysign(LEAST_LEFT, left) - 1)
+        return float(np.copysign(MIN_STRENGTH, left) - 1)
 
     def check(self, ring: Ring, cause: Cause) -> None:
         """Raise where a cause of this effect is impossible in the ring.
@@ -213,7 +213,7 @@ class RingEffect(Effect):
     def build(self, it: Build, amount: float) -> None:
         """Put it, all causes at the element added up, into what another engine is to build."""
 
-    def undone(self, element: Element, amount: float) -> Element | None:
+    def compensated(self, element: Element, amount: float) -> Element | None:
         """The element set so that with this much of the effect it acts as designed.
 
         None where no setting of its own does that: somebody has to move, turn or mend it.
@@ -282,9 +282,9 @@ class StrengthEffect(RingEffect):
         """Scale the whole."""
         it.scale *= 1 + amount
 
-    def undone(self, element: Element, amount: float) -> Element | None:
+    def compensated(self, element: Element, amount: float) -> Element | None:
         """The strength over 1 + amount; None where that is almost no field at all."""
-        if abs(1 + amount) < LEAST_FIELD:
+        if abs(1 + amount) < MIN_FIELD:
             return None
         return self.changed(element, 1 / (1 + amount) - 1, 0.0)
 
@@ -296,12 +296,12 @@ class FamilyEffect(StrengthEffect):
         """Families in the order of their first members; where every magnet is a family of its own,
         what several of their names begin with; and those that nothing but the design has alike."""
         powered = [e for e in ring.elements if self.sits_on(e)]
-        named = _several(e.family for e in powered)
-        return [*(named or _several(stem(e.name) for e in powered)), *self._alike(ring)]
+        named = _repeated(e.family for e in powered)
+        return [*(named or _repeated(stem(e.name) for e in powered)), *self._alike(ring)]
 
     def _named(self, ring: Ring) -> list[str | None]:
         """And what the names of several families begin with."""
-        begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
+        begin = _repeated(stem(e.name) for e in ring.elements if self.sits_on(e))
         return [*self.places(ring), *begin]
 
     def _alike(self, ring: Ring) -> dict[str, list[int]]:
@@ -324,12 +324,12 @@ class FamilyEffect(StrengthEffect):
         return family or [i for i in powered if stem(ring.elements[i].name) == name]
 
 
-def _several(names: Iterable[str]) -> list[str]:
+def _repeated(names: Iterable[str]) -> list[str]:
     """Those that stand more than once, in their order."""
     return [name for name, count in Counter(names).items() if count > 1]
 
 
-LEAST_FIELD = 0.1
+MIN_FIELD = 0.1
 """Share of its field below which a magnet is broken: no setting makes ten times as much of it."""
 
 

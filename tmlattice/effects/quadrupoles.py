@@ -73,7 +73,7 @@ class GradientAbsolute(_Gradient, ErrorEffect):
         """A thin quadrupole."""
         it.add_gradient("middle", normal=amount)
 
-    def stands_for(self, element: Element) -> tuple[str, float]:
+    def corrected_as(self, element: Element) -> tuple[str, float]:
         """A powered quadrupole's own gradient, or a wiggler's focusing."""
         if element.kind == "quadrupole" and element.k1 * element.length != 0:
             return QuadrupoleGradient.name, 1 / (element.k1 * element.length)
@@ -81,9 +81,9 @@ class GradientAbsolute(_Gradient, ErrorEffect):
             return "insertion_device_focusing", 1.0
         return self.name, 1.0
 
-    def undone(self, element: Element, amount: float) -> Element | None:
+    def compensated(self, element: Element, amount: float) -> Element | None:
         """As much less of a powered quadrupole's own gradient."""
-        if self.stands_for(element)[0] != QuadrupoleGradient.name:
+        if self.corrected_as(element)[0] != QuadrupoleGradient.name:
             return None
         return element.changed(k1=element.k1 - amount / element.length)
 
@@ -107,7 +107,7 @@ class SkewGradient(_Gradient, ErrorEffect):
         """A thin skew quadrupole."""
         it.add_gradient("middle", skew=amount)
 
-    def stands_for(self, element: Element) -> tuple[str, float]:
+    def corrected_as(self, element: Element) -> tuple[str, float]:
         """The roll of a powered quadrupole: by theta it has k1s L = -2 theta k1 L."""
         if element.kind == "quadrupole" and element.k1 * element.length != 0:
             return QuadrupoleRoll.name, -1 / (2 * element.k1 * element.length)

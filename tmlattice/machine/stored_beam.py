@@ -92,7 +92,7 @@ class _Machine:
         """What the monitors make of it, [..., monitor, 2], without noise."""
         return self.monitors.read(beam)
 
-    def told(self) -> dict[str, Any]:
+    def fields(self) -> dict[str, Any]:
         """What the records say of the ring."""
         ring = self.engine.ring
         names = tuple(monitor.name for monitor in ring.monitors)
@@ -199,7 +199,7 @@ def simulate_turns(
         reading += sigma * stream(seed, "turns", i).standard_normal(reading.shape)  # noqa: PLW2901
     readings[:, :, frozen] = readings[0, 0, frozen]
     measured = TurnByTurn(
-        readings=readings, noise=known, settings=each if settings else (), **machine.told()
+        readings=readings, noise=known, settings=each if settings else (), **machine.fields()
     )
     more: dict[str, Any] = {"particles": particles, "radiation": radiation}
     if particles > 1:
@@ -235,7 +235,7 @@ def simulate_orbits(
         reading += sigma * stream(seed, "orbit", i).standard_normal(reading.shape)  # noqa: PLW2901
     orbit[:, machine.monitors.frozen] = orbit[0, machine.monitors.frozen]
     measured = ClosedOrbit(
-        orbit=orbit, noise=known, settings=each if settings else (), **machine.told()
+        orbit=orbit, noise=known, settings=each if settings else (), **machine.fields()
     )
     return StoredSimulation(measured=measured, more={"radiation": radiation}, **machine.made_of)
 
@@ -276,7 +276,7 @@ def simulate_dispersion(
         change[machine.monitors.frozen] = 0.0
         change += sigma * stream(seed, "dispersion", i).standard_normal(change.shape)
         made.append(RfStep(frequency, rf.harmonic, step, change))
-    measured = Dispersion(steps=tuple(made), noise=known, **machine.told())
+    measured = Dispersion(steps=tuple(made), noise=known, **machine.fields())
     return StoredSimulation(measured=measured, more={"one_sided": one_sided}, **machine.made_of)
 
 
@@ -307,8 +307,8 @@ def simulate_tunes(
     values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
     for i, value in enumerate(values):
         value += np.reshape(noise, (2, 1)) * stream(seed, "tunes", i).standard_normal((2, 2))  # noqa: PLW2901
-    told = machine.told()
-    told.pop("monitors")
+    fields = machine.fields()
+    fields.pop("monitors")
     errors = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
     measured = TuneReading(
         tune=values[:, 0] % 1,
@@ -316,7 +316,7 @@ def simulate_tunes(
         chromaticity=values[:, 1] if chromaticity else None,
         chromaticity_error=errors[1] if chromaticity else None,
         settings=each if settings else (),
-        **told,
+        **fields,
     )
     return StoredSimulation(measured=measured, **machine.made_of)
 

@@ -58,5 +58,7 @@ def rare(ring: Ring, effects: Sequence[str]) -> dict[tuple[str, str | None], flo
         for name in effects
         if (effect := find(name)).odds != 1 and isinstance(effect, RingEffect)
         for place in effect.places(ring)
-        if any(effect.stands_for(ring.elements[i])[0] == name for i in effect.members(ring, place))
+        if any(
+            effect.corrected_as(ring.elements[i])[0] == name for i in effect.members(ring, place)
+        )
     }
