@@ -10,7 +10,7 @@ from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.next_measurement import LEAST, next_measurement
-from tmlattice.diagnosis.remedies import credible, leading, remedies_of, remedy_of, compensated
+from tmlattice.diagnosis.remedies import compensated, credible, leading, remedies_of, remedy_of
 from tmlattice.diagnosis.result import Finding, faults_of
 from tmlattice.effects import CATALOGUE, Effect, apply
 from tmlattice.inference.alternatives import Alternative
