@@ -114,7 +114,7 @@ def test_objects_of_other_packages(place, monkeypatch):
     names = {}
     exec("\n".join(blocks("objects.md", "python")), names)
     (finding,) = names["diagnosis"].findings
-    right(finding.remedy)
+    right(finding.recommended_action)
     tunes, design = (names[k].get_tune()[:2] for k in ("estimated", "lattice"))
     assert abs(tunes - design).max() > 1e-3
     assert names["magnet"] in names["family"]

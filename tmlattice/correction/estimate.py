@@ -50,7 +50,7 @@ class Estimate:
     energy: float = 0.0
     energy_error: float = 0.0
 
-    def beside(
+    def with_beam(
         self, dispersion: Dispersion, energy: float = 0.0, energy_error: float = 0.0
     ) -> "Estimate":
         """With the dispersion and the energy that were found beside the ring's."""
@@ -115,14 +115,14 @@ def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) ->
         return found  # in first turns the energy is the injected beam's
     pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
     energies = [(c.amount, s) for c, s in pairs if c.effect == "energy_offset"]
-    return found.beside(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))
+    return found.with_beam(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))
 
 
 def _each_alone(diagnosis: Diagnosis) -> DistributedErrors:
     sigma = {(c.effect, c.element): s for c, s, _ in diagnosis.supported if np.isfinite(s)}
     known = DistributedErrors.usual(list(sigma), {name: 1.0 for name, _ in sigma})
-    beside = tuple(c for c in diagnosis.causes if not _of_ring(c.effect))
-    return replace(known, rms=np.array(list(sigma.values())), causes=beside)
+    with_beam = tuple(c for c in diagnosis.causes if not _of_ring(c.effect))
+    return replace(known, rms=np.array(list(sigma.values())), causes=with_beam)
 
 
 def _of_ring(name: str) -> bool:
@@ -148,12 +148,12 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
             f"'{path}' and '{settings.name}' do not have the same elements; give the lattice that "
             "the diagnosis started from"
         )
-    beside, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
+    with_beam, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
     said: tuple[str, ...] = ()
-    if not beside.is_file():
-        said = (f"'{beside.name}' is not there: the estimated ring is taken as certain",)
-    found = estimate_with(ring, settings, read_known(beside, ring) if not said else None)
+    if not with_beam.is_file():
+        said = (f"'{with_beam.name}' is not there: the estimated ring is taken as certain",)
+    found = estimate_with(ring, settings, read_known(with_beam, ring) if not said else None)
     if calibration.is_file():
         energy = read_energy(calibration, ring)
-        found = found.beside(read_dispersion(calibration, ring), *energy)
+        found = found.with_beam(read_dispersion(calibration, ring), *energy)
     return found, said

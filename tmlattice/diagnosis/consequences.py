@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
-from tmlattice.diagnosis.recommended_actions import undone
+from tmlattice.diagnosis.recommended_actions import compensated
 from tmlattice.effects import Cause, RingEffect, changed_elements, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
@@ -103,7 +103,7 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
     told: dict[Hypothesis, Consequences] = {}
     for cause in felt:
         others = [c for c in causes if c is not cause]
-        mended, by_hand = undone(ring, [cause])
+        mended, by_hand = compensated(ring, [cause])
         changed = _changed(ring, mended, others if by_hand else causes)
         told[cause.effect, cause.element] = Consequences(
             None if design is None else _pair(design.tunes),

@@ -111,7 +111,7 @@ def leading(ring: Ring, cause: Cause) -> Cause:
     """The cause whose action takes this one away too, with the amount that does as much."""
     if cause.element is None or not _is_element(ring, cause.element):
         return cause
-    effect, scale = find(cause.effect).stands_for(ring[cause.element])
+    effect, scale = find(cause.effect).corrected_as(ring[cause.element])
     return Cause(effect, cause.element, scale * cause.amount)
 
 
@@ -215,7 +215,7 @@ def _strength(ring: Ring, cause: Cause) -> Strength | None:
     return Strength(effect.strength, unit, before, before * (1 + cause.amount))
 
 
-def undone(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]]:
+def compensated(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]]:
     """The ring with the settings that take causes away, and the causes that no setting does.
 
     With the causes in it, a magnet of the returned ring acts as the given ring's does: a quadrupole
@@ -233,7 +233,7 @@ def undone(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]
             by_hand.append(cause)
             continue
         places = effect.members(ring, cause.element)
-        told = [effect.undone(settings.get(i, ring.elements[i]), cause.amount) for i in places]
+        told = [effect.compensated(settings.get(i, ring.elements[i]), cause.amount) for i in places]
         if any(element is None for element in told):
             by_hand.append(cause)
             continue

@@ -12,7 +12,7 @@ from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.recommended_actions import RecommendedAction, undone
+from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
@@ -406,9 +406,9 @@ class Diagnosis(ShownDiagnosis):
         """The design with the settings that take the faults away, and what settings do not mend.
 
         Loaded into the machine as it was found, these settings make it the design again: see
-        `recommended_actions.undone`.
+        `recommended_actions.compensated`.
         """
-        return undone(self.ring, self.faults)
+        return compensated(self.ring, self.faults)
 
     @property
     def gap(self) -> dict[str, Any]:

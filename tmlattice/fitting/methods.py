@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from tmlattice.by_name import by_name
 from tmlattice.errors import unknown_choice
 from tmlattice.fitting.adam import FitResult, fit_adam
-from tmlattice.fitting.few import EFFECTS, fit_sparse, sparse_fit, warn_of_launches
-from tmlattice.fitting.many import fit_map
+from tmlattice.fitting.map_fit import fit_map
+from tmlattice.fitting.sparse import EFFECTS, fit_sparse, sparse_causes, warn_of_launches
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
 from tmlattice.observe.data import NOISE_FLOOR, first_turn
@@ -62,9 +62,9 @@ def fine_tune(
     if chosen is Method.ADAM:
         result = fit_adam(network, measurement, **options)
         _check_launches(network, measurement, options.get("launch_sigma"))
-        return _judged(result, measurement)
+        return _with_chi2(result, measurement)
     if chosen is Method.MAP:
-        return _judged(fit_map(network, measurement, **options), measurement)
+        return _with_chi2(fit_map(network, measurement, **options), measurement)
     if chosen is Method.TOLD and not options.get("candidates"):
         raise ValueError(
             "method 'told' is told the magnets that may have changed: give candidates="
@@ -73,7 +73,7 @@ def fine_tune(
         if network.ring is None:
             raise ValueError("methods 'sparse' and 'told' need a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
-    return _judged(fit_sparse(network, measurement, **options), measurement)
+    return _with_chi2(fit_sparse(network, measurement, **options), measurement)
 
 
 def _check_launches(
@@ -86,10 +86,10 @@ def _check_launches(
     if not any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
         return
     data = first_turn(network.monitors, measurement, None, sigma, n)
-    warn_of_launches(ring, data, n, sparse_fit(ring, data, dimension=n))
+    warn_of_launches(ring, data, n, sparse_causes(ring, data, dimension=n))
 
 
-def _judged(result: FitResult, measurement: Measurement) -> FitResult:
+def _with_chi2(result: FitResult, measurement: Measurement) -> FitResult:
     """The result with its chi-square."""
     noise = result.options.get("noise")
     ordered = measurement.in_order_of(result.network.monitors)

@@ -290,7 +290,7 @@ class DistributedProblem(MarginalProblem):
         known = self.known
         amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
-        return np.array([find(name).some_left(amount) for (name, _), amount in own])
+        return np.array([find(name).floored(amount) for (name, _), amount in own])
 
     def learnt(self, explained: Fit) -> DistributedErrors:
         """Distribution of the errors given an explanation."""

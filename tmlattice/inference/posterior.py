@@ -125,7 +125,7 @@ def posterior(
         own = zip(
             known.hypotheses, known.amounts + known.rms * known.correlated(likeliest), strict=True
         )
-        amounts = np.array([find(name).some_left(amount) for (name, _), amount in own])
+        amounts = np.array([find(name).floored(amount) for (name, _), amount in own])
     return Posterior(known, amounts, visible, spread, errors)
 
 

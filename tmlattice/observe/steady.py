@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
-from tmlattice.effects.effect import LEAST_LEFT
+from tmlattice.effects.effect import MIN_STRENGTH
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
@@ -90,8 +90,8 @@ class Steady(Problem):
         """Slope in closed form: the signature of the same effect on top of the present amount."""
         own = point.causes[cause]
         effect, amount = find(own.effect), own.amount
-        if effect.multiplies and abs(1 + amount) < LEAST_LEFT:
-            return self._difference(point, cause, LEAST_LEFT)
+        if effect.multiplies and abs(1 + amount) < MIN_STRENGTH:
+            return self._difference(point, cause, MIN_STRENGTH)
         (slope,) = self.signatures(point.view, point.nuisances, [(own.effect, own.element)])
         return self.as_rows(effect.chain(amount) * slope)
 

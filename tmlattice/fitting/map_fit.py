@@ -17,8 +17,8 @@ from scipy.linalg import solve_triangular
 from tmlattice.beam.shifts import Shifts
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.few import in_coordinates, sparse_fit, warn_of_launches
 from tmlattice.fitting.launches import FreeLaunches, launch_slopes
+from tmlattice.fitting.sparse import in_coordinates, sparse_causes, warn_of_launches
 from tmlattice.inference.dual import MostProbable, best_of, most_probable, posterior_base
 from tmlattice.inference.priors import Student
 from tmlattice.inference.search import Explanation
@@ -47,7 +47,7 @@ class Prior(StrEnum):
 
 FAULT_SCALE = 0.01
 
-WIDE = 0.01
+MAX_LAUNCH = 0.01
 """m and rad: what is said of a launch of which nothing is said; beam pipes are no wider."""
 
 
@@ -66,7 +66,7 @@ class TurnReadings:
     space: Space
     data: Data
     launches: Array
-    off: Array | None = None
+    offset: Array | None = None
 
     @property
     def launch_sigma(self) -> Array:
@@ -87,9 +87,9 @@ class TurnReadings:
         """Measured less model, m, [row]."""
         readings = self.space.readings(amounts, self.launches)
         left = self.data.readings - readings
-        if self.off is not None:  # as if from the nominal ones: those are what has a prior
+        if self.offset is not None:  # as if from the nominal ones: those are what has a prior
             left = left + np.einsum(
-                "smpi,si->smp", launch_slopes(self.space.network, self.launches), self.off
+                "smpi,si->smp", launch_slopes(self.space.network, self.launches), self.offset
             )
         return np.asarray(left[self.data.valid])
 
@@ -106,7 +106,7 @@ class TurnReadings:
 
     def nuisances(self, amounts: Array) -> Array:
         """Errors of the launches."""
-        sigma = np.minimum(self.launch_sigma, WIDE)
+        sigma = np.minimum(self.launch_sigma, MAX_LAUNCH)
         if not sigma.any():
             return np.zeros((len(self.sigma),) * 2)
         return self.slopes(amounts).launch_kernel(sigma)
@@ -165,16 +165,16 @@ def fit_map(
     monitors, dimension = space.network.monitors, space.network.dimension
     data = first_turn(monitors, measurement, noise, launch_sigma, dimension)
     tails = prior is Prior.FAULTS
-    few = sparse_fit(ring, data, kinds, dimension) if tails and ring is not None else None
-    if few is not None and ring is not None:
-        warn_of_launches(ring, data, dimension, few)
-    problem = _readings(space, data, measurement.states(dimension), few)
+    sparse = sparse_causes(ring, data, kinds, dimension) if tails and ring is not None else None
+    if sparse is not None and ring is not None:
+        warn_of_launches(ring, data, dimension, sparse)
+    problem = _readings(space, data, measurement.states(dimension), sparse)
     width = FAULT_SCALE if tails and scale is None else scale
     student = Student(1.0 if width is None else width, 1.0 if tails else np.inf)
     start = np.zeros(len(space.layer))
     found = most_probable(problem, student, start, choose=width is None, iterations=iterations)
-    if few is not None:  # many maxima: another start is the few magnets that explain most
-        amounts = _from_few(space, few)
+    if sparse is not None:  # many maxima: another start is the few magnets that explain most
+        amounts = _from_sparse(space, sparse)
         other = most_probable(problem, student, amounts, wide=False, iterations=iterations)
         found = best_of(problem, (found, other)) if amounts.any() else found
     space.put(found.amounts)
@@ -209,15 +209,15 @@ def fit_map(
     )
 
 
-def _readings(space: Space, data: Data, nominal: Array, few: Explanation | None) -> TurnReadings:
+def _readings(space: Space, data: Data, nominal: Array, sparse: Explanation | None) -> TurnReadings:
     """The problem about the nominal launches, or about those that the few magnets ask for."""
     nominal = np.ascontiguousarray(nominal)
     sigma = in_coordinates(data.launch_sigma, nominal.shape[1])
-    if few is None or not sigma.any():
+    if sparse is None or not sigma.any():
         return TurnReadings(space, data, nominal)
-    about = in_coordinates(few.fit.nuisances, nominal.shape[1])
-    off = np.where(np.isfinite(sigma), about - nominal, 0.0)
-    return TurnReadings(space, data, about, off)
+    about = in_coordinates(sparse.fit.nuisances, nominal.shape[1])
+    offset = np.where(np.isfinite(sigma), about - nominal, 0.0)
+    return TurnReadings(space, data, about, offset)
 
 
 def _free(problem: TurnReadings) -> FreeLaunches:
@@ -227,7 +227,7 @@ def _free(problem: TurnReadings) -> FreeLaunches:
     return FreeLaunches(nominal, problem.launch_sigma, readings, data.sigma[0])
 
 
-def _from_few(space: Space, found: Explanation) -> Array:
+def _from_sparse(space: Space, found: Explanation) -> Array:
     """Amounts of the few magnets that explain most; of the likeliest where none is asked for."""
     best = found.fit if found.named or not found.beyond else found.beyond[0].fit
     start = np.zeros(len(space.layer))

@@ -1,4 +1,4 @@
-"""What is likely beforehand: how large small errors are, and which faults are rare."""
+"""Prior sizes of distributed errors, and prior odds of rare faults."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,21 +10,21 @@ from tmlattice.lattice import Ring
 
 
 def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
-    """The rms of each background effect.
+    """Return the rms of each distributed effect.
 
     Args:
-        wanted: effect -> rms, or None for the catalogue's own; "all" -> a scale of the
-            catalogue's (None: 1) for every effect that has one; "none" alone: none at all. Named
-            effects win over "all".
+        wanted: effect -> rms, or None for the catalogue's; "all" -> a scale of the catalogue's
+            (None: 1) for every effect that has one; "none" alone: no errors. Named effects
+            override "all".
 
     Raises:
-        EffectError: an effect that has no usual size, or a negative rms.
+        EffectError: an effect without a usual size, or a negative rms.
         UnknownNameError: no such effect.
     """
     wanted = dict(wanted)
     if "none" in wanted:
         if len(wanted) > 1:
-            raise EffectError("'none' says that there are no small errors; name it alone")
+            raise EffectError("'none' excludes all distributed errors; give it alone")
         return {}
     chosen: dict[str, float] = {}
     if "all" in wanted:
@@ -39,7 +39,7 @@ def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
         effect = find(name)
         rms = effect.background if size is None else size
         if rms is None or effect.discrete:
-            raise EffectError(f"{effect.name} has no usual size; say {effect.name}=RMS")
+            raise EffectError(f"{effect.name} has no usual size; give {effect.name}=RMS")
         chosen[effect.name] = rms
     if any(not 0 <= rms < np.inf for rms in chosen.values()):
         raise EffectError("a background's rms is zero or more")
@@ -47,7 +47,7 @@ def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def rare(ring: Ring, effects: Sequence[str]) -> dict[tuple[str, str | None], float]:
-    """Odds of each (effect, place) that is less likely than an ordinary fault.
+    """Return the odds of each (effect, place) that is less probable than an ordinary fault.
 
     Args:
         ring: the design.
@@ -58,5 +58,7 @@ def rare(ring: Ring, effects: Sequence[str]) -> dict[tuple[str, str | None], flo
         for name in effects
         if (effect := find(name)).odds != 1 and isinstance(effect, RingEffect)
         for place in effect.places(ring)
-        if any(effect.stands_for(ring.elements[i])[0] == name for i in effect.members(ring, place))
+        if any(
+            effect.corrected_as(ring.elements[i])[0] == name for i in effect.members(ring, place)
+        )
     }

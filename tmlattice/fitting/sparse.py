@@ -40,10 +40,10 @@ FAULT = 0.3
 LARGEST_NUMBER, REFINED = 5, 12
 """Of causes, and of candidates that are refined after each scan."""
 
-BY_CHANCE = 5.0
+MAX_MISFIT = 5.0
 """Standard errors by which a misfit may exceed the noise before it is more than noise."""
 
-ONCE_IN = 1e6
+FALSE_ALARM_ODDS = 1e6
 """False alarms of `warn_of_launches` are that rare."""
 
 RARER = 10.0
@@ -101,11 +101,11 @@ def fit_sparse(
         raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
     monitors = [monitor.name for monitor in ring.monitors]
     data = first_turn(monitors, measurement, noise, launch_sigma, network.dimension)
-    found = sparse_fit(
+    found = sparse_causes(
         ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
     )
     warn_of_launches(ring, data, network.dimension, found)
-    best = _settled(found)
+    best = _refined(found)
     assert isinstance(found.problem, FirstTurns)
     turn = RingTunes(found.problem.model.assembly)
     tunes = turn.of(best.causes)
@@ -157,11 +157,11 @@ def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation)
         return
     sigma = data.launch_sigma.copy()
     sigma[:, :4] = np.inf
-    free = sparse_fit(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
+    free = sparse_causes(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
     readings, numbers = int(data.valid.sum()), int(stated.sum())
     gain = found.fit.chi2 - free.chi2
-    explained = free.chi2 <= readings + BY_CHANCE * np.sqrt(2 * readings)
-    if not explained or gain <= chi_square.isf(1 / ONCE_IN, numbers):
+    explained = free.chi2 <= readings + MAX_MISFIT * np.sqrt(2 * readings)
+    if not explained or gain <= chi_square.isf(1 / FALSE_ALARM_ODDS, numbers):
         return
     off = np.abs(free.nuisances - data.launches)[:, :4]
     x, y = 1e6 * off[:, [0, 2]].max(axis=0)
@@ -184,7 +184,7 @@ def in_coordinates(launches: Array, dimension: int) -> Array:
     return states
 
 
-def sparse_fit(
+def sparse_causes(
     ring: Ring,
     data: Data,
     kinds: Sequence[str] = ("quadrupole", "sextupole"),
@@ -228,7 +228,7 @@ def sparse_fit(
     )
 
 
-def _settled(found: Explanation) -> Fit:
+def _refined(found: Explanation) -> Fit:
     """The amounts to rounding: the search stops at a share of their error."""
     fresh = replace(found.problem, judgement=replace(found.problem.judgement, same=0.0))
     now = found.fit
