@@ -38,7 +38,7 @@ def by_name(function: F) -> F:
                     given[name] = _ring(value)
                 continue
             ring = given.get("ring") or getattr(given.get("network"), "ring", None)
-            if isinstance(value, Mapping) and not is_frame(value):
+            if isinstance(value, Mapping) and not is_frame(value):  # a Dataset is a Mapping
                 given[name] = {key: _measured(own, ring) for key, own in value.items()}
             else:
                 given[name] = _measured(value, ring)
@@ -52,9 +52,9 @@ def _measured(value: Any, ring: Any) -> Any:
 
 
 def is_frame(value: Any) -> bool:
-    """Whether it is a table of another package: pandas, polars (`to_dict`, `columns`), or an
-    xarray Dataset, which makes one of itself."""
-    return hasattr(value, "to_dict") and (hasattr(value, "columns") or hasattr(value, "data_vars"))
+    """Whether it is a pandas DataFrame, or an xarray Dataset or DataArray."""
+    frame = hasattr(value, "columns") and hasattr(value, "reset_index")
+    return frame or (hasattr(value, "dims") and hasattr(value, "to_dataframe"))
 
 
 def _is_path(value: Any) -> bool:
