@@ -158,7 +158,7 @@ def remedies_of(
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
         found[key] = Remedy(
-            lead.effect, lead.element, key[1], _kind(ring, lead.element), lead.amount, error, share,
+            lead.effect, lead.element, key[1], element_kind(ring, lead.element), lead.amount, error, share,
             own, _strength(ring, lead),
         )  # fmt: skip
     if not found:
@@ -193,7 +193,7 @@ def _members(ring: Ring, name: str | None) -> list[Element]:
     return own or [ring.elements[i] for i in next((some for some in shared if some), ())]
 
 
-def _kind(ring: Ring, name: str | None) -> Kind | None:
+def element_kind(ring: Ring, name: str | None) -> Kind | None:
     return next((element.kind for element in _members(ring, name)), None)
 
 

@@ -15,8 +15,15 @@ from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
-from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
+from tmlattice.diagnosis.views import (
+    JointView,
+    PartView,
+    ResponseView,
+    StoredView,
+    TrajectoryView,
+)
 from tmlattice.effects import Cause, apply
+from tmlattice.errors import MeasurementError
 from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.rivals import Detection
@@ -242,7 +249,7 @@ class Diagnosis(ShownDiagnosis):
     repaired: Ring = field(repr=False)
     causes: tuple[Cause, ...]
     errors: tuple[float, ...]
-    view: TrajectoryView | ResponseView | JointView = field(repr=False)
+    view: TrajectoryView | ResponseView | JointView | StoredView = field(repr=False)
     left_out: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
     refused: "tuple[Step, ...]" = ()
@@ -286,9 +293,11 @@ class Diagnosis(ShownDiagnosis):
     @property
     def measured(self) -> tuple[str, ...]:
         """Quantities of the stored beam that were measured."""
+        if isinstance(self.view, StoredView):
+            return self.view.measured
         kinds = {part.kind for part in self.parts} or {self.kind}
         found = {quantity for kind in kinds for quantity in _MEASURES.get(kind, ())}
-        if self.by_steps and np.isfinite(self.response.data[-1]).any():
+        if isinstance(self.view, ResponseView) and np.isfinite(self.view.data[-1]).any():
             found.add("dispersion")
         return tuple(sorted(found))
 
@@ -301,6 +310,8 @@ class Diagnosis(ShownDiagnosis):
     @property
     def kind(self) -> str:
         """Of the measurement, as its folder has it; "together" of several."""
+        if isinstance(self.view, StoredView):
+            return self.view.kind
         if isinstance(self.view, JointView):
             return self.view.parts[0].kind if len(self.view.parts) == 1 else "together"
         return "trajectory" if isinstance(self.view, TrajectoryView) else "orbit_response"
@@ -308,7 +319,19 @@ class Diagnosis(ShownDiagnosis):
     @property
     def by_steps(self) -> bool:
         """Whether families of errors were fitted step by step, as to an orbit response."""
-        return isinstance(self.view, ResponseView)
+        return self.kind == "orbit_response"
+
+    @property
+    def stored(self) -> bool:
+        """Whether it is of `Diagnosis.load`, without readings, scan and covariance."""
+        return isinstance(self.view, StoredView)
+
+    @property
+    def correctors_held_out(self) -> int | None:
+        """How many correctors of an orbit response are the validation set."""
+        if isinstance(self.view, StoredView):
+            return self.view.correctors
+        return int(self.view.held.sum()) if isinstance(self.view, ResponseView) else None
 
     @property
     def since_reference(self) -> bool:
@@ -323,11 +346,12 @@ class Diagnosis(ShownDiagnosis):
     @property
     def parts(self) -> tuple[PartView, ...]:
         """The measurements, where there are several or a stored beam's."""
-        return self.view.parts if isinstance(self.view, JointView) else ()
+        return self.view.parts if isinstance(self.view, JointView | StoredView) else ()
 
     @property
     def trajectories(self) -> TrajectoryView:
         """The view of trajectories; TypeError for another kind."""
+        self._read()
         if not isinstance(self.view, TrajectoryView):
             raise TypeError(f"the diagnosis is of an {self.kind}, not of trajectories")
         return self.view
@@ -335,6 +359,7 @@ class Diagnosis(ShownDiagnosis):
     @property
     def response(self) -> ResponseView:
         """The view of an orbit response; TypeError for another kind."""
+        self._read()
         if not isinstance(self.view, ResponseView):
             raise TypeError(f"the diagnosis is of a {self.kind}, not of an orbit response")
         return self.view
@@ -345,10 +370,19 @@ class Diagnosis(ShownDiagnosis):
 
         Raises:
             TypeError: families of errors were fitted instead.
+            MeasurementError: it was loaded from a file, which does not hold it.
         """
-        if isinstance(self.view, ResponseView):
+        self._read()
+        if not isinstance(self.view, TrajectoryView | JointView):
             raise TypeError("an orbit response was fitted by families: there was no search")
         return self.view.explanation
+
+    def _read(self) -> None:
+        if self.stored:
+            raise MeasurementError(
+                "diagnosis.json does not hold the readings, the scan and the covariance: diagnose "
+                "again, or keep a pickle of the diagnosis"
+            )
 
     @property
     def calibration(self) -> tuple[Cause, ...]:
@@ -421,6 +455,10 @@ class Diagnosis(ShownDiagnosis):
                 "shots": list(self.heldout_shots),
                 "monitors": "half" if self.by_steps else "odd",
                 "steps": [dict(vars(m)) for m in gap.misfits],
+                "since": gap.since,
+                "readings": gap.readings,
+                "correctors": self.correctors_held_out,
+                "lost": gap.lost,
             }
         interval = None if gap is None or gap.interval is None else list(gap.interval)
         return {
@@ -446,6 +484,11 @@ class Diagnosis(ShownDiagnosis):
             "findings": [finding.as_json() for finding in self.findings],
             "steps": [step.as_json() for step in self.steps],
             "refused": [step.as_json() for step in self.refused],
+            "readings_noise": {
+                "x": self.noise[0],
+                "y": self.noise[1],
+                "estimated": self.noise_estimated,
+            },
             "bad_monitors": list(self.bad_monitors),
             "rejected": [{"element": name, "plane": plane} for name, plane in self.rejected],
             "degenerate": list(self.degenerate),

@@ -117,6 +117,7 @@ class Gap:
         interval: of `closed`, 95 %.
         since: index of the model with which the last one is compared.
         readings: how many are scored.
+        lost: whether one of the two models loses readings that the other one has: nobody judges it.
     """
 
     misfits: tuple[Misfit, ...]
@@ -125,6 +126,7 @@ class Gap:
     interval: tuple[float, float] | None
     since: int = 0
     readings: int = 0
+    lost: bool = False
 
     def significant(self, false_alarm: float) -> bool:
         """Whether model `since` leaves more of these readings than it expects.
@@ -134,14 +136,6 @@ class Gap:
         """
         square = self.readings * self.misfits[self.since].chi2_per_dof
         return bool(chi2.sf(square, self.readings) < false_alarm)
-
-    @property
-    def lost(self) -> bool:
-        """Whether one of the models loses readings that the other one has: nobody judges it."""
-        if not len(self.residuals):  # of a response, whose models lose none
-            return False
-        one, other = (np.isfinite(self.residuals[i]).sum() for i in (self.since, -1))
-        return bool(one != other)
 
 
 def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
@@ -156,8 +150,8 @@ def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
     if since < len(judged) - 1 and judged[since].parts and judged[-1].parts:
         closed, interval = _closed(judged[since].parts, judged[-1].parts)
     residuals = np.array([model.residuals for model in judged])
-    readings = int(np.isfinite(residuals[since]).sum())
-    return Gap(misfits, residuals, closed, interval, since, readings)
+    readings, last = (int(np.isfinite(residuals[i]).sum()) for i in (since, -1))
+    return Gap(misfits, residuals, closed, interval, since, readings, readings != last)
 
 
 def _misfit(parts: Sequence[Left]) -> Misfit:
