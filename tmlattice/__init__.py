@@ -111,6 +111,7 @@ if TYPE_CHECKING:
     from tmlattice.optics import off_momentum as off_momentum
     from tmlattice.optics import one_turn_optics as one_turn_optics
     from tmlattice.optics import twiss as twiss
+    from tmlattice.report.compare import compare as compare
 
 _HOME = {
     "correction": ["Correction", "correct"],
@@ -134,6 +135,7 @@ _HOME = {
         "write_measurement",
     ],
     "network": ["TaylorNetwork", "symplectic_penalty"],
+    "report.compare": ["compare"],
     "optics": ["Optics", "off_momentum", "one_turn_optics", "twiss"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
@@ -15,6 +16,7 @@ from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.remedies import Remedy, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
+from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import (
     JointView,
     PartView,
@@ -226,6 +228,8 @@ class Diagnosis(ShownDiagnosis):
             None).
         compared: blocks of readings with what the result predicts of them.
         correlations: pairs of amounts that the data hardly separate.
+        covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of
+            a change between two orbit responses and of a diagnosis that was loaded. See `tables`.
         devices: what the control system calls elements, by their names.
         supports: how much of each cause comes from the data, the same length; empty where all do,
             because their priors are log-uniform.
@@ -267,6 +271,12 @@ class Diagnosis(ShownDiagnosis):
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
     supports: tuple[Support, ...] = field(default=(), repr=False)
+    covariance: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    @property
+    def tables(self) -> Tables:
+        """The result as pandas DataFrames by name: `diagnosis.tables["errors"]`; see `Tables`."""
+        return Tables(self)
 
     @cached_property
     def assessment(self) -> Assessment:

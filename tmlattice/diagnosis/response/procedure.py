@@ -134,10 +134,11 @@ def diagnose_response(
         said += odd if measured.response.size <= LARGE else [*odd, TOO_LARGE]
         rejected = tuple(exchanges.rejected)
         fit, findings = _faults(fit, exchanges, effects, max_effects, judgement, progress)
-        found, supports, degenerate, correlated = told(fit.state)
+        found, supports, degenerate, correlated, covariance = told(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
         fit, found, supports, degenerate, correlated = few.fit, few.told, (), (), ()
+        covariance = None
         verdict, findings = few.verdict, few.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
@@ -155,6 +156,7 @@ def diagnose_response(
         degenerate=degenerate,
         rejected=rejected,
         correlations=correlated,
+        covariance=covariance,
         supports=supports,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
