@@ -15,6 +15,7 @@ import click
 from tmlattice import __version__
 from tmlattice.cli.challenge import challenge
 from tmlattice.cli.check import check
+from tmlattice.cli.compare import compare
 from tmlattice.cli.correct import correct
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
@@ -22,6 +23,7 @@ from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
 from tmlattice.cli.predict import predict
 from tmlattice.cli.progress import stopped_in
+from tmlattice.cli.report import report
 from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
@@ -56,7 +58,7 @@ class Sections(click.Group):
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
     "Measure": (info, simulate, import_files, check),
     "Fit": (tune_fit, predict),
-    "Diagnose": (diagnose, correct, effects),
+    "Diagnose": (diagnose, report, compare, correct, effects),
     "Study": (study, challenge, reproduce),
 }
 

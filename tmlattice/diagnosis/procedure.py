@@ -289,6 +289,7 @@ def _report(
         heldout=heldout,
         heldout_shots=() if turns is None else turns.shots[1],
         compared=compared,
+        covariance=result.covariance[: len(causes), : len(causes)],
         correlations=correlations_of(
             [(cause.effect, cause.element) for cause in causes],
             found.fit.covariance[: len(causes), : len(causes)],

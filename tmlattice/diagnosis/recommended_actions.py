@@ -158,8 +158,8 @@ def recommended_actions(
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
         found[key] = RecommendedAction(
-            lead.effect, lead.element, key[1], _kind(ring, lead.element), lead.amount, error, share,
-            own, _strength(ring, lead),
+            lead.effect, lead.element, key[1], element_kind(ring, lead.element), lead.amount,
+            error, share, own, _strength(ring, lead),
         )  # fmt: skip
     if not found:
         return ()
@@ -197,7 +197,8 @@ def _members(ring: Ring, name: str | None) -> list[Element]:
     return own or [ring.elements[i] for i in next((some for some in shared if some), ())]
 
 
-def _kind(ring: Ring, name: str | None) -> Kind | None:
+def element_kind(ring: Ring, name: str | None) -> Kind | None:
+    """The kind of an element, or of a family's members; None for the beam."""
     return next((element.kind for element in _members(ring, name)), None)
 
 

@@ -74,6 +74,11 @@ def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
         known = found.problem.learnt(found.fit if causes else found.before)
         beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
         return replace(known, causes=(*known.causes, *beside))
+    if diagnosis.stored:
+        raise MeasurementError(
+            "diagnosis.json does not hold the covariance of the errors: take the files of "
+            "--lattice-out, or a pickle of the diagnosis"
+        )
     if not isinstance(view, ResponseView) or not diagnosis.steps or diagnosis.since_reference:
         return None  # of a change the small errors are the reference's
     usual = background_rms({"all": None})

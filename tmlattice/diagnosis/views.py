@@ -94,6 +94,23 @@ class PartView:
 
 
 @dataclass(frozen=True, eq=False)
+class StoredView:
+    """What the file of a diagnosis keeps of its measurement.
+
+    Attributes:
+        kind: of the measurement, see `Diagnosis.kind`.
+        parts: the measurements, without their monitors' residuals.
+        measured: quantities of the stored beam that were measured.
+        correctors: how many of an orbit response were held out; None: no response.
+    """
+
+    kind: str
+    parts: tuple[PartView, ...]
+    measured: tuple[str, ...]
+    correctors: int | None
+
+
+@dataclass(frozen=True, eq=False)
 class JointView:
     """What a stored beam's measurements, or several together, have for plots.
 

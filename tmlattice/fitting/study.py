@@ -185,8 +185,10 @@ def run_case(
             fit = fine_tune(design, measurement, progress=False, **options)
             predicted = network_tunes(fit.network, start, turns)[0]
         else:
-            only = {"candidates": names} if method == "told" else {}
-            fit = fine_tune(design, measurement, method=method, noise=noise, progress=False, **only)
+            only = names if method == "told" else None
+            fit = fine_tune(
+                design, measurement, method=method, noise=noise, candidates=only, progress=False
+            )
             if fit.tunes is None:
                 return dataclasses.replace(known, problem="the fitted network has no tune")
             predicted = fit.tunes

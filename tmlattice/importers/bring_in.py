@@ -3,13 +3,15 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tmlattice.by_name import is_frame
 from tmlattice.errors import MeasurementError, TmlatticeError, plain
-from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, text_of
+from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, as_frame, read_columns, text_of
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
@@ -21,8 +23,9 @@ from tmlattice.importers.tables import bring_table, bring_turns, is_response_tab
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
-from tmlattice.measurement import OrbitResponse
-from tmlattice.measurement.tables import Unit
+from tmlattice.measurement import OrbitResponse, TuneReading
+from tmlattice.measurement.arrays import Unit
+from tmlattice.measurement.frames import of_document
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +62,9 @@ class Options:
     ring: Ring | None = None
 
 
-def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imported:
+def bring_in(
+    paths: Sequence[str | PathLike[str] | Any], options: Options | None = None
+) -> Imported:
     """The measurement of one file or of several that belong together.
 
     Args:
@@ -67,7 +72,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
             with the table of names (`.json`) and the lattice (`.mat`); or the Middle Layer's
             response, dispersion and noise (`.mat`) with the machine's LOCO file; or a table
             (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`) of readings or of a response; or any other
-            file, which the package `turn_by_turn` is asked to read.
+            file, which the package `turn_by_turn` is asked to read; or one pandas DataFrame or
+            xarray Dataset, which is read as a table.
         options: how they are read.
 
     Raises:
@@ -75,7 +81,10 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         LatticeError: a lattice that cannot be made.
     """
     options = options or Options()
-    files = [Path(path) for path in paths]
+    frames = [path for path in paths if is_frame(path)]
+    if frames and len(frames) < len(paths):
+        raise MeasurementError("a frame is imported alone; give no file with it")
+    files = [] if frames else [Path(path) for path in paths]
     for path in files:
         if not path.is_file():
             raise MeasurementError(f"no file '{path}'; check the path")
@@ -87,7 +96,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
     try:
-        brought = _bring(files, matlab, hdf5, options)
+        some = _framed(frames[0], options) if frames else None
+        brought = some or _bring(files, matlab, hdf5, options)
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         if isinstance(error, TmlatticeError):
             raise
@@ -97,9 +107,10 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         raise MeasurementError(
             f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
         ) from error
-    if options.noise is not None and brought.measurement.noise is None:
-        noise = np.full((len(brought.measurement.monitors), 2), options.noise)
-        brought = replace(brought, measurement=replace(brought.measurement, noise=noise))
+    data = brought.measurement
+    if options.noise is not None and not isinstance(data, TuneReading) and data.noise is None:
+        noise = np.full((len(data.monitors), 2), options.noise)
+        brought = replace(brought, measurement=replace(data, noise=noise))
         brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
     if isinstance(brought.measurement, OrbitResponse):
         brought = _with_all_noise(brought, brought.measurement)
@@ -111,6 +122,50 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         assumed=(*brought.assumed, *confirmed),
         doubts=(*brought.doubts, *contradicted),
     )
+
+
+def import_data(
+    source: str | PathLike[str] | Sequence[str | PathLike[str]] | Any,
+    *,
+    ring: Ring | None = None,
+    lattice: str | None = None,
+    sequence: str | None = None,
+    energy: float | None = None,
+    unit: Unit | None = None,
+    noise: float | None = None,
+    turns: str | None = None,
+    names: Mapping[str, str] | None = None,
+    bad: Sequence[str] = (),
+    iteration: Iteration = "first",
+    keep_bad: bool = False,
+) -> Imported:
+    """Import a measurement of another program, with what was assumed of it.
+
+    Args:
+        source: a file, several that belong together (see `bring_in`), or a pandas DataFrame or
+            xarray Dataset.
+        ring: the lattice; or its `lattice`, `sequence` and `energy` (GeV), see `load_ring`.
+        unit: of readings that state none; None: from their size.
+        noise: rms of a reading, or of an orbit change, m, where the source gives none.
+        turns: the kind of a turn-by-turn file, see `read_turn_by_turn`.
+        names: device or column of the source -> the lattice's monitor.
+        bad: monitors to leave out, by either name; patterns.
+        iteration, keep_bad: of a LOCO fit, see `bring_loco`.
+
+    Returns:
+        `measurement`, `ring`, `assumed` and `doubts`; `write_imported` writes them to a folder.
+
+    Raises:
+        MeasurementError: a source that is not known, or does not fit together.
+        LatticeError: a lattice that cannot be made.
+    """
+    told = Told(names=dict(names or {}), bad=tuple(bad)) if names or bad else None
+    one = is_frame(source) or isinstance(source, str | PathLike)
+    options = Options(
+        iteration, keep_bad, sequence, lattice, energy, turns, unit, noise, told, ring
+    )
+    every: Any = [source] if one else source
+    return bring_in(every, options)
 
 
 def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
@@ -177,9 +232,20 @@ def _bring(
 
 def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
-    if path.suffix.lower() in CSV and is_response_table(path):
+    if path.suffix.lower() in CSV and is_response_table(read_columns(path)):
         return bring_table(path, ring)
     return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
+
+
+def _framed(frame: Any, options: Options) -> Imported:
+    """As of `to_dataframe`, or as a table of a file."""
+    ring = _ring(options)
+    stated = of_document(as_frame(frame))
+    if stated is not None:
+        return Imported(stated, ring, ("everything is as `to_dataframe` wrote it",))
+    if is_response_table(read_columns(frame)):
+        return bring_table(frame, ring)
+    return bring_readings(frame, ring, with_unit(options.told, options.unit, options.noise))
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:

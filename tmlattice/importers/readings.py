@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
-from tmlattice.importers.columns import Column, read_columns
+from tmlattice.importers.columns import Column, label, read_columns
 from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
@@ -61,7 +62,7 @@ class Place:
 
 
 def bring_readings(
-    path: Path,
+    source: Path | Any,
     ring: Ring | None,
     told: Told | None = None,
     monitors: Sequence[str] | None = None,
@@ -69,7 +70,7 @@ def bring_readings(
     """The measurement of a file whose columns are not known.
 
     Args:
-        path: CSV of any separator, HDF5 or SDDS.
+        source: CSV of any separator, HDF5 or SDDS; or a frame.
         ring: the lattice, whose monitors are looked for; None: names are as the file has them.
         told: names, unit, noise, bad monitors.
         monitors: names to look for, instead of the lattice's.
@@ -79,7 +80,7 @@ def bring_readings(
         UnknownNameError: the map names a monitor that the ring does not have.
     """
     told = told or Told()
-    columns = read_columns(path)
+    columns, path = read_columns(source), label(source)
     found = _long(path, columns, told) or _wide(path, columns, told)
     shots, turns, places, values, units = found
     position = np.array([place.plane != SUM for place in places])
@@ -160,7 +161,7 @@ Found = tuple[list[str], list[int], list[Place], Array, list[str]]
 """Of every number: its shot, turn, place, value, and unit."""
 
 
-def _long(path: Path, columns: Sequence[Column], told: Told) -> Found | None:
+def _long(path: str, columns: Sequence[Column], told: Told) -> Found | None:
     """A row a monitor; None where no column holds names."""
     names = _called(columns, "monitor", MONITORS, told)
     if names is None or all(_is_number(text) for text in names.values):
@@ -189,7 +190,7 @@ def _long(path: Path, columns: Sequence[Column], told: Told) -> Found | None:
     return _joined(path, [(shots, turns, places, column) for places, column in parts])
 
 
-def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
+def _wide(path: str, columns: Sequence[Column], told: Told) -> Found:
     """A row a shot, a column a monitor and plane."""
     rows = len(columns[0].values)
     turns = _turns(path, columns, told)
@@ -201,6 +202,12 @@ def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
         if (place := place_of(column.name, told)) is not None and _holds(place.plane, column)
     ]  # fmt: skip
     if not used:
+        alone = [column.name for column in columns if _plane(column.name) is not None]
+        if alone:
+            raise MeasurementError(
+                f"{path}: no column 'monitor' beside '{alone[0]}'; add it, with the name of the "
+                "BPM of each row, or name each column as 'bpm_1 x'"
+            )
         raise MeasurementError(
             f"{path}: no column holds readings that are known; name columns such as "
             "'bpm_1 x [mm]', a monitor and a plane (`tmlattice import --example` writes some)"
@@ -213,7 +220,7 @@ def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
 
 
 def _joined(
-    path: Path, parts: Iterable[tuple[list[str], list[int], list[Place | None], Column]]
+    path: str, parts: Iterable[tuple[list[str], list[int], list[Place | None], Column]]
 ) -> Found:
     shots: list[str] = []
     turns: list[int] = []
@@ -239,7 +246,12 @@ def _holds(plane: int, column: Column) -> bool:
     return plane != SUM or all(map(_is_number, column.values))
 
 
-def _number(path: Path, row: int, name: str, text: str) -> float:
+def numbers_of(path: str, column: Column) -> list[float]:
+    """The numbers of a column; NaN where nothing was read."""
+    return [_number(path, row, column.name, text) for row, text in enumerate(column.values)]
+
+
+def _number(path: str, row: int, name: str, text: str) -> float:
     if text.casefold() in ("", "nan", "na", "null", "none", "-", "invalid", "disconnected"):
         return float("nan")
     try:
@@ -277,7 +289,7 @@ def _labels(
     return None if column is None else column.values
 
 
-def _turns(path: Path, columns: Sequence[Column], told: Told) -> list[int] | None:
+def _turns(path: str, columns: Sequence[Column], told: Told) -> list[int] | None:
     column = _called(columns, "turn", TURNS, told)
     if column is None:
         return None
@@ -338,7 +350,7 @@ class _Finder:
                 raise unknown_name("monitor", name, self._names)
             self._told[_norm(device)] = self._exact[plain.casefold()]
 
-    def all(self, path: Path, devices: Sequence[str]) -> dict[str, int | None]:
+    def all(self, path: str, devices: Sequence[str]) -> dict[str, int | None]:
         """Place among the ring's monitors of each device; None: not found.
 
         Raises:

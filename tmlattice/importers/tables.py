@@ -6,18 +6,16 @@ column `name [mm/mrad]` for each corrector, whose steps are not known then. Unit
 header, in brackets; without one they are m, rad and m/rad. Names are the lattice's.
 """
 
-import csv
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
-from tmlattice.importers.columns import SDDS, text_of
+from tmlattice.importers.columns import SDDS, Column, label, read_columns
 from tmlattice.importers.imported import Imported, counted
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.lattice import Ring
@@ -27,9 +25,10 @@ from tmlattice.measurement import (
     TurnByTurn,
     read_turn_by_turn,
 )
+from tmlattice.measurement.arrays import Unit
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
-from tmlattice.measurement.tables import KINDS, Unit
+from tmlattice.measurement.tables import KINDS
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
@@ -38,39 +37,35 @@ Array = NDArray[np.float64]
 LIGHT = 299792458.0
 KICK = 1e-4
 """rad; the step that a wide table is taken to have been made with."""
-_HEADER = re.compile(r"^\s*(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*$")
 _PLANES = {"hcorrector": "x", "vcorrector": "y"}
 
 
-def is_response_table(path: Path) -> bool:
-    """Whether a CSV table is an orbit response, by its header: correctors in a column, or a row for
+def is_response_table(columns: Sequence[Column]) -> bool:
+    """Whether a table is an orbit response, by its header: correctors in a column, or a row for
     each monitor and plane."""
-    try:
-        lines = csv.reader(StringIO(text_of(path), newline=""), skipinitialspace=True)
-        header = next((row for row in lines if row), [])
-    except csv.Error:
-        return False
-    names = [m["name"].lower() for name in header if (m := _HEADER.match(name))]
+    names = [column.name.lower() for column in columns]
     return "corrector" in names or (names[:2] == ["monitor", "plane"] and "value" not in names)
 
 
-def bring_table(path: Path, ring: Ring | None) -> Imported:
-    """An orbit response of a CSV table.
+def bring_table(source: Path | Any, ring: Ring | None) -> Imported:
+    """An orbit response of a CSV table or a frame.
 
     Args:
-        path: the file.
+        source: the file or frame.
         ring: the lattice, which knows the correctors' planes.
 
     Raises:
         MeasurementError: a header that is not known, or a field that is no number: with its line.
         UnknownNameError: a name that the lattice does not have.
     """
-    header, rows = _read(path)
+    columns, path = read_columns(source), label(source)
+    header = [(column.name, column.unit) for column in columns]
+    rows = list(zip(*(column.values for column in columns), strict=True))
     names = [name.lower() for name, _ in header]
     if ring is None:
         raise MeasurementError(
-            f"'{path}' is an orbit response: name its lattice with --lattice, which knows the "
-            "planes of its correctors"
+            f"'{path}' is an orbit response: name its lattice with --lattice (in Python: ring=), "
+            "which knows the planes of its correctors"
         )
     if "corrector" in names:
         return _long(path, header, rows, ring)
@@ -180,25 +175,7 @@ Header = list[tuple[str, str]]
 """Name and unit of each column."""
 
 
-def _read(path: Path) -> tuple[Header, list[list[str]]]:
-    try:
-        lines = csv.reader(StringIO(text_of(path), newline=""), skipinitialspace=True)
-        rows = [row for row in lines if row]
-    except csv.Error as error:
-        raise MeasurementError(f"'{path}' cannot be read as CSV ({error})") from error
-    if len(rows) < 2:
-        raise MeasurementError(f"{path}: no rows below the header; nothing was read")
-    matched = [_HEADER.match(name) for name in rows[0]]
-    header = [(m["name"], m["unit"] or "") for m in matched if m]
-    for line, row in enumerate(rows[1:], 2):
-        if len(row) != len(header):
-            raise MeasurementError(
-                f"{path}, row {line}: {len(row)} fields where the header has {len(header)}"
-            )
-    return header, rows[1:]
-
-
-def _number(path: Path, line: int, text: str) -> float:
+def _number(path: str, line: int, text: str) -> float:
     try:
         value = float(text) if text.strip() else np.nan
     except ValueError:
@@ -206,7 +183,7 @@ def _number(path: Path, line: int, text: str) -> float:
     return value
 
 
-def _factor(path: Path, name: str, unit: str, of: dict[str, float]) -> float:
+def _factor(path: str, name: str, unit: str, of: dict[str, float]) -> float:
     if not unit:
         return 1.0
     if unit.strip().lower() not in of:
@@ -214,7 +191,7 @@ def _factor(path: Path, name: str, unit: str, of: dict[str, float]) -> float:
     return of[unit.strip().lower()]
 
 
-def _long(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
+def _long(path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
     place = {name.lower(): i for i, (name, _) in enumerate(header)}
     for name in ("corrector", "monitor", "x", "y", "kick"):
         if name not in place:
@@ -247,7 +224,7 @@ def _long(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring)
     )  # fmt: skip
 
 
-def _wide(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
+def _wide(path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
     place = {name.lower(): i for i, (name, _) in enumerate(header)}
     for name in ("monitor", "plane"):
         if name not in place:

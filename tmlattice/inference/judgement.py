@@ -5,11 +5,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 
 def _shares() -> Mapping[str, float]:
-    return MappingProxyType({"named": 0.6, "kick": 0.2, "monitor": 0.1, "reading": 0.1})
+    return {"named": 0.6, "kick": 0.2, "monitor": 0.1, "reading": 0.1}
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,7 @@ class Gap:
         interval: of `explained`, 95 %.
         baseline: index of the model with which the last one is compared.
         readings: number of scored readings.
+        lost: whether the two models lose the beam at different readings: they cannot be compared.
     """
 
     misfits: tuple[Misfit, ...]
@@ -123,6 +124,7 @@ class Gap:
     interval: tuple[float, float] | None
     baseline: int = 0
     readings: int = 0
+    lost: bool = False
 
     def significant(self, false_alarm: float) -> bool:
         """Whether the gap of model `baseline` is larger than expected.
@@ -132,14 +134,6 @@ class Gap:
         """
         square = self.readings * self.misfits[self.baseline].chi2_per_dof
         return bool(chi2.sf(square, self.readings) < false_alarm)
-
-    @property
-    def lost(self) -> bool:
-        """Whether the two models lose the beam at different readings: they cannot be compared."""
-        if not len(self.residuals):  # of a response
-            return False
-        one, other = (np.isfinite(self.residuals[i]).sum() for i in (self.baseline, -1))
-        return bool(one != other)
 
 
 def held_out_gap(models: Sequence[HeldOut], baseline: int = 0) -> Gap:
@@ -154,8 +148,8 @@ def held_out_gap(models: Sequence[HeldOut], baseline: int = 0) -> Gap:
     if baseline < len(models) - 1 and models[baseline].parts and models[-1].parts:
         explained, interval = _explained(models[baseline].parts, models[-1].parts)
     residuals = np.array([model.residuals for model in models])
-    readings = int(np.isfinite(residuals[baseline]).sum())
-    return Gap(misfits, residuals, explained, interval, baseline, readings)
+    readings, last = (int(np.isfinite(residuals[i]).sum()) for i in (baseline, -1))
+    return Gap(misfits, residuals, explained, interval, baseline, readings, readings != last)
 
 
 def _misfit(parts: Sequence[Residuals]) -> Misfit:

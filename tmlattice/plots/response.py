@@ -14,12 +14,13 @@ from tmlattice.plots.strip import lattice_strip, plain_log
 
 def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure: (name, caption, figure); close each after use."""
-    yield (
-        "maps",
-        "Orbit change by corrector and monitor, each corrector in its own plane: measured, what "
-        f"the {_before(result)} leaves of it and what the result does. Grey: left out.",
-        plot_maps(result),
-    )
+    if not result.stored:
+        yield (
+            "maps",
+            "Orbit change by corrector and monitor, each corrector in its own plane: measured, "
+            f"what the {_before(result)} leaves of it and what the result does. Grey: left out.",
+            plot_maps(result),
+        )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
     plot_steps(result, ax)
     yield "steps", "The gap on held-out readings, before and after.", figure

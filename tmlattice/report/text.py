@@ -325,7 +325,7 @@ def heldout_text(diagnosis: Diagnosis) -> str:
         return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
     if not diagnosis.by_steps:
         return "at half of the BPMs"
-    return f"{int(diagnosis.response.held.sum())} correctors"
+    return f"{diagnosis.correctors_held_out} correctors"
 
 
 def _chi2(value: float) -> str:
