@@ -1,6 +1,8 @@
 """Data in and out of a notebook: arrays, data frames, xarray, values that are equal, pickles."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -207,6 +209,18 @@ def test_frames_go_where_a_measurement_does(small_ring, measured, tmp_path):
     assert set(tmlattice.fine_tune(network, frame, method="sparse", noise=1e-6).changes) == {
         "QD::5"
     }
+
+
+def test_the_page_runs_as_written(tmp_path, monkeypatch):
+    """With petra3, as it stands; what it says of its magnet is true."""
+    text = (Path(__file__).parent.parent / "docs" / "frames.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec("".join(re.findall(r"```python\n(.*?)```", text, re.S)), names)
+    errors = names["errors"].set_index("element")
+    assert abs(errors.amount["qd::12"] + 0.2) < 4 * errors.sigma["qd::12"]
+    for name in names["diagnosis"].tables:
+        assert f"`{name}`" in text
 
 
 def test_frames_of_a_response(small_ring):

@@ -323,7 +323,8 @@ def test_commands_render_and_compare(diagnoses, small_ring, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "quadrupole_gradient" in done.stdout
     document = json.loads((tmp_path / "c.json").read_text())
-    assert document["format"] == "tmlattice-comparison"
+    comparison = files("tmlattice") / "schemas" / "comparison.schema.json"
+    jsonschema.validate(document, json.loads(comparison.read_text()))
     assert document["rows"][0]["unit"] == "relative"
     write_measurement(tmp_path / "m", response(small_ring))
     write_measurement(tmp_path / "t", shots(small_ring, []))

@@ -37,7 +37,7 @@ def by_name(function: F) -> F:
                 if value is not None:
                     given[name] = _ring(value)
                 continue
-            ring = given.get("ring") or getattr(given.get("network"), "ring", None)
+            ring = given.get("ring", getattr(given.get("network"), "ring", None))
             if isinstance(value, Mapping) and not is_frame(value):  # a Dataset is a Mapping
                 given[name] = {key: _measured(own, ring) for key, own in value.items()}
             else:

@@ -136,8 +136,9 @@ def tune_fit(
         seed: of the noise.
         methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "told".
         candidates: names of the only magnets that may have changed, of "told".
-        epochs, learning_rate, regularization, regularization_rate, relative_to_design, free, clip,
-            patience: of "adam", see `fitting.adam.fit_adam`.
+        epochs, learning_rate, regularization, regularization_rate: of "adam", see
+            `fitting.adam.fit_adam`.
+        relative_to_design, free, clip, patience: of the same.
         progress: show a bar where there is a terminal.
 
     Raises:
