@@ -8,7 +8,7 @@
 from tmlattice.importers.bring_in import Options, bring_in
 from tmlattice.importers.imported import Imported, described, write_imported
 from tmlattice.importers.speaking import read_measurement
-from tmlattice.importers.told import Told, read_told
+from tmlattice.importers.told import Told
 
 __all__ = [
     "Imported",
@@ -17,6 +17,5 @@ __all__ = [
     "bring_in",
     "described",
     "read_measurement",
-    "read_told",
     "write_imported",
 ]
