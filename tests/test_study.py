@@ -27,7 +27,7 @@ QUICK = {"launch": (1e-4, 0.0, 1e-4, 0.0), "change": -0.02, "noise": 1e-6}
 
 def test_study_prints_writes_and_goes_on(tmp_path):
     command = [
-        "study", "tune-fit", SMALL, "--magnets", "2",
+        "dev", "study", "tune-fit", SMALL, "--magnets", "2",
         "--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--noise", "1e-6", "--epochs", "20",
         "--methods", "adam,map,sparse", "--json", "study.json", "--workers", "1",
     ]  # fmt: skip

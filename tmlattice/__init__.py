@@ -92,6 +92,8 @@ if TYPE_CHECKING:
     from tmlattice.lattice import load_ring as load_ring
     from tmlattice.machine import Machine as Machine
     from tmlattice.machine.simulate import simulate as simulate
+    from tmlattice.machine_file import MachineFile as MachineFile
+    from tmlattice.machine_file import load_machine_file as load_machine_file
     from tmlattice.maps import TaylorMap as TaylorMap
     from tmlattice.maps import element_map as element_map
     from tmlattice.maps import ring_maps as ring_maps
@@ -115,6 +117,7 @@ _HOME = {
     "importers": ["read_measurement"],
     "lattice": ["Element", "Ring", "load_ring"],
     "machine": ["Machine", "simulate"],
+    "machine_file": ["MachineFile", "load_machine_file"],
     "maps": ["TaylorMap", "element_map", "ring_maps"],
     "measurement": ["Measurement", "OrbitResponse", "write_measurement"],
     "network": ["TaylorNetwork", "symplectic_penalty"],

@@ -221,8 +221,8 @@ def _cluster(work: Work, address: str) -> Iterator[_Cluster]:
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        instead = "without --scheduler, local processes do the work"
-        raise missing_package(error, "--scheduler needs", "dask", instead) from error
+        instead = "without it, local processes do the work"
+        raise missing_package(error, "a Dask scheduler needs", "dask", instead) from error
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is one sentence of ours
     try:

@@ -70,11 +70,6 @@ def _cluster_options(function: Any) -> Any:
     help="Tier B: the diagnosis starts from an orbit response of the machine before the fault.",
 )
 @click.option(
-    "--correctors",
-    type=click.IntRange(5),
-    help="With --learnt: the response steps so many, evenly along the ring; else all.",
-)
-@click.option(
     "--kind",
     "kinds",
     multiple=True,
@@ -82,6 +77,13 @@ def _cluster_options(function: Any) -> Any:
         ["trajectory", "turn_by_turn", "closed_orbit", "dispersion", "tunes", "orbit_response"]
     ),
     help="Tiers E, M and P: of measurement (repeat); M draws two or three of them for a case.",
+)
+@click.option(
+    "--shots",
+    type=click.IntRange(1),
+    default=4,
+    show_default=True,
+    help="Of the fit; two more are held out.",
 )
 @click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     "--example",
     is_flag=True,
     help="Write a template of each kind of file and a machine file into --out, for --lattice "
-    "(petra3 where none is named), and import nothing.",
+    "(else the machine file's, or petra3), and import nothing.",
 )
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
@@ -76,7 +76,9 @@ def import_files(
     if example:
         if files:
             raise click.UsageError("--example writes templates and reads no FILES")
-        _example(lattice or "petra3", out, quiet)
+        machine = machine_file()
+        own = machine.lattice_name() if machine is not None and machine.lattice else "petra3"
+        _example(lattice or own, out, quiet)
         return
     if not files:
         raise click.UsageError("name the FILES to import, or --example for a template of each")

@@ -70,7 +70,7 @@ def init(
     if path.exists() and not force:
         raise OutputError(f"'{path}' is there already; --force replaces it")
     if lattice is None:
-        if not sys.stdin.isatty():
+        if not on_a_terminal():
             raise click.UsageError("name the LATTICE: a lattice file, or a built-in name")
         lattice = str(click.prompt("Lattice file, or built-in name", default="petra3"))
         asked = click.prompt("File of data (empty: none)", default="", show_default=False)
@@ -102,6 +102,11 @@ def init(
             f"- the lattice is Python code, which is run only where --machine {path} names the file"
         )
     screen.print(f"written: {path}")
+
+
+def on_a_terminal() -> bool:
+    """Whether somebody can answer."""
+    return sys.stdin.isatty()
 
 
 def _of_data(

@@ -114,6 +114,10 @@ class Careful(click.Command):
         values = [ctx.params.get(name) for name in INPUTS]
         given = [v for value in values for v in (value if isinstance(value, tuple) else [value])]
         folder = ctx.params.get("folder")
+        machine = machine_file()
+        if machine is not None:
+            given += [machine.path, machine.lattice]
+            given += [machine.supplies] if isinstance(machine.supplies, Path) else []
         paths = [Path(str(value)) for value in given if value]
         read = {key for path in paths for key in _identities(path)}
         for path in paths:
