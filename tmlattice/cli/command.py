@@ -46,7 +46,10 @@ class Sections(click.Group):
             elif word in ("--quiet", "-q") or word.startswith("--machine="):
                 first.append(word)
             elif word == "--machine":
-                first += [word, *([value] if (value := next(words, None)) is not None else [])]
+                value = next(words, None)
+                if value is None:
+                    raise click.UsageError("--machine needs a FILE", ctx)
+                first += [word, value]
             else:
                 rest.append(word)
         return super().parse_args(ctx, first + rest)
