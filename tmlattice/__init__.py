@@ -56,6 +56,7 @@ from typing import TYPE_CHECKING, Any
 from tmlattice.version import __version__
 
 if TYPE_CHECKING:
+    from tmlattice import batch as batch
     from tmlattice import challenge as challenge
     from tmlattice import correction as correction
     from tmlattice import diagnosis as diagnosis
@@ -128,7 +129,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 _ROOMS = (
     "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
     "inference", "observe", "diagnosis", "correction", "importers", "fitting", "machine",
-    "challenge", "systems", "plots", "report", "errors",
+    "challenge", "systems", "plots", "report", "errors", "batch",
 )  # fmt: skip
 
 __all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604  (they are strings)
