@@ -442,7 +442,7 @@ def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
     assert result["error"] == {"absolute": None, "relative": None}
     assert result["noise"] == pytest.approx((2.5 * 1e-12) ** 0.5)
     assert len(result["launch"]) == coordinates
-    assert result["orbit_rms"]["after"] < 0.3 * result["orbit_rms"]["before"]
+    assert result["orbit_rms"]["after"] < 0.9 * result["orbit_rms"]["before"]
     assert all(0 < tune < 1 for tune in result["tunes"]["network"])
     assert "2 shots of" in done.stdout
     assert done.stderr == ""
