@@ -92,7 +92,8 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
               help="Machine file: lattice, names, units, supplies; else tmlattice.toml of the "
               "working directory, if there is one. For every command.")  # fmt: skip
 @click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors. For every command.")
-def tmlattice(machines: tuple[Path, ...], quiet: bool) -> None:
+@click.pass_context
+def tmlattice(context: click.Context, /, machines: tuple[Path, ...], quiet: bool) -> None:
     """The gap between the model of a storage ring and the ring itself.
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
@@ -101,6 +102,8 @@ def tmlattice(machines: tuple[Path, ...], quiet: bool) -> None:
     that you trust. All others are data (SECURITY.md). A machine file (`tmlattice init`) names the
     LATTICE, so that it may be left out.
     """
+    if machines and context.invoked_subcommand in (dev.name, effects.name):
+        raise click.UsageError(f"--machine has no meaning for {context.invoked_subcommand}")
 
 
 for _commands in SECTIONS.values():

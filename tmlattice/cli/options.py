@@ -161,7 +161,16 @@ class OfMachine(Careful):
             MachineFileError: the machine file cannot be used.
             click.UsageError: neither names a lattice.
         """
-        rest = super().parse_args(ctx, args)
+        try:
+            rest = super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name not in STATED:
+                raise
+            raise click.UsageError(
+                f"no option {error.option_name}: {STATED[error.option_name]} of the machine file "
+                "states it (`tmlattice init` writes one)",
+                ctx,
+            ) from error
         machine = _machine(ctx)
         arguments = {p.name: p for p in self.params if isinstance(p, click.Argument)}
         if "lattice" not in arguments:
@@ -189,6 +198,15 @@ class OfMachine(Careful):
                 raise click.UsageError(f"name the LATTICE{HINT}", ctx)
         return rest
 
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Where the rest is stated."""
+        text = (
+            "Sequence, energy, particle, BPMs, correctors, names and units of data: in the machine "
+            "file (`tmlattice init`). --machine FILE and --quiet: see `tmlattice --help`."
+        )
+        formatter.write_paragraph()
+        formatter.write_text(text)
+
 
 class WithDefault(OfMachine):
     """A command that takes the built-in ring where no lattice is named."""
@@ -196,6 +214,12 @@ class WithDefault(OfMachine):
     default = "petra3"
 
 
+STATED = {
+    "--sequence": "[lattice]", "--energy": "[lattice]", "--particle": "[lattice]",
+    "--monitors": "[lattice]", "--correctors": "[lattice]", "--unit": "[data]",
+    "--noise": "[data]", "--map": "[channels]",
+}  # fmt: skip
+"""Options that a machine file takes the place of, and where it states them."""
 HINT = ", or state it in a machine file (`tmlattice init LATTICE` writes one)"
 _MACHINE = "tmlattice.machine"
 
