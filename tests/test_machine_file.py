@@ -88,6 +88,31 @@ def test_a_control_rooms_file_is_read_by_what_the_machine_file_states(machine, t
     assert abs(finding["amount"] + 0.1) < 4 * finding["amount_sigma"]
 
 
+def test_channels_of_an_orbit_response_are_bpms_and_correctors(tmp_path, small_ring):
+    """Of the design's response with other names: the same response, without the bad BPM."""
+    from tmlattice.observe.calibration import calibrated_response
+
+    _, response = calibrated_response(small_ring, [], ["v1", "v2"])
+    monitors = [monitor.name for monitor in small_ring.monitors]
+    rows = ["corrector,monitor,x,y,kick"]
+    rows += [
+        f"PS{c},D{m},{response[c, m, 0]:.9g},{response[c, m, 1]:.9g},1"
+        for c in range(2) for m in range(len(monitors))
+    ]  # fmt: skip
+    (tmp_path / "r.csv").write_text("\n".join(rows))
+    names = {"ps0": "v1", "PS1": "V2", **{f"D{m}": name for m, name in enumerate(monitors)}}
+    lines = ["[data]", 'bad = ["d3"]', "[channels]", *(f'{d} = "{n}"' for d, n in names.items())]
+    (tmp_path / "m.toml").write_text("\n".join(lines))
+    machine = load_machine_file(tmp_path / "m.toml")
+    read = machine.read(tmp_path / "r.csv", small_ring)
+    assert read.correctors == ("v1", "v2")
+    assert (read.devices["v1"], read.devices[monitors[0]]) == ("PS0", "D0")
+    assert read.monitors == tuple(name for m, name in enumerate(monitors) if m != 3)
+    np.testing.assert_allclose(read.response, np.delete(response, 3, axis=1), rtol=1e-8)
+    (tmp_path / "a.csv").write_text("shot,D1 x [mm]\n0,1\n")  # correctors' names are in no way
+    assert machine.read(tmp_path / "a.csv", small_ring).monitors == (monitors[1],)
+
+
 def test_supplies_are_knobs_with_limits_and_calibration(machine, small_ring):
     (knob,) = load_machine_file(machine / "tmlattice.toml").knobs(small_ring)
     assert (knob.unit, knob.low, knob.high, knob.step) == ("A", 80.0, 120.0, 0.1)

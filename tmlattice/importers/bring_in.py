@@ -180,7 +180,7 @@ def _bring(
 def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
     if path.suffix.lower() in CSV and is_response_table(path):
-        return bring_table(path, ring)
+        return bring_table(path, ring, options.told)
     return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
 
 
@@ -189,7 +189,7 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
     try:
         told = with_unit(options.told, options.unit, None)
         unit = cast("Unit | None", "um" if told.unit == "µm" else told.unit)
-        return bring_turns(path, ring, options.turns, unit)
+        return bring_turns(path, ring, options.turns, unit, told)
     except MeasurementError:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise

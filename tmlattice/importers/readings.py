@@ -10,7 +10,6 @@ BPMs had a beam.
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +86,7 @@ def bring_readings(
     if not devices:
         raise MeasurementError(f"{path}: sum signals without x and y; give the positions too")
     names = list(monitors or devices if ring is None else [e.name for e in ring.monitors])
-    finder = _Finder(names, told)
+    finder = _Finder(names, told, [] if ring is None else [e.name for e in ring.elements])
     monitor = finder.all(path, devices)
     for place in places:
         monitor.setdefault(place.device, finder.find(place.device))
@@ -323,17 +322,20 @@ def _norm(text: str) -> str:
 class _Finder:
     """The lattice's monitor of a device."""
 
-    def __init__(self, names: Sequence[str], told: Told) -> None:
+    def __init__(self, names: Sequence[str], told: Told, elements: Sequence[str] = ()) -> None:
         self._names = list(names)
         self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
         self._plain = _unique(_norm, self._names)
         self._told: dict[str, int] = {}
         self._in_order = told.in_order
-        self._bad = tuple(pattern.casefold() for pattern in told.bad)
+        self._stated = told
+        others = {name.casefold() for name in elements}
         self.bad: set[int] = set()
         self.said: list[str] = []
         for device, name in told.names.items():
             plain = name if name.casefold() in self._exact else name.rpartition(" ")[0]
+            if plain.casefold() not in self._exact and name.casefold() in others:
+                continue  # a corrector's
             if plain.casefold() not in self._exact:
                 raise unknown_name("monitor", name, self._names)
             self._told[_norm(device)] = self._exact[plain.casefold()]
@@ -371,8 +373,7 @@ class _Finder:
         for device, at in found.items():
             if at is None:
                 continue
-            both = device.casefold(), self._names[at].casefold()
-            if any(fnmatchcase(name, pattern) for name in both for pattern in self._bad):
+            if self._stated.is_bad(device, self._names[at]):
                 self.bad.add(at)
         return found
 

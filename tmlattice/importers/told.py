@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
@@ -16,7 +17,7 @@ class Told:
     Attributes:
         unit: of readings whose header has none; None: from their size.
         noise: rms of a reading, m; None: unknown.
-        names: device or column in the file -> the lattice's monitor.
+        names: device or column in the file -> the lattice's monitor or corrector.
         in_order: the devices are the lattice's monitors in beam order, whatever their names.
         bad: monitors to leave out, by either name; patterns.
         columns: what columns are called: of `COLUMNS`, the name in the file.
@@ -30,6 +31,19 @@ class Told:
     bad: tuple[str, ...] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
     assume: tuple[str, ...] = ()
+
+    def name_of(self, device: str) -> str:
+        """The lattice's name of a device, or the device's own."""
+        plain = device.casefold()
+        return next((own for key, own in self.names.items() if key.casefold() == plain), device)
+
+    def is_bad(self, *names: str) -> bool:
+        """Whether a pattern of the bad monitors is like one of the names."""
+        return any(
+            fnmatchcase(name.casefold(), pattern.casefold())
+            for name in names
+            for pattern in self.bad
+        )
 
 
 def machine_text(
@@ -69,7 +83,7 @@ def machine_text(
         *lines("file", "sequence", "energy", "particle", "monitors", "correctors"), "",
         "[data]  # of files of other programs; a measurement folder states all of it itself",
         *lines("unit", "noise", "bad", "assume", "in_order", "columns"), "",
-        "[channels]  # device or column in the data = BPM of the lattice",
+        "[channels]  # device or column in the data = BPM or corrector of the lattice",
         *(named or ['# "SR:BPM-001" = "bpm_1"']), "",
         "# Power supplies, for `tmlattice correct`: what is left out is taken from the lattice.",
         '# Or a table, above [lattice]: supplies = "knobs.csv" (`tmlattice correct --example`).',
