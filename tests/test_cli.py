@@ -173,7 +173,8 @@ def test_help_groups_the_commands_by_what_they_are_for(tmp_path):
     from tmlattice.cli.command import tmlattice as group
 
     done = tmlattice("--help", cwd=tmp_path, check=0)
-    at = [done.stdout.index(f"\n{title}:") for title in ("Measure", "Fit", "Diagnose", "Study")]
+    titles = ("Describe", "Measure", "Diagnose", "Fit", "Develop")
+    at = [done.stdout.index(f"\n{title}:") for title in titles]
     assert at == sorted(at)
     listed = [command.name for commands in SECTIONS.values() for command in commands]
     assert sorted(listed) == sorted(group.commands)
