@@ -408,6 +408,8 @@ def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):
     found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
     assert found["not_run"] == ["0002"]
     (folder / "cases" / "0002" / "case.json").write_text("[]")
-    done = tmlattice("challenge", "run", folder, "--jobs", 1, "--lattice", LATTICE, cwd=tmp_path)
+    done = tmlattice(
+        "dev", "challenge", "run", folder, "--jobs", 1, "--lattice", LATTICE, cwd=tmp_path
+    )
     assert done.returncode == 1
     assert "case 0002" in done.stdout

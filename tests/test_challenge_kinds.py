@@ -223,11 +223,13 @@ def test_kinds_that_make_no_sense_are_a_sentence(tmp_path):
 
 def test_the_command_makes_kinds(tmp_path):
     tmlattice(
-        "challenge", "make", "E", "--kind", "tunes", "--cases", "2", "--out", "e", "--lattice",
-        LATTICE, cwd=tmp_path, check=0,
+        "dev", "challenge", "make", "E", "--kind", "tunes", "--cases", "2", "--out", "e",
+        "--lattice", LATTICE, cwd=tmp_path, check=0,
     )  # fmt: skip
-    tmlattice("challenge", "run", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0)
+    tmlattice(
+        "dev", "challenge", "run", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
+    )
     told = tmlattice(
-        "challenge", "score", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
+        "dev", "challenge", "score", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
     )
     assert "false alarms" in told.stdout

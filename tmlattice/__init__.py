@@ -56,6 +56,7 @@ from typing import TYPE_CHECKING, Any
 from tmlattice.version import __version__
 
 if TYPE_CHECKING:
+    from tmlattice import batch as batch
     from tmlattice import challenge as challenge
     from tmlattice import correction as correction
     from tmlattice import diagnosis as diagnosis
@@ -94,6 +95,8 @@ if TYPE_CHECKING:
     from tmlattice.lattice import save_ring as save_ring
     from tmlattice.machine import Machine as Machine
     from tmlattice.machine.simulate import simulate as simulate
+    from tmlattice.machine_file import MachineFile as MachineFile
+    from tmlattice.machine_file import load_machine_file as load_machine_file
     from tmlattice.maps import TaylorMap as TaylorMap
     from tmlattice.maps import element_map as element_map
     from tmlattice.maps import ring_maps as ring_maps
@@ -123,6 +126,7 @@ _HOME = {
     "importers": ["import_data", "read_measurement"],
     "lattice": ["Element", "Ring", "load_ring", "save_ring"],
     "machine": ["Machine", "simulate"],
+    "machine_file": ["MachineFile", "load_machine_file"],
     "maps": ["TaylorMap", "element_map", "ring_maps"],
     "measurement": [
         "ClosedOrbit",
@@ -143,7 +147,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 _ROOMS = (
     "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
     "inference", "observe", "diagnosis", "correction", "importers", "fitting", "machine",
-    "challenge", "systems", "plots", "report", "errors",
+    "challenge", "systems", "plots", "report", "errors", "batch",
 )  # fmt: skip
 
 __all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604  (they are strings)

@@ -81,7 +81,7 @@ def score(
     results = finished(folder / "results")
     names = [name for name in case_names(folder) if name in results]
     if not names:
-        raise TmlatticeError(f"'{folder}' has no results; `tmlattice challenge run` makes them")
+        raise TmlatticeError(f"'{folder}' has no results; `tmlattice dev challenge run` makes them")
     failed, truths = dict[str, str](), dict[str, Truth]()
     for name in names:
         try:

@@ -194,7 +194,7 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
         return note(
             "energy",
             f"the data state a beam energy of {data.energy:g} GeV, the lattice {ring.energy:g}: "
-            "name this machine's lattice, or its energy (--energy)",
+            "name this machine's lattice, or its energy (`energy` in tmlattice.toml)",
         )
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
 

@@ -8,7 +8,7 @@
 from tmlattice.importers.bring_in import Options, bring_in, import_data
 from tmlattice.importers.imported import Imported, described, write_imported
 from tmlattice.importers.speaking import read_measurement
-from tmlattice.importers.told import Told, read_told
+from tmlattice.importers.told import Told
 
 __all__ = [
     "Imported",
@@ -18,6 +18,5 @@ __all__ = [
     "described",
     "import_data",
     "read_measurement",
-    "read_told",
     "write_imported",
 ]

@@ -1,16 +1,16 @@
 """Which importer files are for: by what they hold, not by their names."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from tmlattice.by_name import is_frame
-from tmlattice.errors import MeasurementError, TmlatticeError, plain
+from tmlattice.errors import MeasurementError, TmlatticeError, plain, unknown_name
 from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, as_frame, read_columns, text_of
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
@@ -23,8 +23,9 @@ from tmlattice.importers.tables import bring_table, bring_turns, is_response_tab
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
-from tmlattice.measurement import OrbitResponse, TuneReading
+from tmlattice.measurement import Measurement, OrbitResponse, TuneReading
 from tmlattice.measurement.arrays import Unit
+from tmlattice.measurement.assume import ASSUMPTIONS, assume
 from tmlattice.measurement.frames import of_document
 
 log = logging.getLogger(__name__)
@@ -45,8 +46,9 @@ class Options:
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
         unit: of the readings of first turns or turns; else as the file says, or from their size.
-        told: what a map says of a table of readings.
-        ring: instead of `lattice`, one that is loaded already.
+        told: what a machine file says of a table of readings.
+        ring: instead of `lattice`, one that is loaded already, or a function that loads it where a
+            file needs one.
         noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
@@ -59,7 +61,7 @@ class Options:
     unit: Unit | None = None
     noise: float | None = None
     told: Told | None = None
-    ring: Ring | None = None
+    ring: Ring | Callable[[], Ring] | None = None
 
 
 def bring_in(
@@ -193,9 +195,9 @@ def _bring(
         path, ring = files[0], _ring(options)
         suffix = path.suffix.lower()
         if not options.turns and suffix in (*CSV, *HDF5):
-            return _table(path, ring, options)
+            return _with_conventions(_table(path, ring, options), ring, options)
         if options.turns or suffix not in NAMES:
-            return _turns(path, ring, options)
+            return _with_conventions(_turns(path, ring, options), ring, options)
     loco = [(path, content) for path, content in matlab if is_loco(content)]
     rest = [(path, content) for path, content in matlab if not is_loco(content)]
     if hdf5:
@@ -233,7 +235,7 @@ def _bring(
 def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
     if path.suffix.lower() in CSV and is_response_table(read_columns(path)):
-        return bring_table(path, ring)
+        return bring_table(path, ring, options.told)
     return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
 
 
@@ -251,7 +253,9 @@ def _framed(frame: Any, options: Options) -> Imported:
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
     """Turns of a known kind; of SDDS of another, columns as they come."""
     try:
-        return bring_turns(path, ring, options.turns, options.unit)
+        told = with_unit(options.told, options.unit, None)
+        unit = cast("Unit | None", "um" if told.unit == "µm" else told.unit)
+        return bring_turns(path, ring, options.turns, unit, told)
     except MeasurementError:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise
@@ -259,7 +263,31 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
         return bring_readings(path, ring, told)
 
 
+def _with_conventions(brought: Imported, ring: Ring | None, options: Options) -> Imported:
+    """The readings with the stated conventions of signs and units undone; those that have a meaning
+    for this kind of measurement."""
+    data: Any = brought.measurement
+    stated = options.told.assume if options.told else ()
+    for name in stated:
+        if name not in ASSUMPTIONS:
+            raise unknown_name("assumption", name, ASSUMPTIONS)
+    first, response = isinstance(data, Measurement), isinstance(data, OrbitResponse)
+    own = [
+        name for name in stated
+        if (first and ASSUMPTIONS[name].trajectory) or (response and ASSUMPTIONS[name].response)
+    ]  # fmt: skip
+    if left := [name for name in stated if name not in own]:
+        brought = brought.saying(f"of no meaning for these data, not undone: {', '.join(left)}")
+    if not own:
+        return brought
+    names = data.monitors if ring is None else [monitor.name for monitor in ring.monitors]
+    brought = replace(brought, measurement=assume(data, own, names))
+    return brought.saying(f"conventions of the machine file, undone: {', '.join(own)}")
+
+
 def _ring(options: Options) -> Ring | None:
+    if callable(options.ring):
+        return options.ring()
     if options.ring is not None or options.lattice is None:
         return options.ring
     return load_ring(options.lattice, options.sequence, options.energy)

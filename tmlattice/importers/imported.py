@@ -33,12 +33,14 @@ class Imported:
         ring: the model that the files hold or that the caller named; None: neither.
         assumed: what the files do not prove: units, signs, steps; a sentence each.
         doubts: what the data contradict; a sentence each.
+        unit: of readings, where it is taken from their size.
     """
 
     measurement: AnyMeasurement
     ring: Ring | None = None
     assumed: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    unit: str | None = None
 
     def saying(self, *sentences: str) -> "Imported":
         """The same with more that was assumed."""

@@ -10,7 +10,6 @@ BPMs had a beam.
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +76,7 @@ def bring_readings(
 
     Raises:
         MeasurementError: no table, no monitor of the ring, or a field that is no number.
-        UnknownNameError: the map names a monitor that the ring does not have.
+        UnknownNameError: `told` names a monitor that the ring does not have.
     """
     told = told or Told()
     columns, path = read_columns(source), label(source)
@@ -88,12 +87,12 @@ def bring_readings(
     if not devices:
         raise MeasurementError(f"{path}: sum signals without x and y; give the positions too")
     names = list(monitors or devices if ring is None else [e.name for e in ring.monitors])
-    finder = _Finder(names, told)
+    finder = _Finder(names, told, [] if ring is None else [e.name for e in ring.elements])
     monitor = finder.all(path, devices)
     for place in places:
         monitor.setdefault(place.device, finder.find(place.device))
     scale = np.ones(len(values))
-    scale[position], of_unit = _scale(
+    scale[position], of_unit, guessed = _scale(
         values[position], [u for u, p in zip(units, position, strict=True) if p], told
     )
     both = np.full((len(set(shots)), max(turns) + 1, len(names), 3), np.nan)
@@ -154,7 +153,7 @@ def bring_readings(
     if bad:
         said.append(f"bad monitors, left out as told: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
-    return Imported(data, ring, tuple(said), doubts)
+    return Imported(data, ring, tuple(said), doubts, guessed)
 
 
 Found = tuple[list[str], list[int], list[Place], Array, list[str]]
@@ -335,17 +334,20 @@ def _norm(text: str) -> str:
 class _Finder:
     """The lattice's monitor of a device."""
 
-    def __init__(self, names: Sequence[str], told: Told) -> None:
+    def __init__(self, names: Sequence[str], told: Told, elements: Sequence[str] = ()) -> None:
         self._names = list(names)
         self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
         self._plain = _unique(_norm, self._names)
         self._told: dict[str, int] = {}
         self._in_order = told.in_order
-        self._bad = tuple(pattern.casefold() for pattern in told.bad)
+        self._stated = told
+        others = {name.casefold() for name in elements}
         self.bad: set[int] = set()
         self.said: list[str] = []
         for device, name in told.names.items():
             plain = name if name.casefold() in self._exact else name.rpartition(" ")[0]
+            if plain.casefold() not in self._exact and name.casefold() in others:
+                continue  # a corrector's
             if plain.casefold() not in self._exact:
                 raise unknown_name("monitor", name, self._names)
             self._told[_norm(device)] = self._exact[plain.casefold()]
@@ -360,7 +362,7 @@ class _Finder:
             if len(devices) != len(self._names):
                 raise MeasurementError(
                     f"{path}: {len(devices)} devices, and the lattice has {len(self._names)} "
-                    "monitors; name them in the map, they are not the same in order"
+                    "monitors; name them in [channels], they are not the same in order"
                 )
             self.said.append("devices are the lattice's monitors in beam order, as told")
             found: dict[str, int | None] = {device: i for i, device in enumerate(devices)}
@@ -369,8 +371,8 @@ class _Finder:
         if all(at is None for at in found.values()):
             error = unknown_name("monitor", devices[0], self._names)
             raise MeasurementError(
-                f"{path}: {error}; say which is which in a map (--map, `names:`; "
-                "`tmlattice import --example` writes one)"
+                f"{path}: {error}; say which is which in [channels] of "
+                "tmlattice.toml (`tmlattice import --example` writes one)"
             )
         loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
         if loose and not self._in_order:
@@ -383,8 +385,7 @@ class _Finder:
         for device, at in found.items():
             if at is None:
                 continue
-            both = device.casefold(), self._names[at].casefold()
-            if any(fnmatchcase(name, pattern) for name in both for pattern in self._bad):
+            if self._stated.is_bad(device, self._names[at]):
                 self.bad.add(at)
         return found
 
@@ -418,8 +419,8 @@ def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
     return {name: i for name, i in table.items() if name not in twice}
 
 
-def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str]:
-    """Metres per unit of each number, and what is to be said of it."""
+def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str, str | None]:
+    """Metres per unit of each number, what is to be said of it, and a unit that is a guess."""
     known = {"µm": "um", "μm": "um", "micron": "um", "metre": "m", "meter": "m"}
     plain = [known.get(unit.strip().casefold(), unit.strip().casefold()) for unit in units]
     strange = [unit for unit in plain if unit and unit not in METRES]
@@ -431,18 +432,20 @@ def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str]
     scale = np.array([METRES[unit] if unit else 1.0 for unit in plain])
     stated = sorted(set(plain) - {""})
     if not silent.any():
-        return scale, f"readings are in {' and '.join(stated)}, as the file says"
+        return scale, f"readings are in {' and '.join(stated)}, as the file says", None
     if told.unit is not None:
         scale[silent] = METRES[told.unit]
-        return scale, f"readings are in {told.unit}, as told"
+        return scale, f"readings are in {told.unit}, as told", None
     own = np.abs(values[silent])
     own = own[np.isfinite(own)]
     size = float(np.percentile(own, 95)) if len(own) else 0.0
     unit = next(unit for below, unit in SIZES if size < below)
     scale[silent] = METRES[unit]
-    return scale, (
+    return (
+        scale,
         f"no unit is given: readings are taken in {unit}, for most are below {size:.3g} "
-        "(--unit says otherwise)"
+        "(`unit` in [data] of tmlattice.toml says otherwise)",
+        unit,
     )
 
 

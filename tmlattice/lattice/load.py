@@ -17,6 +17,8 @@ from tmlattice.lattice.ring import PARTICLES, Ring
 AT_SUFFIXES = (".mat", ".m", ".repr")
 MADX_SUFFIXES = (".seq", ".madx", ".lte")
 TFS_SUFFIXES = (".tfs", ".twiss", ".dat", ".outx")
+SUFFIXES = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES, *TFS_SUFFIXES)
+"""Of lattice files."""
 
 
 def _builtin_folder() -> Path:
@@ -148,8 +150,7 @@ def _find(name: str) -> Path:
     if name.casefold() in builtin:
         return _builtin_folder() / f"{name.casefold()}.py"
     path = Path(name)
-    known = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES, *TFS_SUFFIXES)
-    if path.suffix.lower() in known and path.is_file():
+    if path.suffix.lower() in SUFFIXES and path.is_file():
         return path
     if path.is_file():
         raise LatticeError(
