@@ -223,7 +223,7 @@ def test_version_has_one_source(tmp_path):
         (["tune-fit", SMALL, "--launch", "nan,0,0,0"], "four numbers"),
         (["tune-fit", SMALL, "--noise", "-1e-5"], "--noise"),
         (["tune-fit", SMALL, "--epochs", "0"], "--epochs"),
-        (["tune-fit", SMALL, "--sequence", "loop"], "[lattice] of the machine file states it"),
+        (["tune-fit", SMALL, "--sequence", "loop"], "no sequence in"),
         (["tune-fit", SMALL, "--out", "/dev/null/folder"], "cannot write"),
         (["tune-fit", SMALL, "--json", "no/such/folder/a.json"], "cannot write"),
         (["tune-fit", SMALL, "--wrong"], "--wrong"),

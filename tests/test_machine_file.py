@@ -195,7 +195,7 @@ def test_two_files_or_none_are_one_sentence(machine):
     for words, said in (
         (files, "--machine is given twice, 'a.toml' and 'b.toml'"),
         (files[:2], "cannot read 'a.toml': No such file"),
-        (["--machine"], "--machine needs a FILE"),
+        (["--machine"], "--machine needs a value, FILE"),
     ):
         done = tmlattice("info", *words, cwd=machine, check=2)
         assert said in done.stderr
@@ -306,3 +306,17 @@ def test_what_python_code_is_told_of_a_wrong_file(tmp_path):
     with pytest.raises(MeasurementError, match="cannot read"):
         load_machine_file(path).knobs(load_ring(SMALL))
     assert isinstance(Path(machine.path), Path)
+
+
+def test_the_command_line_states_the_lattice_too(machine, tmp_path):
+    """Anywhere on it, and over the machine file."""
+    for words in (["--energy", "2.5", "info"], ["info", "--energy=2.5"]):
+        out = tmp_path / "info.json"
+        tmlattice(*words, "--json", out, cwd=machine, check=0)
+        assert json.loads(out.read_text())["energy_gev"] == 2.5
+    done = tmlattice("info", "--sequence", "loop", cwd=machine, check=2)
+    assert "--sequence" in done.stderr or "no sequence" in done.stderr
+    assert (
+        "--energy has no meaning for effects"
+        in tmlattice("effects", "--energy", "3", check=2).stderr
+    )

@@ -9,7 +9,7 @@ import sys
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 import click
 
@@ -23,7 +23,7 @@ from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
 from tmlattice.cli.init import init
-from tmlattice.cli.options import FILE
+from tmlattice.cli.options import FILE, lattice_options
 from tmlattice.cli.predict import predict
 from tmlattice.cli.progress import stopped_in
 from tmlattice.cli.report import report
@@ -39,21 +39,28 @@ class Sections(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """The options of all commands are taken wherever they stand."""
+        own = {
+            name: option
+            for option in self.params
+            if isinstance(option, click.Option) and option.name != "version"
+            for name in option.opts
+        }
         first: list[str] = []
         rest: list[str] = []
         words = iter(args)
         for word in words:
+            name, _, value = word.partition("=")
             if word == "--":
                 rest += [word, *words]
-            elif word in ("--quiet", "-q") or word.startswith("--machine="):
-                first.append(word)
-            elif word == "--machine":
-                value = next(words, None)
-                if value is None:
-                    raise click.UsageError("--machine needs a FILE", ctx)
-                first += [word, value]
-            else:
+            elif name not in own:
                 rest.append(word)
+            elif value or own[name].is_flag:
+                first.append(word)
+            else:
+                given = next(words, None)
+                if given is None:
+                    raise click.UsageError(f"{name} needs a value, {own[name].metavar}", ctx)
+                first += [word, given]
         return super().parse_args(ctx, first + rest)
 
     def resolve_command(
@@ -94,8 +101,11 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
               help="Machine file: lattice, names, units, supplies; else tmlattice.toml of the "
               "working directory, if there is one. For every command.")  # fmt: skip
 @click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors. For every command.")
+@lattice_options
 @click.pass_context
-def tmlattice(context: click.Context, /, machines: tuple[Path, ...], quiet: bool) -> None:
+def tmlattice(
+    context: click.Context, /, machines: tuple[Path, ...], quiet: bool, **lattice: Any
+) -> None:
     """The gap between the model of a storage ring and the ring itself.
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
@@ -104,8 +114,9 @@ def tmlattice(context: click.Context, /, machines: tuple[Path, ...], quiet: bool
     that you trust. All others are data (SECURITY.md). A machine file (`tmlattice init`) names the
     LATTICE, so that it may be left out.
     """
-    if machines and context.invoked_subcommand in (dev.name, effects.name):
-        raise click.UsageError(f"--machine has no meaning for {context.invoked_subcommand}")
+    given = ["machine"] * bool(machines) + [name for name, value in lattice.items() if value]
+    if given and context.invoked_subcommand in (dev.name, effects.name):
+        raise click.UsageError(f"--{given[0]} has no meaning for {context.invoked_subcommand}")
 
 
 for _commands in SECTIONS.values():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, checked_ring, console, quiet_option
+from tmlattice.cli.options import FILE, Careful, checked_ring, console, quiet_option, stated_options
 
 if TYPE_CHECKING:
     from tmlattice.lattice import Ring
@@ -16,31 +16,6 @@ if TYPE_CHECKING:
 @click.command("init", cls=Careful)
 @click.argument("lattice", required=False)
 @click.argument("measurement", metavar="[DATA]", type=FILE, required=False)
-@click.option("--sequence", metavar="NAME", help="The lattice file's variable that holds the ring.")
-@click.option(
-    "--energy",
-    type=click.FloatRange(0, min_open=True),
-    metavar="GEV",
-    help="Beam energy; else what the lattice states.",
-)
-@click.option(
-    "--particle",
-    type=click.Choice(["electron", "proton"]),
-    help="Else what the lattice states.",
-)
-@click.option(
-    "--monitors",
-    multiple=True,
-    metavar="PATTERN",
-    help="Elements that are BPMs although the file has them as markers or drifts, such as 'BPM*'; "
-    "several with commas.",
-)
-@click.option(
-    "--correctors",
-    multiple=True,
-    metavar="PATTERN",
-    help="Elements that are correctors too, such as 'COR*'; see --monitors.",
-)
 @click.option("--force", is_flag=True, help="Replace a machine file that is there.")
 @quiet_option
 @click.pass_context
@@ -51,7 +26,6 @@ def init(
     measurement: Path | None,
     force: bool,
     quiet: bool,
-    **options: Any,
 ) -> None:
     """Write the machine file tmlattice.toml, or that of --machine, of LATTICE and of DATA.
 
@@ -75,7 +49,7 @@ def init(
         lattice = str(click.prompt("Lattice file, or built-in name", default="petra3"))
         asked = click.prompt("File of data (empty: none)", default="", show_default=False)
         measurement = Path(asked) if asked else None
-    chosen = {key: list(v) if isinstance(v, tuple) else v for key, v in options.items() if v}
+    chosen = stated_options()
     ring = checked_ring(lattice, chosen, read=measurement is not None)
     named = lattice.casefold() in builtin_lattices()
     stated, silent, channels, said = _of_data(ring, measurement)

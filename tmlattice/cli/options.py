@@ -201,8 +201,9 @@ class OfMachine(Careful):
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Where the rest is stated."""
         text = (
-            "Sequence, energy, particle, BPMs, correctors, names and units of data: in the machine "
-            "file (`tmlattice init`). --machine FILE and --quiet: see `tmlattice --help`."
+            "Names, units and supplies: in the machine file (`tmlattice init`). --machine FILE, "
+            "--quiet, --sequence, --energy, --particle, --monitors and --correctors: see "
+            "`tmlattice --help`."
         )
         formatter.write_paragraph()
         formatter.write_text(text)
@@ -214,14 +215,39 @@ class WithDefault(OfMachine):
     default = "petra3"
 
 
-STATED = {
-    "--sequence": "[lattice]", "--energy": "[lattice]", "--particle": "[lattice]",
-    "--monitors": "[lattice]", "--correctors": "[lattice]", "--unit": "[data]",
-    "--noise": "[data]", "--map": "[channels]",
-}  # fmt: skip
+STATED = {"--unit": "[data]", "--noise": "[data]", "--map": "[channels]"}
 """Options that a machine file takes the place of, and where it states them."""
 HINT = ", or state it in a machine file (`tmlattice init LATTICE` writes one)"
 _MACHINE = "tmlattice.machine"
+
+
+LATTICE_OPTIONS = (
+    click.option("--sequence", metavar="NAME", help="The sequence, line or variable of the lattice "
+                 "file that is the ring."),
+    click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
+                 help="Beam energy, if the lattice states none."),
+    click.option("--particle", type=click.Choice(["electron", "proton"]), metavar="NAME",
+                 help="electron or proton, if the lattice states none."),
+    click.option("--monitors", multiple=True, metavar="PATTERN", help="Markers or drifts that are "
+                 "BPMs, such as 'BPM*'; several with commas."),
+    click.option("--correctors", multiple=True, metavar="PATTERN",
+                 help="Elements that are correctors too, such as 'COR*'."),
+)  # fmt: skip
+
+
+def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """How the LATTICE is read, for every command; a machine file states it once and for all."""
+    for option in reversed(LATTICE_OPTIONS):
+        function = option(function)
+    return function
+
+
+def stated_options() -> dict[str, Any]:
+    """The options of `load_ring` that the command line states."""
+    given = click.get_current_context().find_root().params
+    names = ("sequence", "energy", "particle", "monitors", "correctors")
+    chosen = {name: given.get(name) for name in names}
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in chosen.items() if v}
 
 
 def is_quiet() -> bool:
@@ -303,7 +329,8 @@ def open_ring(lattice: str, read: bool = True) -> "Ring":
         LatticeError: no such ring, or one without monitors.
     """
     machine = machine_file()
-    return checked_ring(lattice, {} if machine is None else machine.options_for(lattice), read)
+    options = {} if machine is None else dict(machine.options_for(lattice))
+    return checked_ring(lattice, options | stated_options(), read)
 
 
 def checked_ring(lattice: str, options: Mapping[str, Any], read: bool = True) -> "Ring":
@@ -317,8 +344,8 @@ def checked_ring(lattice: str, options: Mapping[str, Any], read: bool = True) ->
     except LatticeError as error:
         if not re.search(r"\b(energy|sequence)=", str(error)):
             raise
-        where = "on the command line: in [lattice] of tmlattice.toml, or `tmlattice init LATTICE"
-        raise LatticeError(f"{error}; {where} --energy GEV --sequence NAME`") from error
+        where = "on the command line: --energy GEV, --sequence NAME, or [lattice] of tmlattice.toml"
+        raise LatticeError(f"{error}; {where}") from error
     if read:
         need_monitors(ring)
     if told := no_whole_turn(ring):
